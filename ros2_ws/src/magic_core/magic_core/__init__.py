@@ -1,0 +1,1 @@
+"""What the MAGIC packages share: geometry, errors, strategies, objects, conversions."""

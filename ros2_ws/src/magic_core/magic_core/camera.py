@@ -1,0 +1,69 @@
+"""The pinhole camera (REP-103 optical frame: x right, y down, z forward)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magic_core.errors import Code, MagicError
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Undistorted pinhole intrinsics in pixels; pixel centres lie at integer (u, v)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if self.width < 1 or self.height < 1:
+            raise MagicError(Code.BAD_INTRINSICS, "image size", (self.width, self.height), "at least 1 x 1 pixels")
+        if not np.all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
+            raise MagicError(Code.BAD_INTRINSICS, "fx, fy, cx, cy", values, "finite numbers, focal lengths above 0")
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 camera matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def unproject(self, depth: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Turn a depth image (H, W) in metres into points (H, W, 3) in the optical frame; NaN stays NaN."""
+        v, u = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]]
+        z = np.asarray(depth, dtype=float)
+        return np.stack([(u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z], axis=-1)
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Project points (..., 3) in the optical frame to pixels (..., 2); NaN behind the camera."""
+        points = np.asarray(points, dtype=float)
+        z = np.where(points[..., 2] > 1e-9, points[..., 2], np.nan)
+        return np.stack([self.fx * points[..., 0] / z + self.cx, self.fy * points[..., 1] / z + self.cy], axis=-1)
+
+
+@dataclass(frozen=True)
+class RgbdFrame:
+    """One colour image with depth registered to it.
+
+    color (H, W, 3) uint8 RGB; depth (H, W) float32 metres, NaN where there is
+    none; world_from_camera (4, 4) pose of the colour optical frame; stamp in seconds.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    intrinsics: Intrinsics
+    world_from_camera: NDArray[np.float64]
+    camera: str = "camera"
+    stamp: float = 0.0
+
+    def __post_init__(self) -> None:
+        size = (self.intrinsics.height, self.intrinsics.width)
+        if self.color.shape != (*size, 3) or self.color.dtype != np.uint8:
+            raise MagicError(Code.BAD_IMAGE, f"colour image of {self.camera}", f"{self.color.shape} {self.color.dtype}", f"{(*size, 3)} uint8")
+        if self.depth.shape != size:
+            raise MagicError(Code.BAD_IMAGE, f"depth image of {self.camera}", self.depth.shape, f"{size}, the size of its colour image")

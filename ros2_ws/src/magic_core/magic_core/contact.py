@@ -1,0 +1,78 @@
+"""Contacts: a point on an object's silhouette with its normal and curvature.
+
+The contact frame, the same for tool and target: origin at the contact point on
+the mid-plane of the canonical view, x along the outward normal n (out of the
+material), z along the view direction v, y = z cross x.  Two objects touch
+squarely when their x axes oppose and their z axes agree, see :data:`OPPOSED`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.scene import CanonicalView
+
+#: target_contact_from_tool_contact when the two surfaces touch squarely: half a turn about z.
+OPPOSED = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One contact point on one object (p_T or p_O of the paper).
+
+    pixel (2,) float (u, v) in the canonical view; normal (2,) unit, outward, in
+    picture coordinates (u right, v down); radius r of curvature in metres (inf on
+    a straight edge); concave: the centre of curvature lies outside the material;
+    scale: the motion functional scale s_j in metres; object_from_contact (4, 4).
+    """
+
+    pixel: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    radius: float
+    concave: bool
+    scale: float
+    object_from_contact: NDArray[np.float64]
+
+    @property
+    def signed_curvature(self) -> float:
+        """kappa = 1 / r in 1/m, positive where convex, negative where concave."""
+        return (-1.0 if self.concave else 1.0) / self.radius
+
+
+@dataclass(frozen=True)
+class ContactCandidate:
+    """A proposed contact on a new tool, with the contact on the target that it would meet.
+
+    rotation (radians, 0..2 pi) and flipped: the in-plane turn of the reference view,
+    and whether it was mirrored, under which the reference looked most like the new
+    tool.  s_dino is the global score, s_curv the local one, score their combination.
+    tool_from_reference (4, 4) carries the reference tool's frame onto the new tool's
+    frame by aligning the contact frames.
+    """
+
+    tool_id: str
+    tool: Contact
+    target: Contact | None
+    rotation: float
+    flipped: bool
+    s_dino: float
+    s_curv: float
+    score: float
+    tool_from_reference: NDArray[np.float64]
+
+
+def contact_frame(view: CanonicalView, pixel: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """object_from_contact (4, 4) of a pixel (2,) and an outward picture normal (2,)."""
+    return transforms.frame(view.points(pixel), view.directions(normal), view.direction)
+
+
+def turned_over(object_from_contact: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The contact frame seen from behind: half a turn about the normal.
+
+    A mirrored match is met exactly by turning the tool over; x stays, y and z flip.
+    """
+    return object_from_contact @ np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,0 +1,81 @@
+"""Motions of the tool and of the arm that holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.errors import Code, MagicError
+
+#: The variants of the paper: a floating gripper moves the tool, or the arm grasps and moves it.
+VARIANTS = ("fg", "arm")
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A named part of a motion: ``grasp``, ``transfer``, ``approach``, ``contact``, ``goal``,
+    ``release``, ``retreat``; start and end in seconds from the motion's start."""
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class ToolMotion:
+    """times (T,) seconds from 0, strictly increasing; world_from_tool (T, 4, 4)."""
+
+    times: NDArray[np.float64]
+    world_from_tool: NDArray[np.float64]
+    phases: tuple[Phase, ...] = ()
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times, dtype=float)
+        poses = np.asarray(self.world_from_tool, dtype=float)
+        if len(times) < 1 or poses.shape != (len(times), 4, 4):
+            raise MagicError(Code.BAD_MOTION, "tool motion", f"{len(times)} times, poses {poses.shape}", "T >= 1 times and (T, 4, 4) poses")
+        if not (np.all(np.isfinite(times)) and np.all(np.isfinite(poses))):
+            raise MagicError(Code.BAD_MOTION, "tool motion", "NaN or infinite values", "finite times and poses")
+        if np.any(np.diff(times) <= 0):
+            raise MagicError(Code.BAD_MOTION, "times of the tool motion", float(np.diff(times).min()), "strictly increasing")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "world_from_tool", poses)
+
+
+@dataclass(frozen=True)
+class ArmMotion:
+    """A joint trajectory with the moments at which the gripper closes and opens.
+
+    times (N,) seconds from 0; positions, velocities, accelerations (N, J) in rad,
+    rad/s, rad/s^2 for joint_names; tool_from_tcp (4, 4) the grasp; grasp_width the
+    opening in metres when closed on the tool; grasp_time and release_time seconds
+    from the start (``None``: the tool stays in hand).
+    """
+
+    times: NDArray[np.float64]
+    joint_names: tuple[str, ...]
+    positions: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    accelerations: NDArray[np.float64]
+    tool_from_tcp: NDArray[np.float64]
+    grasp_width: float
+    grasp_time: float
+    release_time: float | None = None
+    phases: tuple[Phase, ...] = ()
+
+
+@dataclass(frozen=True)
+class MotionPlan:
+    """What the planner hands to the verifier: where the tool goes, and how the arm takes it there."""
+
+    variant: str
+    tool_motion: ToolMotion
+    arm_motion: ArmMotion | None = None
+
+    def __post_init__(self) -> None:
+        if self.variant not in VARIANTS:
+            raise MagicError(Code.UNKNOWN_VARIANT, "variant", self.variant, VARIANTS)
+        if (self.variant == "arm") != (self.arm_motion is not None):
+            raise MagicError(Code.BAD_MOTION, "plan", f"variant {self.variant} {'with' if self.arm_motion else 'without'} an arm motion", "arm with, fg without")

@@ -1,0 +1,92 @@
+"""What every node of the graph does alike: start, stop, validate parameters, report."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from magic_core.errors import Code, MagicError
+
+
+def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None = None) -> None:
+    """Spin one node until SIGINT, SIGTERM or shutdown; ends the process's main cleanly on each.
+
+    A node that cannot start (a bad parameter, for one) logs why and exits with status 1.
+    """
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+
+    def stop(signum: int, _frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    node = None
+    executor = MultiThreadedExecutor(threads)
+    status = 0
+    try:
+        node = node_type()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except MagicError as error:
+        print(f"{getattr(node_type, '__name__', 'node')} cannot start: {error}", file=sys.stderr)
+        status = 1
+    finally:
+        # A second signal during the shutdown must not leave a traceback behind.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        executor.shutdown(timeout_sec=2.0)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    sys.exit(status)
+
+
+def parameter(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+    read_only: bool = False,
+) -> Any:
+    """Declare a parameter with its description and range, and return its value.
+
+    A value of a read-only or start-up parameter that is not one of ``choices`` raises ``BAD_REQUEST``.
+    """
+    descriptor = ParameterDescriptor(description=description, read_only=read_only)
+    if choices is not None:
+        descriptor.additional_constraints = "one of: " + ", ".join(choices)
+    if low is not None and high is not None:
+        if isinstance(default, int) and not isinstance(default, bool):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)]
+    value = node.declare_parameter(name, default, descriptor).value
+    if choices is not None and value not in choices:
+        raise MagicError(Code.BAD_REQUEST, f"parameter {name}", value, choices)
+    return value
+
+
+def describe(node: Node, error: BaseException) -> tuple[int, str]:
+    """Code and message of any exception, for the answer of a handler.
+
+    What is not a :class:`MagicError` is a defect of ours: it is logged with its traceback and answered as INTERNAL.
+    """
+    if isinstance(error, MagicError):
+        return int(error.code), error.message
+    node.get_logger().error("".join(traceback.format_exception(error)))
+    return int(Code.INTERNAL), f"{type(error).__name__}: {error}"

@@ -1,0 +1,135 @@
+"""Pictures of meshes by ray casting (Open3D, CPU): no renderer, no GPU, no display."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magic_core import transforms
+from magic_core.camera import Intrinsics
+from magic_core.mesh import Mesh
+from magic_core.scene import CanonicalView
+
+#: Edge length in pixels of a canonical view, and the share of it that the object fills.
+VIEW_SIZE = 384
+VIEW_FILL = 0.8
+
+GREY = np.array([180, 180, 185], dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Cast:
+    """Where a grid of rays hit.
+
+    distance (H, W) float32 along unit rays (inf: none); ids (H, W) int32 index of
+    the mesh hit, -1 none; normals (H, W, 3) world, towards the eye; color (H, W, 3) uint8.
+    """
+
+    distance: NDArray[np.float32]
+    ids: NDArray[np.int32]
+    normals: NDArray[np.float32]
+    color: NDArray[np.uint8]
+
+
+class Raycaster:
+    """A fixed set of meshes, ready to be looked at from anywhere.
+
+    meshes are given in world coordinates; a mesh without colours is grey.
+    """
+
+    def __init__(self, meshes: list[Mesh] | tuple[Mesh, ...]) -> None:
+        import open3d as o3d  # slow to import; only who renders pays for it
+
+        self._o3d = o3d
+        self._meshes = list(meshes)
+        self._scene = o3d.t.geometry.RaycastingScene()
+        for mesh in self._meshes:
+            self._scene.add_triangles(
+                o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+            )
+
+    def cast(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Cast:
+        """Cast rays: origins and unit directions, each (H, W, 3) in world coordinates."""
+        rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).astype(np.float32)
+        hits = self._scene.cast_rays(self._o3d.core.Tensor(rays))
+        distance = hits["t_hit"].numpy()
+        ids = hits["geometry_ids"].numpy().astype(np.int64)
+        hit = np.isfinite(distance)
+        ids = np.where(hit, ids, -1).astype(np.int32)
+        normals = hits["primitive_normals"].numpy()
+        facing = np.sum(normals * rays[..., 3:], axis=-1, keepdims=True) > 0
+        normals = np.where(facing, -normals, normals)
+        color = np.zeros((*distance.shape, 3), dtype=np.uint8)
+        primitives = hits["primitive_ids"].numpy()
+        uv = hits["primitive_uvs"].numpy()
+        for index, mesh in enumerate(self._meshes):
+            where = ids == index
+            if not where.any():
+                continue
+            if mesh.colors is None:
+                color[where] = GREY
+                continue
+            corners = mesh.colors[mesh.faces[primitives[where]]].astype(np.float32)
+            b, c = uv[where][:, 0:1], uv[where][:, 1:2]
+            color[where] = (corners[:, 0] * (1 - b - c) + corners[:, 1] * b + corners[:, 2] * c).round().astype(np.uint8)
+        return Cast(distance, ids, normals, color)
+
+    def perspective(self, intrinsics: Intrinsics, world_from_camera: NDArray[np.float64]) -> tuple[Cast, NDArray[np.float32]]:
+        """Look through a pinhole camera; also returns the depth image (H, W), metres along z, NaN where nothing is."""
+        rays = intrinsics.unproject(np.ones((intrinsics.height, intrinsics.width)))
+        length = np.linalg.norm(rays, axis=-1)
+        directions = (rays / length[..., None]) @ world_from_camera[:3, :3].T
+        cast = self.cast(world_from_camera[:3, 3], directions)
+        depth = np.where(np.isfinite(cast.distance), cast.distance / length, np.nan).astype(np.float32)
+        return cast, depth
+
+    def orthographic(self, world_from_view: NDArray[np.float64], size: tuple[int, int], metres_per_pixel: float, reach: float) -> tuple[Cast, NDArray[np.float32]]:
+        """Look along z of a view frame with parallel rays from ``reach`` metres before its plane.
+
+        size is (H, W); also returns depth (H, W) from the view plane, negative before it, NaN off the meshes.
+        """
+        height, width = size
+        v, u = np.mgrid[0:height, 0:width].astype(float)
+        plane = np.stack(
+            [(u - (width - 1) / 2) * metres_per_pixel, (v - (height - 1) / 2) * metres_per_pixel, np.full_like(u, -reach)], axis=-1
+        )
+        cast = self.cast(transforms.apply(world_from_view, plane), world_from_view[:3, 2])
+        depth = np.where(np.isfinite(cast.distance), cast.distance - reach, np.nan).astype(np.float32)
+        return cast, depth
+
+
+def shade(cast: Cast, light: ArrayLike = (0.3, 0.2, 1.0), ambient: float = 0.45, background: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.uint8]:
+    """Colours under one distant light (a direction towards it, world frame): (H, W, 3) uint8."""
+    lambert = np.clip(cast.normals @ transforms.unit(light), 0, 1)
+    image = cast.color * (ambient + (1 - ambient) * lambert)[..., None]
+    image[cast.ids < 0] = background
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def canonical_view(
+    mesh: Mesh,
+    direction: ArrayLike,
+    up: ArrayLike,
+    kind: str,
+    size: int = VIEW_SIZE,
+    fill: float = VIEW_FILL,
+    confidence: float = 1.0,
+) -> CanonicalView:
+    """Draw a mesh (object frame) as seen along ``direction`` with ``up`` at the top of the picture.
+
+    The picture is square; the silhouette's larger side fills ``fill`` of it.
+    """
+    z = transforms.unit(direction)
+    up = np.asarray(up, dtype=float)
+    y = transforms.unit(-(up - (up @ z) * z))
+    rotation = np.column_stack([np.cross(y, z), y, z])
+    local = mesh.vertices @ rotation
+    low, high = local.min(axis=0), local.max(axis=0)
+    object_from_view = transforms.make(rotation, rotation @ ((low + high) / 2))
+    metres_per_pixel = max(float((high - low)[:2].max()), 1e-6) / (fill * size)
+    reach = float(high[2] - low[2]) / 2 + 0.01
+    cast, depth = Raycaster([mesh]).orthographic(object_from_view, (size, size), metres_per_pixel, reach)
+    image = shade(cast, light=-z + 0.4 * np.cross(y, z) - 0.3 * y)
+    return CanonicalView(image, cast.ids >= 0, metres_per_pixel, object_from_view, kind, depth, confidence)

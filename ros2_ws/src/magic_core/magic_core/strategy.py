@@ -1,0 +1,267 @@
+"""A strategy: one demonstration of a tool in use, as a folder (paper, III-A).
+
+The folder holds ``strategy.yaml`` and what it names::
+
+    strategy.yaml     everything below
+    tool.png          canonical view of the reference tool T, RGB
+    tool_mask.png     its mask (255 on the tool)
+    target.png, target_mask.png      the same for the reference object O
+    tool.ply, target.ply             meshes in their own frames (to replay and to render)
+    trajectory.csv    t, x, y, z, qx, qy, qz, qw: target_from_tool, with the target's
+                      frame where it stood when the motion began
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.contact import Contact, contact_frame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh, load as load_mesh
+from magic_core.scene import CanonicalView
+
+MODES = ("plan", "retarget")
+REFLECTIONS = ("keep", "turn")
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A pose of the tool's contact frame on the way.
+
+    offset (3,) metres from the target's contact frame, in axes of that frame: x
+    along the target's outward normal, z along the view direction.  ``phase`` names
+    the part of the motion that ends here; speed in m/s.
+    """
+
+    name: str
+    offset: NDArray[np.float64]
+    phase: str
+    speed: float = 0.1
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The test that decides success in simulation: ``test`` is a name the verifier knows, ``values`` its numbers."""
+
+    test: str
+    values: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Friction coefficients and densities (kg/m^3) of the simulation."""
+
+    friction: float = 0.5
+    tool_density: float = 600.0
+    target_density: float = 600.0
+    target_is_fixed: bool = False
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """The demonstration and how it is to be carried over.
+
+    view: kind of canonical view the contacts are matched in.  mode: ``plan`` goes
+    through the waypoints, ``retarget`` carries the demonstrated trajectory over.
+    target_normal (3,): world direction of the target's outward normal at p_O (the
+    side on which the tool acts); target_view_direction (3,): world direction in which
+    the target is looked at, and with which the tool's view direction is made to agree.
+    reflections: what to do with mirrored matches, in
+    order of trial: ``keep`` the tool's face or ``turn`` it over.  environment: names
+    and numbers of fixed things around (for the scene set-ups).
+    """
+
+    name: str
+    description: str
+    view: str
+    mode: str
+    tool_view: CanonicalView
+    tool_contact: Contact
+    target_view: CanonicalView
+    target_contact: Contact
+    target_normal: NDArray[np.float64]
+    target_view_direction: NDArray[np.float64]
+    times: NDArray[np.float64]
+    target_from_tool: NDArray[np.float64]
+    tool_mesh: Mesh
+    target_mesh: Mesh
+    waypoints: tuple[Waypoint, ...]
+    goal: Goal
+    physics: Physics
+    reflections: tuple[str, ...] = REFLECTIONS
+    releases: bool = False
+    simulatable: bool = True
+    environment: dict[str, Any] = field(default_factory=dict)
+
+
+def _read_image(path: Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise MagicError(Code.BAD_STRATEGY, "reference image", str(path), "a readable PNG")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _read_mask(path: Path) -> NDArray[np.bool_]:
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise MagicError(Code.BAD_STRATEGY, "reference mask", str(path), "a readable PNG")
+    return mask > 127
+
+
+def _view(folder: Path, prefix: str, kind: str, data: dict[str, Any]) -> CanonicalView:
+    return CanonicalView(
+        _read_image(folder / f"{prefix}.png"),
+        _read_mask(folder / f"{prefix}_mask.png"),
+        float(data["metres_per_pixel"]),
+        transforms.from_quaternion(data["object_from_view"]["position"], data["object_from_view"]["orientation"]),
+        kind,
+    )
+
+
+def _contact(view: CanonicalView, data: dict[str, Any]) -> Contact:
+    pixel = np.array(data["pixel"], dtype=float)
+    normal = transforms.unit(data["normal"])
+    return Contact(
+        pixel, normal, float(data["radius"]), bool(data["concave"]), float(data["scale"]), contact_frame(view, pixel, normal)
+    )
+
+
+def load(folder: str | Path) -> Strategy:
+    """Read a strategy folder; ``BAD_STRATEGY`` says which key or file is wrong."""
+    folder = Path(folder)
+    path = folder / "strategy.yaml"
+    if not path.is_file():
+        raise MagicError(Code.UNKNOWN_STRATEGY, "strategy folder", str(folder), "a folder with a strategy.yaml")
+    try:
+        data = yaml.safe_load(path.read_text())
+        if data["mode"] not in MODES:
+            raise MagicError(Code.BAD_STRATEGY, f"{path}: mode", data["mode"], MODES)
+        tool_view = _view(folder, "tool", data["view"], data["tool"])
+        target_view = _view(folder, "target", data["view"], data["target"])
+        with open(folder / "trajectory.csv", newline="") as file:
+            rows = np.array([[float(x) for x in row] for row in list(csv.reader(file))[1:]])
+        physics = data["physics"]
+        return Strategy(
+            name=data["name"],
+            description=data["description"],
+            view=data["view"],
+            mode=data["mode"],
+            tool_view=tool_view,
+            tool_contact=_contact(tool_view, data["tool"]["contact"]),
+            target_view=target_view,
+            target_contact=_contact(target_view, data["target"]["contact"]),
+            target_normal=transforms.unit(data["target"]["normal_in_world"]),
+            target_view_direction=transforms.unit(data["target"]["view_direction_in_world"]),
+            times=rows[:, 0],
+            target_from_tool=np.stack([transforms.from_quaternion(r[1:4], r[4:8]) for r in rows]),
+            tool_mesh=load_mesh(folder / "tool.ply"),
+            target_mesh=load_mesh(folder / "target.ply"),
+            waypoints=tuple(
+                Waypoint(w["name"], np.array(w["offset"], dtype=float), w["phase"], float(w.get("speed", 0.1)))
+                for w in data.get("waypoints", [])
+            ),
+            goal=Goal(data["goal"]["test"], {k: float(v) for k, v in data["goal"].get("values", {}).items()}),
+            physics=Physics(**physics),
+            reflections=tuple(data.get("reflections", REFLECTIONS)),
+            releases=bool(data.get("releases", False)),
+            simulatable=bool(data.get("simulatable", True)),
+            environment=dict(data.get("environment", {})),
+        )
+    except MagicError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, OSError, yaml.YAMLError) as error:
+        raise MagicError(Code.BAD_STRATEGY, f"strategy file {path}", f"{type(error).__name__}: {error}", "the keys that magic_core.strategy documents") from error
+
+
+def installed_folder() -> Path:
+    """Where the strategies that ship with the project are installed."""
+    from ament_index_python.packages import get_package_share_directory
+
+    return Path(get_package_share_directory("magic_bringup")) / "strategies"
+
+
+def find(name: str, root: str | Path | None = None) -> Strategy:
+    """Load a strategy by the name of its folder under ``root`` (default: the installed ones) or by its path.
+
+    Raises ``UNKNOWN_STRATEGY`` naming the strategies there are.
+    """
+    if name and "/" in name:
+        return load(name)
+    root = Path(root) if root else installed_folder()
+    names = sorted(p.parent.name for p in root.glob("*/strategy.yaml"))
+    if name not in names:
+        raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, [*names, "or the path of a strategy folder"])
+    return load(root / name)
+
+
+def _floats(values: Any) -> list[float]:
+    return [float(x) for x in np.asarray(values, dtype=float).ravel()]
+
+
+def _view_data(view: CanonicalView, contact: Contact) -> dict[str, Any]:
+    return {
+        "metres_per_pixel": float(view.metres_per_pixel),
+        "object_from_view": {
+            "position": _floats(view.object_from_view[:3, 3]),
+            "orientation": _floats(transforms.quaternion_xyzw(view.object_from_view)),
+        },
+        "contact": {
+            "pixel": _floats(contact.pixel),
+            "normal": _floats(contact.normal),
+            "radius": float(contact.radius),
+            "concave": bool(contact.concave),
+            "scale": float(contact.scale),
+        },
+    }
+
+
+def save(strategy: Strategy, folder: str | Path) -> None:
+    """Write a strategy folder that :func:`load` reads back."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for prefix, view in (("tool", strategy.tool_view), ("target", strategy.target_view)):
+        cv2.imwrite(str(folder / f"{prefix}.png"), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(folder / f"{prefix}_mask.png"), view.mask.astype(np.uint8) * 255)
+    strategy.tool_mesh.save(folder / "tool.ply")
+    strategy.target_mesh.save(folder / "target.ply")
+    with open(folder / "trajectory.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        for t, pose in zip(strategy.times, strategy.target_from_tool, strict=True):
+            writer.writerow([f"{v:.9g}" for v in (t, *pose[:3, 3], *transforms.quaternion_xyzw(pose))])
+    data = {
+        "name": strategy.name,
+        "description": strategy.description,
+        "view": strategy.view,
+        "mode": strategy.mode,
+        "tool": _view_data(strategy.tool_view, strategy.tool_contact),
+        "target": {
+            **_view_data(strategy.target_view, strategy.target_contact),
+            "normal_in_world": _floats(strategy.target_normal),
+            "view_direction_in_world": _floats(strategy.target_view_direction),
+        },
+        "reflections": list(strategy.reflections),
+        "releases": strategy.releases,
+        "simulatable": strategy.simulatable,
+        "waypoints": [
+            {"name": w.name, "offset": _floats(w.offset), "phase": w.phase, "speed": w.speed} for w in strategy.waypoints
+        ],
+        "goal": {"test": strategy.goal.test, "values": dict(strategy.goal.values)},
+        "physics": {
+            "friction": strategy.physics.friction,
+            "tool_density": strategy.physics.tool_density,
+            "target_density": strategy.physics.target_density,
+            "target_is_fixed": strategy.physics.target_is_fixed,
+        },
+        "environment": dict(strategy.environment),
+    }
+    (folder / "strategy.yaml").write_text(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
