@@ -1,0 +1,128 @@
+"""Convex pieces against convex pieces: which two bodies touch, and where (FCL, as MPlib ships it)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.scene import SceneObject
+
+
+def hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Vertices (V, 3) and outward faces (F, 3) of the convex hull of points (N, 3).
+
+    A set without volume (a sheet, a line) is thickened by 0.1 mm each way first, so that it still has a hull.
+    """
+    points = np.asarray(vertices, dtype=float).reshape(-1, 3)
+    if len(points) == 0:
+        raise MagicError(Code.BAD_MESH, "convex piece", "no vertices", "at least one vertex")
+    try:
+        shell = ConvexHull(points)
+    except (QhullError, ValueError):
+        pad = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 1e-4
+        points = (points[:, None] + pad).reshape(-1, 3)
+        try:
+            shell = ConvexHull(points, qhull_options="QJ")
+        except (QhullError, ValueError) as error:
+            raise MagicError(Code.BAD_MESH, "convex piece", str(error).splitlines()[0], "points with a convex hull") from error
+    used = np.unique(shell.simplices)
+    index = np.zeros(len(points), dtype=np.int32)
+    index[used] = np.arange(len(used), dtype=np.int32)
+    faces = index[shell.simplices]
+    corners = points[shell.simplices]
+    # Qhull orders a simplex's corners anyhow; its equations hold the outward normals.
+    inward = np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), shell.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return points[used], faces.astype(np.int32)
+
+
+def solid_pieces(item: SceneObject) -> tuple[Mesh, ...]:
+    """The convex pieces of an object; where it has none, the convex hull of its mesh (object frame)."""
+    pieces = tuple(p for p in item.pieces if len(p.vertices))
+    if pieces:
+        return pieces
+    if len(item.mesh.vertices) == 0:
+        raise MagicError(Code.BAD_MESH, f"mesh of {item.id}", "no vertices and no convex pieces", "an object with a shape")
+    return (Mesh(*hull(item.mesh.vertices)),)
+
+
+def outer_points(item: SceneObject) -> NDArray[np.float64]:
+    """Corners (N, 3) of the convex hull of the whole object, object frame: all that its extent in a direction depends on."""
+    return hull(np.concatenate([p.vertices for p in solid_pieces(item)]))[0]
+
+
+def fcl_pose(transform: NDArray[np.float64]) -> Any:
+    """A 4x4 transform as MPlib's Pose."""
+    import mplib
+
+    return mplib.Pose(np.asarray(transform)[:3, 3], transforms.quaternion_wxyz(transform))
+
+
+def convex_shape(piece: Mesh) -> Any:
+    """A convex piece as FCL's convex geometry."""
+    from mplib.collision_detection import fcl
+
+    vertices, faces = hull(piece.vertices)
+    return fcl.Convex(vertices, faces)
+
+
+class Body:
+    """A named rigid body of convex shapes that can be moved and asked what it touches."""
+
+    def __init__(self, name: str, shapes: Sequence[Any], local: Sequence[NDArray[np.float64]], radii: Sequence[float]) -> None:
+        """shapes: FCL geometries; local: body_from_shape (4, 4) of each; radii: of the ball about each shape's origin, m."""
+        import mplib
+        from mplib.collision_detection import fcl
+
+        self.name = name
+        self.shapes = list(shapes)
+        self.objects = [fcl.CollisionObject(shape, mplib.Pose()) for shape in shapes]
+        self.local = np.asarray(local, dtype=float).reshape(-1, 4, 4)
+        self.radii = np.asarray(radii, dtype=float)
+        self.centres = self.local[:, :3, 3].copy()
+
+    @classmethod
+    def from_pieces(cls, name: str, pieces: Iterable[Mesh]) -> Body:
+        """A body of convex meshes given in the body's frame."""
+        from mplib.collision_detection import fcl
+
+        shapes, local, radii = [], [], []
+        for piece in pieces:
+            vertices, faces = hull(piece.vertices)
+            centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+            shapes.append(fcl.Convex(vertices - centre, faces))
+            local.append(transforms.make(translation=centre))
+            radii.append(float(np.linalg.norm(vertices - centre, axis=1).max()))
+        return cls(name, shapes, local, radii)
+
+    @classmethod
+    def from_object(cls, item: SceneObject) -> Body:
+        """A body of an object's pieces, already placed where the object is."""
+        body = cls.from_pieces(item.id, solid_pieces(item))
+        body.move(item.world_from_object)
+        return body
+
+    def move(self, world_from_body: NDArray[np.float64]) -> None:
+        """Place the body."""
+        world_from_shape = np.asarray(world_from_body) @ self.local
+        self.centres = world_from_shape[:, :3, 3]
+        for shape, pose in zip(self.objects, world_from_shape, strict=True):
+            shape.set_pose(fcl_pose(pose))
+
+    def touches(self, other: Body) -> bool:
+        """Whether any shape of this body meets any of the other's."""
+        from mplib.pymp.collision_detection import fcl
+
+        reach = self.radii[:, None] + other.radii[None, :]
+        near = np.linalg.norm(self.centres[:, None] - other.centres[None, :], axis=2) < reach
+        for i, j in np.argwhere(near):
+            if fcl.collide(self.objects[i], other.objects[j]).is_collision():
+                return True
+        return False

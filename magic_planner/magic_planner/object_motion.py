@@ -1,0 +1,262 @@
+"""The motion of the tool alone: the floating gripper of the paper (III-C).
+
+Two ways to make it, both in terms of C(t) = target_contact_from_tool_contact, the
+pose of the tool's contact frame in the target's:
+
+    world_from_tool(t) = world_from_target  target_from_contact  C(t)  tool_from_contact^-1
+
+``retarget`` takes C(t) from the demonstration, ``plan`` leads the squarely opposed
+frames through the strategy's waypoints.  Either way the motion is then raised by
+the least amount that keeps the tool above the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.contact import OPPOSED, Contact, ContactCandidate, turned_over
+from magic_core.errors import Code, MagicError
+from magic_core.motion import Phase, ToolMotion
+from magic_core.scene import SceneObject
+from magic_core.strategy import MODES, REFLECTIONS, Strategy
+from magic_planner.collision import Body, outer_points, solid_pieces
+
+#: Largest step between two samples: metres, radians.
+STEP_LENGTH = 0.005
+STEP_ANGLE = np.deg2rad(2.0)
+#: Gap kept between tool and table, metres.
+TABLE_CLEARANCE = 0.001
+#: How quickly the tool takes up and loses its speed between waypoints, m/s^2.
+ACCELERATION = 1.0
+#: How long a waypoint that does not move the tool lasts (the gripper opens), seconds.
+DWELL = 0.5
+
+
+def plan_tool_motion(
+    strategy: Strategy,
+    tool: SceneObject,
+    target: SceneObject,
+    candidate: ContactCandidate,
+    reflection: str = "keep",
+    table: NDArray[np.float64] | Sequence[float] = (0.0, 0.0, 1.0, 0.0),
+    obstacles: Sequence[SceneObject] = (),
+) -> ToolMotion:
+    """The motion of a new tool that brings its contact onto the target's as the demonstration did.
+
+    reflection: for a mirrored candidate, ``turn`` turns the tool over (exact), ``keep`` keeps its
+    face (the mirrored part of the likeness is lost); without effect on other candidates.
+    table (4,): plane a x + b y + c z + d = 0 in world coordinates, unit normal up.
+
+    A strategy that releases ends with its phase ``release``: the tool has left the hand, and
+    waypoints after that are the hand's own.
+
+    Raises BAD_REQUEST (no target contact, unknown reflection, another tool's candidate), BAD_STRATEGY
+    (no waypoints, no demonstration), BAD_MOTION (NaN, a frame that is not a rotation, a table that
+    stands on edge), BAD_MESH (a tool without a shape), and PATH_IN_COLLISION naming the pair where the
+    tool would start inside the target or an obstacle.
+    """
+    if candidate.target is None:
+        raise MagicError(Code.BAD_REQUEST, f"candidate of tool {tool.id}", "without a target contact", "a candidate with the target's contact filled in")
+    if candidate.tool_id and candidate.tool_id != tool.id:
+        raise MagicError(Code.BAD_REQUEST, "tool of the candidate", candidate.tool_id, f"{tool.id!r}, the tool of the request")
+    if reflection not in REFLECTIONS:
+        raise MagicError(Code.BAD_REQUEST, "reflection", reflection, REFLECTIONS)
+    plane = _plane(table)
+    _rigid(tool.world_from_object, f"pose of {tool.id}")  # the arm starts from it
+    world_from_target = _rigid(target.world_from_object, f"pose of {target.id}")
+    target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
+    tool_from_contact = tool_contact_frame(candidate, reflection)
+
+    if strategy.mode == "plan":
+        times, contacts, phases = waypoint_motion(strategy)
+    elif strategy.mode == "retarget":
+        times, contacts, phases = demonstrated_motion(strategy)
+    else:
+        raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
+    world_from_tool = (world_from_target @ target_from_contact) @ contacts @ transforms.inverse(tool_from_contact)
+    world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool))
+    motion = ToolMotion(times, world_from_tool, phases)
+    start = Body.from_pieces(tool.id, solid_pieces(tool))
+    start.move(motion.world_from_tool[0])
+    for item in (target, *obstacles):
+        if start.touches(Body.from_object(item)):
+            raise MagicError(
+                Code.PATH_IN_COLLISION,
+                f"start of the tool's motion: {tool.id} and {item.id}",
+                "in collision",
+                "a first waypoint at which the tool is clear of the target and the obstacles",
+            )
+    return motion
+
+
+def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:
+    """tool_from_contact (4, 4) that is led along: turned over for a mirrored match that is to be turned."""
+    tool_from_contact = _rigid(candidate.tool.object_from_contact, f"contact frame of {candidate.tool_id or 'the tool'}")
+    return turned_over(tool_from_contact) if candidate.flipped and reflection == "turn" else tool_from_contact
+
+
+def waypoint_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Phase, ...]]:
+    """times (T,), C(t) (T, 4, 4) and phases of a ``plan`` strategy: straight lines, at rest at each waypoint."""
+    waypoints = list(strategy.waypoints)
+    if strategy.releases:
+        last = next((i for i, w in enumerate(waypoints) if w.phase == "release"), None)
+        waypoints = waypoints[: last + 1] if last is not None else waypoints
+    if len(waypoints) < 2:
+        raise MagicError(Code.BAD_STRATEGY, f"waypoints of {strategy.name}", len(waypoints), "two or more for mode 'plan'")
+    offsets = np.array([np.asarray(w.offset, dtype=float) for w in waypoints])
+    if offsets.shape != (len(waypoints), 3) or not np.all(np.isfinite(offsets)):
+        raise MagicError(Code.BAD_STRATEGY, f"offsets of the waypoints of {strategy.name}", offsets.tolist(), "three finite metres each")
+    times, points = [np.zeros(1)], [offsets[:1]]
+    pieces: list[tuple[str, float]] = []
+    now = 0.0
+    for i in range(1, len(waypoints)):
+        speed = float(waypoints[i].speed)
+        if not (np.isfinite(speed) and speed > 0):
+            raise MagicError(Code.BAD_STRATEGY, f"speed of waypoint {waypoints[i].name} of {strategy.name}", speed, "a number of m/s above 0")
+        seconds, share = straight_line(float(np.linalg.norm(offsets[i] - offsets[i - 1])), speed)
+        times.append(now + seconds)
+        points.append(offsets[i - 1] + share[:, None] * (offsets[i] - offsets[i - 1]))
+        now += float(seconds[-1])
+        pieces.append((waypoints[i].phase, now))
+    if strategy.releases and waypoints[-1].phase != "release":
+        now += DWELL
+        times.append(np.array([now]))
+        points.append(offsets[-1:])
+        pieces.append(("release", now))
+    contacts = np.tile(np.eye(4), (sum(len(p) for p in points), 1, 1))
+    contacts[:, :3, 3] = np.concatenate(points)
+    return np.concatenate(times), contacts @ OPPOSED, join_phases(pieces)
+
+
+def straight_line(length: float, speed: float, acceleration: float = ACCELERATION) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times (n,) and shares (n,) of a rest-to-rest line, its start left out: trapezoidal speed, steps of STEP_LENGTH at most.
+
+    A line of no length is a rest of DWELL seconds.
+    """
+    if length < 1e-9:
+        return np.array([DWELL]), np.ones(1)
+    ramp = min(speed / acceleration, np.sqrt(length / acceleration))
+    top = ramp * acceleration
+    cruise = max(0.0, (length - top * ramp) / top)
+    knots = np.concatenate(
+        [
+            np.linspace(0, ramp, max(4, int(np.ceil(0.5 * top * ramp / STEP_LENGTH * 2))) + 1),
+            np.linspace(ramp, ramp + cruise, int(np.ceil(top * cruise / STEP_LENGTH)) + 1) if cruise > 1e-9 else [],
+            np.linspace(ramp + cruise, 2 * ramp + cruise, max(4, int(np.ceil(0.5 * top * ramp / STEP_LENGTH * 2))) + 1),
+        ]
+    )
+    times = knots[np.concatenate([[True], np.diff(knots) > 1e-9])][1:]
+    total = 2 * ramp + cruise
+    left = total - times
+    travelled = np.where(
+        times <= ramp,
+        0.5 * acceleration * times**2,
+        np.where(left <= ramp, length - 0.5 * acceleration * left**2, 0.5 * top * ramp + top * (times - ramp)),
+    )
+    share = np.clip(travelled / length, 0.0, 1.0)
+    share[-1] = 1.0
+    return times, share
+
+
+def demonstrated_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Phase, ...]]:
+    """times (T,), C(t) (T, 4, 4) and phases of a ``retarget`` strategy: the demonstration, its own samples kept and refined.
+
+    The phases come from the strategy's waypoints: each ends when the demonstrated contact
+    passes nearest to its offset.  Without waypoints: ``approach`` until the contact points
+    first meet (3 mm), then ``goal``.
+    """
+    times = np.asarray(strategy.times, dtype=float)
+    demonstrated = np.asarray(strategy.target_from_tool, dtype=float)
+    if len(times) < 2 or demonstrated.shape != (len(times), 4, 4):
+        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", f"{len(times)} times, poses {demonstrated.shape}", "two or more timed poses")
+    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(demonstrated)) and np.all(np.diff(times) > 0)):
+        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", "NaN, or times that do not increase", "finite poses at increasing times")
+    target_from_contact = _reference(strategy.target_contact, f"target contact of {strategy.name}")
+    tool_from_contact = _reference(strategy.tool_contact, f"tool contact of {strategy.name}")
+    at = refined_times(times, demonstrated)
+    contacts = transforms.inverse(target_from_contact) @ transforms.interpolate(times, demonstrated, at) @ tool_from_contact
+    at = at - at[0]
+    points = contacts[:, :3, 3]
+    pieces: list[tuple[str, float]] = []
+    if strategy.waypoints:
+        first = 0
+        for waypoint in strategy.waypoints:
+            first += int(np.argmin(np.linalg.norm(points[first:] - np.asarray(waypoint.offset, dtype=float), axis=1)))
+            if first > 0:
+                pieces.append((waypoint.phase, float(at[first])))
+        if not pieces or pieces[-1][1] < at[-1]:
+            pieces.append((strategy.waypoints[-1].phase, float(at[-1])))
+    else:
+        met = np.flatnonzero(np.linalg.norm(points, axis=1) <= 0.003)
+        if len(met) and 0 < met[0] < len(at) - 1:
+            pieces.append(("approach", float(at[met[0]])))
+        pieces.append(("goal", float(at[-1])))
+    if strategy.releases and pieces[-1][0] != "release":
+        at = np.append(at, at[-1] + DWELL)
+        contacts = np.concatenate([contacts, contacts[-1:]])
+        pieces.append(("release", float(at[-1])))
+    return at, contacts, join_phases(pieces)
+
+
+def refined_times(times: NDArray[np.float64], poses: NDArray[np.float64], length: float = STEP_LENGTH, angle: float = STEP_ANGLE) -> NDArray[np.float64]:
+    """The given times (T,) and as many between them as keep each step of poses (T, 4, 4) within length and angle."""
+    moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turned = np.array([transforms.rotation_angle(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)])
+    parts = np.maximum(1, np.ceil(np.maximum(moved / length, turned / angle) - 1e-9)).astype(int)
+    inner = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(times[:-1], times[1:], parts, strict=True)]
+    return np.concatenate([times[:1], *inner])
+
+
+def join_phases(ends: Sequence[tuple[str, float]]) -> tuple[Phase, ...]:
+    """Phases from (name, end in seconds) in order of time; neighbours of one name become one."""
+    phases: list[Phase] = []
+    start = 0.0
+    for name, end in ends:
+        if end <= start:
+            continue
+        if phases and phases[-1].name == name:
+            phases[-1] = Phase(name, phases[-1].start, end)
+        else:
+            phases.append(Phase(name, start, end))
+        start = end
+    return tuple(phases)
+
+
+def lift_above(plane: NDArray[np.float64], world_from_tool: NDArray[np.float64], points: NDArray[np.float64], clearance: float = TABLE_CLEARANCE) -> float:
+    """Least rise along world up, metres, that keeps points (N, 3) of the tool frame above the plane at all poses (T, 4, 4)."""
+    normal = plane[:3]
+    in_tool = np.einsum("tji,j->ti", world_from_tool[:, :3, :3], normal)
+    height = (in_tool @ points.T).min(axis=1) + world_from_tool[:, :3, 3] @ normal + plane[3]
+    return max(0.0, (clearance - float(height.min())) / float(normal[2]))
+
+
+def _plane(table: NDArray[np.float64] | Sequence[float]) -> NDArray[np.float64]:
+    plane = np.asarray(table, dtype=float).reshape(-1)
+    if plane.shape != (4,) or not np.all(np.isfinite(plane)):
+        raise MagicError(Code.BAD_MOTION, "table plane", plane.tolist(), "four finite coefficients a, b, c, d")
+    norm = float(np.linalg.norm(plane[:3]))
+    if norm < 1e-9 or abs(plane[2]) < 0.5 * norm:
+        raise MagicError(Code.BAD_MOTION, "table plane", plane.tolist(), "a normal within 60 degrees of world up")
+    plane = plane / norm
+    return plane if plane[2] > 0 else -plane
+
+
+def _rigid(transform: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    transform = np.asarray(transform, dtype=float)
+    if transform.shape != (4, 4) or not np.all(np.isfinite(transform)):
+        raise MagicError(Code.BAD_MOTION, what, "NaN, infinite or misshapen", "a finite 4x4 transform")
+    rotation = transform[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
+        raise MagicError(Code.BAD_MOTION, what, rotation.round(4).tolist(), "a right-handed rotation (determinant 1)")
+    return transform
+
+
+def _reference(contact: Contact, what: str) -> NDArray[np.float64]:
+    try:
+        return _rigid(contact.object_from_contact, what)
+    except MagicError as error:
+        raise MagicError(Code.BAD_STRATEGY, what, error.message) from error

@@ -1,0 +1,224 @@
+"""The motion of the tool: contacts meet, the table stays clear, the target's frame is all that matters."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+import scenes
+from hypothesis import given, settings, strategies as st
+
+from magic_core import transforms
+from magic_core.contact import OPPOSED, turned_over
+from magic_core.errors import Code, MagicError
+from magic_core.strategy import Waypoint
+from magic_planner.object_motion import STEP_LENGTH, TABLE_CLEARANCE, plan_tool_motion, straight_line
+
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+
+
+def setup(flipped=False, **changes):
+    tool, tool_contact = scenes.hook()
+    target, target_contact = scenes.standing_cylinder()
+    return scenes.pulling(**changes), tool, target, scenes.candidate(tool, tool_contact, target_contact, flipped)
+
+
+def at(motion, seconds):
+    return transforms.interpolate(motion.times, motion.world_from_tool, [seconds])[0]
+
+
+def contact_end(motion):
+    return next(p.end for p in motion.phases if p.name == "contact")
+
+
+def test_contact_frames_meet_squarely_at_the_contact_waypoint():
+    strategy, tool, target, candidate = setup()
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", TABLE)
+    tool_contact = at(motion, contact_end(motion)) @ candidate.tool.object_from_contact
+    target_contact = target.world_from_object @ candidate.target.object_from_contact
+    np.testing.assert_allclose(tool_contact[:3, 3], target_contact[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(tool_contact[:3, 0], -target_contact[:3, 0], atol=1e-9)
+    np.testing.assert_allclose(tool_contact[:3, 2], target_contact[:3, 2], atol=1e-9)
+
+
+def test_phases_follow_the_waypoints_and_times_increase():
+    strategy, tool, target, candidate = setup()
+    motion = plan_tool_motion(strategy, tool, target, candidate)
+    assert [p.name for p in motion.phases] == ["approach", "contact", "goal"]
+    assert motion.phases[0].start == 0 and motion.phases[-1].end == pytest.approx(motion.times[-1])
+    assert all(a.end == b.start for a, b in zip(motion.phases, motion.phases[1:], strict=False))
+    assert np.all(np.diff(motion.times) > 0)
+    steps = np.linalg.norm(np.diff(motion.world_from_tool[:, :3, 3], axis=0), axis=1)
+    assert steps.max() <= STEP_LENGTH + 1e-9
+    assert (steps / np.diff(motion.times)).max() <= 0.1 + 1e-9
+
+
+def test_a_line_keeps_speed_and_acceleration():
+    times, share = straight_line(0.3, 0.1, 1.0)
+    assert times[-1] == pytest.approx(3.1)
+    assert share[-1] == 1 and np.all(np.diff(share) > 0)
+    short, _ = straight_line(0.001, 0.1, 1.0)
+    assert short[-1] == pytest.approx(2 * np.sqrt(0.001))
+
+
+def demonstration():
+    """A demonstrated sweep with a turn, given as target_from_tool, and the strategy that holds it."""
+    tool, tool_contact = scenes.hook()
+    target, target_contact = scenes.standing_cylinder()
+    times = np.linspace(0, 2, 9)
+    poses = []
+    for share in times / 2:
+        c = transforms.from_rpy(0, 0, 0.4 * share, [0.05 * (1 - share), -0.05 * share, 0]) @ OPPOSED
+        poses.append(target_contact.object_from_contact @ c @ transforms.inverse(tool_contact.object_from_contact))
+    return scenes.pulling(waypoints=(), mode="retarget", times=times, target_from_tool=np.stack(poses))
+
+
+def with_no_waypoints(strategy):
+    return dataclasses.replace(strategy, waypoints=())
+
+
+def test_retargeting_with_the_references_own_contact_reproduces_the_demonstration():
+    strategy = with_no_waypoints(demonstration())
+    _, tool, target, candidate = setup()
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", TABLE)
+    raised = motion.world_from_tool[0, 2, 3] - (target.world_from_object @ strategy.target_from_tool[0])[2, 3]
+    assert raised == pytest.approx(0, abs=1e-9)
+    for t, pose in zip(strategy.times, strategy.target_from_tool, strict=True):
+        np.testing.assert_allclose(at(motion, t), target.world_from_object @ pose, atol=1e-9)
+        assert np.abs(motion.times - t).min() < 1e-12
+
+
+def test_retargeting_carries_the_contact_and_not_the_tool():
+    strategy = with_no_waypoints(demonstration())
+    tool, tool_contact = scenes.hook(handle=0.2)
+    target, target_contact = scenes.standing_cylinder(0.03, (0.5, 0.1))
+    motion = plan_tool_motion(strategy, tool, target, scenes.candidate(tool, tool_contact, target_contact), "keep", TABLE)
+    for t, pose in zip(strategy.times, strategy.target_from_tool, strict=True):
+        expected = transforms.inverse(strategy.target_contact.object_from_contact) @ pose @ strategy.tool_contact.object_from_contact
+        got = transforms.inverse(target.world_from_object @ target_contact.object_from_contact) @ at(motion, t) @ tool_contact.object_from_contact
+        np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+def test_turned_over_is_a_proper_rotation_and_keeps_the_normals_opposed():
+    strategy, tool, target, candidate = setup(flipped=True)
+    keep = plan_tool_motion(strategy, tool, target, candidate, "keep", TABLE)
+    turn = plan_tool_motion(strategy, tool, target, candidate, "turn", TABLE)
+    assert np.allclose(np.linalg.det(turn.world_from_tool[:, :3, :3]), 1)
+    np.testing.assert_allclose(turn.world_from_tool[0, :3, 2], -keep.world_from_tool[0, :3, 2], atol=1e-9)
+    frame = at(turn, contact_end(turn)) @ turned_over(candidate.tool.object_from_contact)
+    target_frame = target.world_from_object @ candidate.target.object_from_contact
+    np.testing.assert_allclose(transforms.inverse(target_frame) @ frame, OPPOSED, atol=1e-9)
+    plain = dataclasses.replace(candidate, flipped=False)
+    np.testing.assert_array_equal(plan_tool_motion(strategy, tool, target, plain, "turn", TABLE).world_from_tool, keep.world_from_tool)
+
+
+@pytest.mark.parametrize("table", [[0, 0, 1, 0], [0.05, 0.02, 1.0, -0.01], [0, 0, -2.0, 0.06]])
+def test_the_tool_is_raised_by_the_least_amount_that_clears_the_table(table):
+    strategy, tool, _, _ = setup()
+    _, tool_contact = scenes.hook(thickness=0.08)
+    tall, _ = scenes.hook(thickness=0.08)
+    target, target_contact = scenes.standing_cylinder(0.02)
+    motion = plan_tool_motion(strategy, tall, target, scenes.candidate(tall, tool_contact, target_contact), "keep", table)
+    plane = np.array(table, dtype=float) / np.linalg.norm(table[:3]) * np.sign(table[2])
+    vertices = np.concatenate([p.vertices for p in tall.pieces])
+    gaps = [(transforms.apply(pose, vertices) @ plane[:3] + plane[3]).min() for pose in motion.world_from_tool]
+    assert min(gaps) == pytest.approx(TABLE_CLEARANCE, abs=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    x=st.floats(-1, 1),
+    y=st.floats(-1, 1),
+    z=st.floats(0.5, 1),
+    yaw=st.floats(-3.1, 3.1),
+    roll=st.floats(-1, 1),
+    mode=st.sampled_from(["plan", "retarget"]),
+)
+def test_the_motion_moves_with_the_target(x, y, z, yaw, roll, mode):
+    strategy, tool, target, candidate = setup()
+    if mode == "retarget":
+        strategy = with_no_waypoints(demonstration())
+    shift = transforms.from_rpy(roll, 0, yaw, [x, y, z])
+    far = (0, 0, 1.0, 5.0)  # a table far below, so that nothing is raised
+    moved = dataclasses.replace(target, world_from_object=shift @ target.world_from_object)
+    a = plan_tool_motion(strategy, tool, target, candidate, "keep", far)
+    b = plan_tool_motion(strategy, tool, moved, candidate, "keep", far)
+    np.testing.assert_allclose(b.world_from_tool, shift @ a.world_from_tool, atol=1e-9)
+    np.testing.assert_array_equal(a.times, b.times)
+
+
+def test_a_releasing_strategy_ends_with_the_release():
+    strategy, tool, target, candidate = setup(releases=True)
+    motion = plan_tool_motion(strategy, tool, target, candidate)
+    assert motion.phases[-1].name == "release"
+    assert motion.phases[-1].end - motion.phases[-1].start == pytest.approx(0.5)
+    np.testing.assert_array_equal(motion.world_from_tool[-1], motion.world_from_tool[-2])
+    hand = (*strategy.waypoints, Waypoint("let go", np.array([-0.25, 0, 0]), "release", 0.1), Waypoint("away", np.array([0, 0, -0.1]), "retreat", 0.1))
+    longer = plan_tool_motion(dataclasses.replace(strategy, waypoints=hand), tool, target, candidate)
+    assert longer.phases == motion.phases
+
+
+def test_a_start_inside_the_target_or_an_obstacle_names_the_pair():
+    strategy, tool, target, candidate = setup()
+    inside = dataclasses.replace(strategy, waypoints=(Waypoint("start", np.array([-0.02, 0, 0]), "approach"), *strategy.waypoints[2:]))
+    with pytest.raises(MagicError, match="tool and target") as raised:
+        plan_tool_motion(inside, tool, target, candidate)
+    assert raised.value.code == Code.PATH_IN_COLLISION
+    wall = scenes.item("wall", [scenes.box([0.02, 0.5, 0.5])], transforms.make(translation=[0.5, 0, 0.25]))
+    with pytest.raises(MagicError, match="tool and wall") as raised:
+        plan_tool_motion(strategy, tool, target, candidate, "keep", TABLE, [wall])
+    assert raised.value.code == Code.PATH_IN_COLLISION
+
+
+def broken(strategy, tool, target, candidate, case):
+    nan = np.eye(4)
+    nan[0, 3] = np.nan
+    mirror = np.diag([-1.0, 1, 1, 1])
+    replace = dataclasses.replace
+    empty = scenes.box([1, 1, 1])
+    empty = dataclasses.replace(empty, vertices=np.zeros((0, 3)), faces=np.zeros((0, 3)))
+    return {
+        "no target": (strategy, tool, target, replace(candidate, target=None), "keep", TABLE, Code.BAD_REQUEST),
+        "other tool": (strategy, tool, target, replace(candidate, tool_id="spoon"), "keep", TABLE, Code.BAD_REQUEST),
+        "reflection": (strategy, tool, target, candidate, "swap", TABLE, Code.BAD_REQUEST),
+        "nan pose": (strategy, replace(tool, world_from_object=nan), target, candidate, "keep", TABLE, Code.BAD_MOTION),
+        "nan contact": (strategy, tool, target, replace(candidate, tool=replace(candidate.tool, object_from_contact=nan)), "keep", TABLE, Code.BAD_MOTION),
+        "mirrored": (strategy, tool, target, replace(candidate, target=replace(candidate.target, object_from_contact=mirror)), "keep", TABLE, Code.BAD_MOTION),
+        "degenerate": (strategy, tool, target, replace(candidate, tool=replace(candidate.tool, object_from_contact=np.diag([1.0, 0, 0, 1]))), "keep", TABLE, Code.BAD_MOTION),
+        "table on edge": (strategy, tool, target, candidate, "keep", (1, 0, 0, 0), Code.BAD_MOTION),
+        "nan table": (strategy, tool, target, candidate, "keep", (0, 0, np.nan, 0), Code.BAD_MOTION),
+        "no waypoints": (replace(strategy, waypoints=strategy.waypoints[:1]), tool, target, candidate, "keep", TABLE, Code.BAD_STRATEGY),
+        "no speed": (replace(strategy, waypoints=(*strategy.waypoints[:3], Waypoint("goal", np.ones(3), "goal", 0.0))), tool, target, candidate, "keep", TABLE, Code.BAD_STRATEGY),
+        "mode": (replace(strategy, mode="dance"), tool, target, candidate, "keep", TABLE, Code.BAD_STRATEGY),
+        "times": (replace(strategy, mode="retarget", times=np.zeros(2)), tool, target, candidate, "keep", TABLE, Code.BAD_STRATEGY),
+        "empty tool": (strategy, replace(tool, mesh=empty, pieces=()), target, candidate, "keep", TABLE, Code.BAD_MESH),
+    }[case]
+
+
+@pytest.mark.parametrize(
+    "case",
+    ["no target", "other tool", "reflection", "nan pose", "nan contact", "mirrored", "degenerate", "table on edge", "nan table", "no waypoints", "no speed", "mode", "times", "empty tool"],
+)  # fmt: skip
+def test_bad_input_gets_its_code(case):
+    *arguments, code = broken(*setup(), case)
+    with pytest.raises(MagicError) as raised:
+        plan_tool_motion(*arguments)
+    assert raised.value.code == code
+
+
+def test_a_sheet_without_volume_is_still_a_tool():
+    strategy, tool, target, candidate = setup()
+    flat = [scenes.box([0.3, 0.02, 0.0]), scenes.box([0.02, 0.08, 0.0], [0.14, 0.05, 0])]
+    sheet = dataclasses.replace(tool, pieces=tuple(flat), mesh=flat[0])
+    motion = plan_tool_motion(strategy, sheet, target, candidate)
+    assert motion.phases[-1].name == "goal"
+
+
+def test_a_candidate_takes_under_a_tenth_of_a_second():
+    strategy, tool, target, candidate = setup()
+    plan_tool_motion(strategy, tool, target, candidate)
+    start = time.perf_counter()
+    plan_tool_motion(strategy, tool, target, candidate)
+    assert time.perf_counter() - start < 0.1
