@@ -1,0 +1,42 @@
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "magic_bringup"
+
+
+def tree(*folders: str) -> list[tuple[str, list[str]]]:
+    """Every file below the folders, to be installed under the package's share at the same relative place."""
+    found: dict[str, list[str]] = {}
+    for folder in folders:
+        for path in sorted(Path(folder).rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                found.setdefault(f"share/{PACKAGE}/{path.parent.as_posix()}", []).append(path.as_posix())
+    return sorted(found.items())
+
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        *tree("launch", "config", "strategies", "rviz"),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="MAGIC developers",
+    maintainer_email="maintainers@magic-robotics.org",
+    description="Strategies, launch files, the strategy server, the report, bag player and recorder of MAGIC.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "strategy_server = magic_bringup.strategy_server:main",
+            "report = magic_bringup.report:main",
+            "rgbd_to_bag = magic_bringup.rgbd_to_bag:main",
+            "bag_player = magic_bringup.bag_player:main",
+            "bag_recorder = magic_bringup.bag_recorder:main",
+        ],
+    },
+)
