@@ -1,0 +1,1 @@
+"""Physics says yes or no: simulation of a planned motion and the goal tests that judge it."""

@@ -1,0 +1,267 @@
+"""The scene of a strategy, and the floating-gripper run (paper, Table I: FG).
+
+In a floating run the tool is a kinematic body on its planned trajectory: only the
+contact between tool and target is put to the test, not the arm.  Where the plan
+has a ``release`` phase the tool becomes free at its start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.motion import MotionPlan, Phase
+from magic_core.scene import SceneObject
+from magic_core.strategy import Physics
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, Probe, Settings, World, to_poses, usable_pieces
+
+TOOL = "tool"
+TARGET = "target"
+TABLE = "table"
+
+#: Phases in which the tool may touch what it acts on.
+CONTACT_PHASES = ("contact", "goal", "release", "retreat")
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """What a perturbed run draws: standard deviations of the target's place on the table (m) and turn about the
+    vertical (rad), and the half range by which frictions and densities are scaled."""
+
+    position: float = 0.002
+    turn: float = 0.03
+    friction: float = 0.2
+    density: float = 0.2
+
+
+@dataclass(frozen=True)
+class Body:
+    """An object ready for physics: hull corners in its own frame and its pose."""
+
+    id: str
+    hulls: tuple[NDArray[np.float64], ...]
+    world_from_object: NDArray[np.float64]
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """(N, 3): all hull corners in the object's frame."""
+        return np.concatenate(self.hulls)
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,): middle of the axis-aligned box in the object's frame."""
+        corners = self.corners
+        return (corners.min(axis=0) + corners.max(axis=0)) / 2
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that a run is built from.  ``target_kind`` is static or dynamic; obstacles and the table never move."""
+
+    tool: Body
+    target: Body
+    obstacles: tuple[Body, ...]
+    table: NDArray[np.float64]
+    physics: Physics
+    target_kind: str
+    settings: Settings
+
+    def table_height(self, point: NDArray[np.float64]) -> float:
+        """Height in metres of the table under a world point."""
+        a, b, c, d = (float(v) for v in self.table)
+        return -(a * float(point[0]) + b * float(point[1]) + d) / c
+
+
+def make_setup(
+    tool: SceneObject,
+    target: SceneObject,
+    obstacles: tuple[SceneObject, ...],
+    table: NDArray[np.float64],
+    physics: Physics,
+    settings: Settings,
+) -> Setup:
+    """Check the objects and compute their hulls; raises ``BAD_SCENE``."""
+
+    def body(item: SceneObject) -> Body:
+        if not np.all(np.isfinite(item.world_from_object)):
+            raise MagicError(Code.BAD_SCENE, f"pose of {item.id}", "not finite", "a finite pose")
+        return Body(item.id, tuple(usable_pieces(item.id, item.pieces)), np.asarray(item.world_from_object, dtype=float))
+
+    table = np.asarray(table, dtype=float)
+    if table.shape != (4,) or not np.all(np.isfinite(table)) or table[2] < 0.5:
+        raise MagicError(Code.BAD_SCENE, "table plane", table, "a, b, c, d with a unit normal that points up")
+    kind = STATIC if physics.target_is_fixed else DYNAMIC
+    setup = Setup(body(tool), body(target), tuple(body(o) for o in obstacles), table, physics, kind, settings)
+    return replace(setup, target=_on_table(setup)) if kind == DYNAMIC else setup
+
+
+def _on_table(setup: Setup) -> Body:
+    """The target raised out of the table, into which a reconstruction may reach by some millimetres."""
+    corners = transforms.apply(setup.target.world_from_object, setup.target.corners)
+    depth = -float((corners @ setup.table[:3] + setup.table[3]).min())
+    if depth <= 0:
+        return setup.target
+    if depth > 0.02:
+        raise MagicError(Code.BAD_SCENE, f"lowest point of {setup.target.id}", f"{depth * 1000:.1f} mm below the table", "at most 20 mm below")
+    return replace(setup.target, world_from_object=transforms.make(translation=depth * setup.table[:3]) @ setup.target.world_from_object)
+
+
+def perturbed(setup: Setup, perturbation: Perturbation, rng: np.random.Generator) -> Setup:
+    """A setup with the target displaced and friction and densities scaled; a fixed target stays where it is."""
+    scale = 1 + rng.uniform(-1, 1, 3) * [perturbation.friction, perturbation.density, perturbation.density]
+    shift, turn = rng.normal(0, perturbation.position, 2), rng.normal(0, perturbation.turn)
+    physics = replace(
+        setup.physics,
+        friction=setup.physics.friction * float(scale[0]),
+        tool_density=setup.physics.tool_density * float(scale[1]),
+        target_density=setup.physics.target_density * float(scale[2]),
+    )
+    if setup.target_kind == STATIC:
+        return replace(setup, physics=physics)
+    pose = setup.target.world_from_object
+    origin = transforms.apply(pose, setup.target.centre)
+    about = transforms.make(translation=origin + [*shift, 0.0]) @ transforms.from_rpy(0, 0, turn) @ transforms.make(translation=-origin)
+    return replace(setup, physics=physics, target=replace(setup.target, world_from_object=about @ pose))
+
+
+def fill_world(setup: Setup, tool_kind: str) -> World:
+    """A world with table, obstacles, target and tool."""
+    physics = setup.physics
+    world = World(setup.settings)
+    world.add_table(setup.table, physics.friction, TABLE)
+    for obstacle in setup.obstacles:
+        world.add(obstacle.id, list(obstacle.hulls), obstacle.world_from_object, STATIC, 1000.0, physics.friction)
+    world.add(TARGET, list(setup.target.hulls), setup.target.world_from_object, setup.target_kind, physics.target_density, physics.friction)
+    world.add(TOOL, list(setup.tool.hulls), setup.tool.world_from_object, tool_kind, physics.tool_density, physics.friction)
+    return world
+
+
+def phase_start(phases: tuple[Phase, ...], names: tuple[str, ...]) -> float | None:
+    """When the first phase of one of these names begins, ``None`` where there is none."""
+    starts = [phase.start for phase in phases if phase.name in names]
+    return min(starts) if starts else None
+
+
+def phase_end(phases: tuple[Phase, ...], name: str) -> float | None:
+    """When the last phase of this name ends, ``None`` where there is none."""
+    ends = [phase.end for phase in phases if phase.name == name]
+    return max(ends) if ends else None
+
+
+def phase_at(phases: tuple[Phase, ...], time: float) -> str:
+    """The phase at a time; after the last one ``settle``."""
+    for phase in phases:
+        if phase.start <= time < phase.end:
+            return phase.name
+    return "settle" if not phases or time >= phases[-1].end else ""
+
+
+@dataclass(frozen=True)
+class Intrusion:
+    """Where a planned motion goes through something: body, depth in metres, time, whether before the contact phase."""
+
+    body: str
+    depth: float
+    time: float
+    before_contact: bool
+
+
+class FloatingRun:
+    """One run of a floating plan; :meth:`advance` steps it once.
+
+    ``duration`` is the motion's length in seconds; the run may be advanced beyond
+    it, the tool then stays where it is (or free, if it was released).
+    """
+
+    variant = "fg"
+
+    def __init__(self, setup: Setup, plan: MotionPlan) -> None:
+        motion = plan.tool_motion
+        self.setup = setup
+        self.phases = motion.phases
+        self.duration = float(motion.times[-1] - motion.times[0])
+        if not self.duration <= 600:
+            raise MagicError(Code.BAD_SCENE, "length of the motion", f"{self.duration:.0f} s", "up to 600 s")
+        self.release_time = phase_start(self.phases, ("release",))
+        self.contact_time = self._contact_time()
+        self._motion = motion
+        self.world = fill_world(replace(setup, tool=replace(setup.tool, world_from_object=motion.world_from_tool[0])), KINEMATIC)
+        steps = int(np.ceil(self.duration * setup.settings.frequency)) + 1
+        at = motion.times[0] + np.arange(1, steps + 1) / setup.settings.frequency
+        self._targets = to_poses(transforms.interpolate(motion.times, motion.world_from_tool, at))
+        self._released = False
+
+    def _contact_time(self) -> float:
+        start = phase_start(self.phases, CONTACT_PHASES)
+        return self.duration if start is None else start
+
+    @property
+    def time(self) -> float:
+        """Simulated seconds."""
+        return self.world.time
+
+    @property
+    def phase(self) -> str:
+        """The name of the present phase."""
+        return phase_at(self.phases, self.world.time)
+
+    @property
+    def released(self) -> bool:
+        """Whether the tool has been let go."""
+        return self._released
+
+    def advance(self) -> None:
+        """One step."""
+        if not self._released:
+            if self.release_time is not None and self.time >= self.release_time:
+                self.world.let_go(TOOL)
+                self._released = True
+            else:
+                self.world.move_to(TOOL, self._targets[min(self.world.steps, len(self._targets) - 1)])
+        self.world.step()
+
+    def joints(self) -> NDArray[np.float64]:
+        """(0,): there is no arm."""
+        return np.zeros(0)
+
+    def intrusions(self, interval: float = 0.02) -> tuple[Intrusion, ...]:
+        """The deepest overlap of the planned tool with each static body and the table, before and after the contact
+        phase begins, sampled every ``interval`` seconds up to the release."""
+        setup, motion = self.setup, self._motion
+        end = self.duration if self.release_time is None else self.release_time
+        times = np.append(np.arange(0.0, end, interval), end)
+        poses = transforms.interpolate(motion.times, motion.world_from_tool, motion.times[0] + times)
+        worst: dict[tuple[str, bool], Intrusion] = {}
+
+        def note(name: str, depth: float, time: float) -> None:
+            early = time < self.contact_time
+            if depth > 0 and (known := worst.get((name, early))) is None or depth > 0 and depth > known.depth:
+                worst[(name, early)] = Intrusion(name, depth, time, early)
+
+        heights = np.einsum("tij,nj->tni", poses[:, :3, :3], setup.tool.corners) + poses[:, None, :3, 3]
+        below = -((heights @ setup.table[:3]) + setup.table[3]).min(axis=1)
+        for time, depth in zip(times, below, strict=True):
+            note(TABLE, float(depth), float(time))
+        others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}
+        if setup.target_kind == STATIC:
+            others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
+        if others:
+            probe = Probe(setup.settings, list(setup.tool.hulls), others)
+            for time, pose in zip(times, to_poses(poses), strict=True):
+                name, depth = probe.deepest(pose)
+                if name:
+                    note(name, depth, float(time))
+        return tuple(worst.values())
+
+
+def as_object(item_id: str, mesh: Mesh, pieces: tuple[Mesh, ...], world_from_object: NDArray[np.float64], kind: str = "top", source: str = "known") -> SceneObject:
+    """A SceneObject of a mesh and its pieces without a picture, for simulations that need none."""
+    from magic_core.scene import CanonicalView
+
+    blank = CanonicalView(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), bool), 1.0, np.eye(4), kind)
+    return SceneObject(item_id, mesh, pieces, np.asarray(world_from_object, dtype=float), blank, source=source)

@@ -1,0 +1,396 @@
+"""Rigid-body worlds in SAPIEN (PhysX on the CPU), built from objects given as convex pieces.
+
+Only what the verifier needs of a physics engine: a table plane, bodies that are
+static, moved (kinematic) or free (dynamic), steps of fixed length, and contacts.
+The same calls in the same order give the same poses.
+
+PhysX reports no contact between a kinematic and a static body.  :class:`Probe`
+fills the gap: it asks, in a world of its own, how deep a posed body is in others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+
+#: Smallest and largest edge length in metres of a body's axis-aligned box that the solver can treat well.
+MIN_EXTENT = 0.002
+MAX_EXTENT = 5.0
+#: A hull below this volume in cubic metres (a cube of 0.1 mm) has no inertia to speak of.
+MIN_VOLUME = 1e-12
+#: More pieces than this cannot be simulated in useful time.
+MAX_PIECES = 1024
+#: PhysX convex meshes hold at most 255 vertices; the rest is left out in :func:`reduced`.
+MAX_VERTICES = 200
+
+STATIC = "static"
+KINEMATIC = "kinematic"
+DYNAMIC = "dynamic"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of the solver.
+
+    frequency in Hz; contact_offset in metres: pairs nearer than twice this are
+    solved (PhysX's default of 10 mm makes things of 20 mm hover and stick);
+    max_depenetration_speed in m/s: how fast an initial overlap is pushed apart;
+    angular_damping in 1/s stands for rolling resistance, which PhysX does not have;
+    max_speed (m/s) and max_distance (m from the origin) bound what is believable.
+    """
+
+    frequency: float = 240.0
+    position_iterations: int = 16
+    velocity_iterations: int = 2
+    contact_offset: float = 0.002
+    rest_offset: float = 0.0
+    restitution: float = 0.0
+    max_depenetration_speed: float = 0.5
+    linear_damping: float = 0.0
+    angular_damping: float = 0.5
+    max_speed: float = 20.0
+    max_distance: float = 10.0
+    gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        if not 30.0 <= self.frequency <= 5000.0:
+            raise MagicError(Code.BAD_REQUEST, "simulation frequency", self.frequency, "30 to 5000 Hz")
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One contact point between two bodies: world position (3,), unit normal (3,) towards the
+    first body, separation in metres (negative: overlap), impulse (3,) in N s on the first body."""
+
+    position: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    separation: float
+    impulse: NDArray[np.float64]
+
+
+def reduced(points: NDArray[np.float64], limit: int = MAX_VERTICES) -> NDArray[np.float64]:
+    """The corners of the convex hull of points (N, 3); at most ``limit`` of them, those furthest out in evenly
+    spread directions.  Raises ``QhullError`` or ``ValueError`` where the points span no volume."""
+    if len(points) < 4:
+        raise ValueError(f"{len(points)} points span no volume")
+    hull = ConvexHull(points)
+    if hull.volume < MIN_VOLUME:
+        raise ValueError(f"hull of {hull.volume:.2g} m^3")
+    corners = points[hull.vertices]
+    if len(corners) <= limit:
+        return corners
+    # A Fibonacci sphere: directions spread evenly without chance.
+    k = np.arange(4 * limit) + 0.5
+    z = 1 - 2 * k / len(k)
+    angle = np.pi * (1 + 5**0.5) * k
+    directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
+    chosen: list[int] = []
+    for index in np.argmax(corners @ directions.T, axis=0):
+        if index not in chosen:
+            chosen.append(int(index))
+        if len(chosen) == limit:
+            break
+    return corners[chosen]
+
+
+def sphere_of(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
+    """Centre (3,) and radius of the ball that hull corners (N, 3) tessellate, ``None`` where it is not a ball.
+
+    A ball rolls as it should only as a sphere; as a polyhedron it rocks over its facets.
+    """
+    if len(corners) < 30:
+        return None
+    system = np.column_stack([2 * corners, np.ones(len(corners))])
+    solution, *_ = np.linalg.lstsq(system, np.sum(corners**2, axis=1), rcond=None)
+    centre = solution[:3]
+    distance = np.linalg.norm(corners - centre, axis=1)
+    radius = float(distance.mean())
+    if radius <= 0 or np.abs(distance - radius).max() > 0.02 * radius:
+        return None
+    # Corners all over the ball, not on a cap of it.
+    directions = (corners - centre) / distance[:, None]
+    if np.abs(directions.mean(axis=0)).max() > 0.1 or ConvexHull(corners).volume < 0.85 * 4 / 3 * np.pi * radius**3:
+        return None
+    return centre, radius
+
+
+def usable_pieces(name: str, pieces: tuple[Mesh, ...] | list[Mesh]) -> list[NDArray[np.float64]]:
+    """The hull corners of each piece that has a volume; ``BAD_SCENE`` says what is wrong with the body."""
+    if len(pieces) == 0:
+        raise MagicError(Code.BAD_SCENE, f"pieces of {name}", 0, f"1 to {MAX_PIECES} convex pieces")
+    if len(pieces) > MAX_PIECES:
+        raise MagicError(Code.BAD_SCENE, f"pieces of {name}", len(pieces), f"1 to {MAX_PIECES} convex pieces")
+    everything = np.concatenate([piece.vertices for piece in pieces])
+    if len(everything) == 0 or not np.all(np.isfinite(everything)):
+        raise MagicError(Code.BAD_SCENE, f"vertices of {name}", "none or not finite", "finite coordinates in metres")
+    extents = everything.max(axis=0) - everything.min(axis=0)
+    if extents.max() > MAX_EXTENT or extents.max() < MIN_EXTENT:
+        raise MagicError(Code.BAD_SCENE, f"largest extent of {name}", f"{extents.max():.3g} m", f"{MIN_EXTENT} to {MAX_EXTENT} m")
+    hulls = []
+    for piece in pieces:
+        try:
+            hulls.append(reduced(piece.vertices))
+        except (QhullError, ValueError):
+            continue  # slivers of a decomposition carry neither mass nor contact
+    if not hulls:
+        raise MagicError(Code.BAD_SCENE, f"volume of {name}", "no piece has a volume", f"pieces above {MIN_VOLUME} m^3")
+    return hulls
+
+
+def to_pose(transform: NDArray[np.float64]) -> Any:
+    """4x4 transform to sapien.Pose."""
+    import sapien
+
+    return sapien.Pose(transform[:3, 3], transforms.quaternion_wxyz(transform))
+
+
+def to_poses(stack: NDArray[np.float64]) -> list[Any]:
+    """(T, 4, 4) transforms to a list of sapien.Pose."""
+    import sapien
+
+    quaternions = transforms.quaternion_wxyz(stack)
+    return [sapien.Pose(p, q) for p, q in zip(stack[:, :3, 3], quaternions, strict=True)]
+
+
+def from_pose(pose: Any) -> NDArray[np.float64]:
+    """sapien.Pose to a 4x4 float64 transform."""
+    return np.asarray(pose.to_transformation_matrix(), dtype=float)
+
+
+class World:
+    """One simulation: bodies by name, stepped together.
+
+    The pieces' hulls are computed once and can be handed on to another world
+    (``hulls`` of :meth:`add`), which is what perturbed repetitions do.
+    """
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        import sapien
+
+        self._sapien = sapien
+        self.settings = settings or Settings()
+        # Configuration is global in SAPIEN and read when the system is made.
+        sapien.physx.set_scene_config(
+            gravity=np.array([0, 0, -self.settings.gravity], dtype=np.float32),
+            bounce_threshold=2.0,
+            enable_pcm=True,
+            enable_tgs=True,
+            enable_ccd=False,
+            enable_enhanced_determinism=True,
+            enable_friction_every_iteration=True,
+            cpu_workers=0,
+        )
+        sapien.physx.set_shape_config(contact_offset=self.settings.contact_offset, rest_offset=self.settings.rest_offset)
+        sapien.physx.set_body_config(
+            solver_position_iterations=self.settings.position_iterations,
+            solver_velocity_iterations=self.settings.velocity_iterations,
+            sleep_threshold=0.0,
+        )
+        self.scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+        self.scene.physx_system.timestep = 1.0 / self.settings.frequency
+        self.time = 0.0
+        self.steps = 0
+        self._materials: dict[float, Any] = {}
+        self._bodies: dict[str, Any] = {}
+        self._names: dict[int, str] = {}  # by the component's address: contacts name their bodies by component
+
+    @property
+    def timestep(self) -> float:
+        """Length of a step in seconds."""
+        return 1.0 / self.settings.frequency
+
+    def material(self, friction: float) -> Any:
+        """The PhysX material of a friction coefficient; pairs take the average of their two."""
+        friction = float(friction)
+        if friction not in self._materials:
+            if not (np.isfinite(friction) and 0 <= friction <= 100):
+                raise MagicError(Code.BAD_SCENE, "friction coefficient", friction, "0 to 100")
+            self._materials[friction] = self._sapien.physx.PhysxMaterial(friction, friction, self.settings.restitution)
+        return self._materials[friction]
+
+    def _register(self, name: str, component: Any, pose: NDArray[np.float64]) -> None:
+        if name in self._bodies:
+            raise MagicError(Code.BAD_SCENE, "body name", name, "names that differ")
+        entity = self._sapien.Entity()
+        entity.name = name
+        entity.add_component(component)
+        entity.pose = to_pose(pose)
+        self.scene.add_entity(entity)
+        self._bodies[name] = component
+        self.name_component(component, name)
+
+    def name_component(self, component: Any, name: str) -> None:
+        """Let contacts of a component (a robot's link) be found under a name; several may share one."""
+        self._names[component._physx_pointer] = name
+
+    def add_table(self, plane: NDArray[np.float64], friction: float, name: str = "table") -> None:
+        """The half space below the plane (4,) a x + b y + c z + d = 0, unit normal up."""
+        physx = self._sapien.physx
+        normal = transforms.unit(plane[:3])
+        # PhysX's plane passes through its frame's origin with the normal along x.
+        helper = np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
+        pose = transforms.frame(-float(plane[3]) * normal, normal, np.cross(normal, helper))
+        component = physx.PhysxRigidStaticComponent()
+        shape = physx.PhysxCollisionShapePlane(material=self.material(friction))
+        shape.contact_offset = self.settings.contact_offset
+        shape.rest_offset = self.settings.rest_offset
+        component.attach(shape)
+        self._register(name, component, pose)
+
+    def add(
+        self,
+        name: str,
+        hulls: list[NDArray[np.float64]],
+        world_from_object: NDArray[np.float64],
+        kind: str,
+        density: float,
+        friction: float,
+    ) -> None:
+        """Add a body of convex hulls (see :func:`usable_pieces`), corners (N, 3) in its own frame; density in kg/m^3."""
+        physx = self._sapien.physx
+        if not (np.isfinite(density) and 0 < density < 1e5):
+            raise MagicError(Code.BAD_SCENE, f"density of {name}", density, "above 0 and below 100000 kg/m^3")
+        if not np.all(np.isfinite(world_from_object)):
+            raise MagicError(Code.BAD_SCENE, f"pose of {name}", "not finite", "finite numbers")
+        component = physx.PhysxRigidStaticComponent() if kind == STATIC else physx.PhysxRigidDynamicComponent()
+        material = self.material(friction)
+        for corners in hulls:
+            ball = sphere_of(corners)
+            if ball is not None:
+                shape = physx.PhysxCollisionShapeSphere(radius=ball[1], material=material)
+                shape.local_pose = self._sapien.Pose(ball[0])
+            else:
+                try:
+                    shape = physx.PhysxCollisionShapeConvexMesh(
+                        vertices=np.ascontiguousarray(corners, dtype=np.float32), scale=np.ones(3, np.float32), material=material
+                    )
+                except RuntimeError as error:
+                    raise MagicError(Code.BAD_SCENE, f"piece of {name}", str(error), "a convex piece that PhysX can cook") from error
+            shape.density = float(density)
+            shape.contact_offset = self.settings.contact_offset
+            shape.rest_offset = self.settings.rest_offset
+            component.attach(shape)
+        if kind != STATIC:
+            component.solver_position_iterations = self.settings.position_iterations
+            component.solver_velocity_iterations = self.settings.velocity_iterations
+            component.sleep_threshold = 0.0
+            component.linear_damping = self.settings.linear_damping
+            component.angular_damping = self.settings.angular_damping
+            component.max_depenetration_velocity = self.settings.max_depenetration_speed
+            component.kinematic = kind == KINEMATIC
+        self._register(name, component, world_from_object)
+
+    def component(self, name: str) -> Any:
+        """The PhysX component of a body."""
+        return self._bodies[name]
+
+    def has(self, name: str) -> bool:
+        """Whether there is a body of that name."""
+        return name in self._bodies
+
+    def pose(self, name: str) -> NDArray[np.float64]:
+        """world_from_object (4, 4)."""
+        return from_pose(self._bodies[name].entity_pose)
+
+    def position(self, name: str) -> NDArray[np.float64]:
+        """World position (3,) of a body's origin."""
+        return np.asarray(self._bodies[name].entity_pose.p, dtype=float)
+
+    def velocity(self, name: str) -> NDArray[np.float64]:
+        """Linear velocity (3,) in m/s of a body's centre of mass."""
+        return np.asarray(self._bodies[name].linear_velocity, dtype=float)
+
+    def set_velocity(self, name: str, velocity: NDArray[np.float64]) -> None:
+        """Set the linear velocity of a dynamic body."""
+        self._bodies[name].linear_velocity = np.asarray(velocity, dtype=np.float32)
+
+    def move_to(self, name: str, pose: Any) -> None:
+        """Where a kinematic body shall be after the next step (a sapien.Pose)."""
+        self._bodies[name].kinematic_target = pose
+
+    def let_go(self, name: str) -> None:
+        """Make a kinematic body free, at rest."""
+        component = self._bodies[name]
+        component.kinematic = False
+        component.linear_velocity = np.zeros(3, np.float32)
+        component.angular_velocity = np.zeros(3, np.float32)
+        component.wake_up()
+
+    def step(self) -> None:
+        """Advance by one step."""
+        self.scene.step()
+        self.steps += 1
+        self.time = self.steps / self.settings.frequency
+
+    def check(self, names: tuple[str, ...]) -> None:
+        """Raise ``SIMULATION_EXPLODED`` where a body is nowhere, too far or too fast."""
+        for name in names:
+            position = self.position(name)
+            speed = float(np.linalg.norm(self.velocity(name)))
+            distance = float(np.linalg.norm(position))
+            if not (np.isfinite(distance) and np.isfinite(speed)):
+                raise MagicError(Code.SIMULATION_EXPLODED, f"state of {name} at {self.time:.2f} s", "not a number", "finite positions and velocities")
+            if speed > self.settings.max_speed:
+                raise MagicError(Code.SIMULATION_EXPLODED, f"speed of {name} at {self.time:.2f} s", f"{speed:.1f} m/s", f"up to {self.settings.max_speed} m/s")
+            if distance > self.settings.max_distance:
+                raise MagicError(Code.SIMULATION_EXPLODED, f"distance of {name} at {self.time:.2f} s", f"{distance:.1f} m", f"up to {self.settings.max_distance} m")
+
+    def touches(self, first: str, second: str, within: float = 0.0) -> list[Touch]:
+        """Contact points of the last step between two bodies whose separation is at most ``within`` metres."""
+        result = []
+        for contact in self.scene.get_contacts():
+            names = [self._names.get(body._physx_pointer) for body in contact.bodies]
+            if names == [first, second]:
+                sign = 1.0
+            elif names == [second, first]:
+                sign = -1.0
+            else:
+                continue
+            for point in contact.points:
+                if point.separation <= within:
+                    result.append(
+                        Touch(
+                            np.asarray(point.position, dtype=float),
+                            sign * np.asarray(point.normal, dtype=float),
+                            float(point.separation),
+                            sign * np.asarray(point.impulse, dtype=float),
+                        )
+                    )
+        return result
+
+
+class Probe:
+    """How deep a posed body is in fixed ones, by the same collision shapes as the simulation's."""
+
+    def __init__(self, settings: Settings, hulls: list[NDArray[np.float64]], others: dict[str, tuple[list[NDArray[np.float64]], NDArray[np.float64]]]) -> None:
+        """``others``: hulls and world_from_object by name."""
+        self._world = World(settings)
+        # So short a step that nothing moves: the contacts are those of the pose that was set.
+        self._world.scene.physx_system.timestep = 1e-6
+        self._others = tuple(others)
+        self._world.add("probe", hulls, transforms.make(translation=[0, 0, 5.0]), DYNAMIC, 1000.0, 0.0)
+        self._world.component("probe").disable_gravity = True
+        for name, (other_hulls, pose) in others.items():
+            self._world.add(name, other_hulls, pose, STATIC, 1000.0, 0.0)
+
+    def deepest(self, pose: Any) -> tuple[str, float]:
+        """The body that a pose (sapien.Pose) is deepest in, and how deep in metres; ``("", 0.0)`` for none."""
+        component = self._world.component("probe")
+        component.entity_pose = pose
+        component.linear_velocity = np.zeros(3, np.float32)
+        component.angular_velocity = np.zeros(3, np.float32)
+        self._world.step()
+        name, depth = "", 0.0
+        for other in self._others:
+            for touch in self._world.touches("probe", other):
+                if -touch.separation > depth:
+                    name, depth = other, -touch.separation
+        return name, depth
