@@ -1,0 +1,186 @@
+"""Stand-ins for the graph's other nodes, for tests of the strategy server and of clients of it.
+
+They speak the true interfaces; what they answer is set by plain functions.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from magic_core import conversions, qos, transforms
+from magic_core.contact import Contact, ContactCandidate, contact_frame
+from magic_core.errors import Code
+from magic_core.mesh import Mesh
+from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
+from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+from magic_interfaces.action import PlanMotion, VerifyMotion
+from magic_interfaces.msg import SceneObjectArray
+from magic_interfaces.srv import MatchContact
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+
+
+def box(size: float = 0.05) -> Mesh:
+    """A cube about the origin with edges of ``size`` metres, faces counter-clockwise from outside."""
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float) * size / 2
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Mesh(corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]))
+
+
+def view(kind: str = "top", size: int = 64) -> CanonicalView:
+    """A square seen from above, half the picture wide."""
+    mask = np.zeros((size, size), bool)
+    mask[size // 4 : 3 * size // 4, size // 4 : 3 * size // 4] = True
+    return CanonicalView(
+        np.where(mask[..., None], 180, 0).astype(np.uint8).repeat(3, axis=2), mask, 0.1 / size, transforms.from_rpy(np.pi, 0.0, 0.0), kind
+    )
+
+
+def contact(of: CanonicalView) -> Contact:
+    """The middle of the square's right edge."""
+    height, width = of.mask.shape
+    pixel, normal = np.array([0.75 * width, height / 2]), np.array([1.0, 0.0])
+    return Contact(pixel, normal, 0.02, False, 0.01, contact_frame(of, pixel, normal))
+
+
+def scene(ids: tuple[str, ...] = ("object_1", "object_2")) -> Scene:
+    """Cubes in a row on the table, 0.2 m apart."""
+    items = [
+        SceneObject(name, box(), (box(),), transforms.make(translation=[0.4, 0.2 * i, 0.025]), view(), box_extents=np.full(3, 0.05))
+        for i, name in enumerate(ids)
+    ]
+    return Scene(tuple(items), np.array([0.0, 0.0, 1.0, 0.0]))
+
+
+def candidate(tool_id: str = "object_1", score: float = 1.0, flipped: bool = False) -> ContactCandidate:
+    """A candidate with a target."""
+    return ContactCandidate(tool_id, contact(view()), contact(view()), 0.0, flipped, score, score, score, np.eye(4))
+
+
+def strategy(name: str = "fake", simulatable: bool = True) -> Strategy:
+    """The least strategy that can be saved and loaded."""
+    return Strategy(
+        name=name,
+        description="a stand-in",
+        view="top",
+        mode="plan",
+        tool_view=view(),
+        tool_contact=contact(view()),
+        target_view=view(),
+        target_contact=contact(view()),
+        target_normal=np.array([1.0, 0.0, 0.0]),
+        target_view_direction=np.array([0.0, 0.0, -1.0]),
+        times=np.array([0.0, 1.0]),
+        target_from_tool=np.stack([np.eye(4), transforms.make(translation=[0.1, 0.0, 0.0])]),
+        tool_mesh=box(),
+        target_mesh=box(),
+        waypoints=(Waypoint("contact", np.zeros(3), "contact"), Waypoint("goal", np.array([-0.2, 0.0, 0.0]), "goal")),
+        goal=Goal("hook", {"distance": 0.2}),
+        physics=Physics(),
+        simulatable=simulatable,
+    )
+
+
+def plan(variant: str = "fg") -> MotionPlan:
+    """A motion of 0.1 m in one second."""
+    times = np.array([0.0, 1.0])
+    motion = ToolMotion(times, np.stack([np.eye(4), transforms.make(translation=[0.1, 0.0, 0.0])]), (Phase("goal", 0.0, 1.0),))
+    if variant == "fg":
+        return MotionPlan(variant, motion)
+    names = tuple(f"panda_joint{i}" for i in range(1, 8))
+    rows = np.zeros((2, 7))
+    return MotionPlan(variant, motion, ArmMotion(times, names, rows, rows, rows, np.eye(4), 0.03, 0.1))
+
+
+class FakeServers(Node):
+    """``match_contact``, ``plan_motion`` and ``verify_motion`` in one node, and a publisher of ``objects``.
+
+    ``on_match(request)``, ``on_plan(goal, canceled)`` and ``on_verify(goal, canceled)``
+    may be replaced; each returns a response or result.  ``canceled`` is a function.
+    ``goals`` lists the goals as (name, goal); ``canceled_goals`` the names of those canceled.
+    """
+
+    def __init__(self, name: str = "fakes", services: tuple[str, ...] = ("match", "plan", "verify"), **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.goals: list[tuple[str, Any]] = []
+        self.canceled_goals: list[str] = []
+        self.started = threading.Event()
+        self.on_match: Callable[[Any], Any] = self.match
+        self.on_plan: Callable[[Any, Callable[[], bool]], Any] = self.plan
+        self.on_verify: Callable[[Any, Callable[[], bool]], Any] = self.verify
+        group = ReentrantCallbackGroup()
+        self._objects = self.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
+        self._servers: list[Any] = []
+        if "match" in services:
+            self.create_service(MatchContact, "match_contact", self._match, callback_group=group)
+        if "plan" in services:
+            self._servers.append(self._action(PlanMotion, "plan_motion", lambda g, c: self.on_plan(g, c), group))
+        if "verify" in services:
+            self._servers.append(self._action(VerifyMotion, "verify_motion", lambda g, c: self.on_verify(g, c), group))
+
+    def publish(self, of: Scene) -> None:
+        """Publish a scene as perception would."""
+        self._objects.publish(conversions.scene_to_msg(of))
+
+    def clear(self) -> None:
+        """Go back to the answers and lists of the start."""
+        self.goals.clear()
+        self.canceled_goals.clear()
+        self.started.clear()
+        self.on_match, self.on_plan, self.on_verify = self.match, self.plan, self.verify
+
+    @staticmethod
+    def match(request: Any) -> Any:
+        """Three candidates, the second one mirrored."""
+        found = [candidate(score=1.0), candidate(score=0.9, flipped=True), candidate(score=0.8)]
+        target = request.target_id or "object_2"
+        return MatchContact.Response(code=0, candidates=[conversions.candidate_to_msg(c) for c in found], target_id=target, features="fake")
+
+    @staticmethod
+    def plan(goal: Any, canceled: Callable[[], bool]) -> Any:
+        """The motion of :func:`plan`."""
+        return PlanMotion.Result(code=0, message="planned", plan=conversions.plan_to_msg(plan(goal.variant), goal.tool.id))
+
+    @staticmethod
+    def verify(goal: Any, canceled: Callable[[], bool]) -> Any:
+        """Every motion passes."""
+        return VerifyMotion.Result(code=0, message="passed", success=True, success_rate=1.0, metric_names=["pulled"], metric_values=[0.25])
+
+    @staticmethod
+    def until_canceled(result: Any) -> Callable[[Any, Callable[[], bool]], Any]:
+        """A handler that works until its goal is canceled, at most ten seconds."""
+
+        def handler(goal: Any, canceled: Callable[[], bool]) -> Any:
+            deadline = time.monotonic() + 10.0
+            while not canceled() and time.monotonic() < deadline:
+                time.sleep(0.005)
+            result.code = int(Code.CANCELED)
+            return result
+
+        return handler
+
+    def _match(self, request: Any, response: Any) -> Any:
+        self.goals.append(("match", request))
+        return self.on_match(request)
+
+    def _action(self, kind: Any, name: str, handler: Callable[[Any, Callable[[], bool]], Any], group: Any) -> ActionServer:
+        def execute(handle: Any) -> Any:
+            self.goals.append((name, handle.request))
+            self.started.set()
+            result = handler(handle.request, lambda: handle.is_cancel_requested)
+            if handle.is_cancel_requested:
+                self.canceled_goals.append(name)
+                handle.canceled()
+            elif result.code == 0:
+                handle.succeed()
+            else:
+                handle.abort()
+            return result
+
+        return ActionServer(self, kind, name, execute, cancel_callback=lambda handle: CancelResponse.ACCEPT, callback_group=group)

@@ -1,0 +1,198 @@
+"""Calls to other nodes that always come back: by an answer, a timeout or a cancel.
+
+Waiting happens on a condition in the caller's thread while the executor's other
+threads receive the answer; nothing here spins, so that a call may be made from
+inside a callback of a reentrant group.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from magic_core.errors import Code, MagicError
+from rclpy.action import ActionClient
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+
+#: Between looks at whether a server is still there, s; discovery gives no event for it in rclpy.
+PRESENCE_PERIOD = 0.1
+
+
+class Token:
+    """Joins the reasons to stop waiting: something arrived, the run was canceled, the node closes."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._canceled = False
+        self._closing = False
+
+    def cancel(self, closing: bool = False) -> None:
+        """Make all present and later waits end with CANCELED; ``closing``: without courtesy to other nodes."""
+        with self._condition:
+            self._canceled = True
+            self._closing = self._closing or closing
+            self._condition.notify_all()
+
+    @property
+    def canceled(self) -> bool:
+        """Whether :meth:`cancel` was called."""
+        return self._canceled
+
+    @property
+    def closing(self) -> bool:
+        """Whether the node itself is going down."""
+        return self._closing
+
+    def poke(self, *_: Any) -> None:
+        """Make waiters look at their condition again; fits as a future's done callback."""
+        with self._condition:
+            self._condition.notify_all()
+
+    def wait(self, done: Callable[[], bool], deadline: float, heed_cancel: bool = True, alive: Callable[[], None] | None = None) -> bool:
+        """Wait until ``done()`` or until ``time.monotonic()`` reaches the deadline; returns ``done()``.
+
+        ``alive`` is called every tenth of a second and may raise to end the wait.  Raises CANCELED.
+        """
+        with self._condition:
+            while not done():
+                if self._canceled and (heed_cancel or self._closing):
+                    raise MagicError(Code.CANCELED, "canceled")
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    return False
+                if alive is not None:
+                    alive()
+                self._condition.wait(min(left, PRESENCE_PERIOD) if alive is not None else left)
+            return True
+
+
+class _Remote:
+    """What service and action calls share: the server's name and whether it is there."""
+
+    def __init__(self, node: Node, name: str, server: str) -> None:
+        self.name = node.resolve_service_name(name)
+        self.server = server
+
+    def ready(self) -> bool:
+        """Whether the server can be seen now."""
+        raise NotImplementedError
+
+    def require(self, timeout: float, token: Token) -> None:
+        """Wait for the server; raises SERVER_UNAVAILABLE naming it."""
+        if not token.wait(self.ready, time.monotonic() + timeout, alive=lambda: None):
+            raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server} does not answer: nothing serves {self.name} (waited {timeout:.1f} s)")
+
+    def _still_there(self) -> None:
+        if not self.ready():
+            raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server} has gone: nothing serves {self.name} any more")
+
+    def _late(self, what: str, timeout: float) -> MagicError:
+        return MagicError(Code.SERVER_TIMEOUT, f"the {self.server} ({self.name}) {what} within {timeout:.1f} s")
+
+
+class RemoteService(_Remote):
+    """A service of another node."""
+
+    def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup) -> None:
+        super().__init__(node, name, server)
+        self._client = node.create_client(kind, name, callback_group=group)
+
+    def ready(self) -> bool:
+        return self._client.service_is_ready()
+
+    def call(self, request: Any, timeout: float, token: Token, presence: float = 5.0) -> Any:
+        """The response; raises SERVER_UNAVAILABLE, SERVER_TIMEOUT or CANCELED."""
+        deadline = time.monotonic() + timeout
+        self.require(min(presence, timeout), token)
+        future = self._client.call_async(request)
+        future.add_done_callback(token.poke)
+        try:
+            if not token.wait(future.done, deadline, alive=self._still_there):
+                raise self._late("did not answer", timeout)
+            return future.result()
+        finally:
+            if not future.done():
+                self._client.remove_pending_request(future)
+
+
+class RemoteAction(_Remote):
+    """An action of another node."""
+
+    #: How long a canceled or late goal is given to end by itself, s.
+    CANCEL_PATIENCE = 2.0
+
+    def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup) -> None:
+        super().__init__(node, name, server)
+        self._client = ActionClient(node, kind, name, callback_group=group)
+
+    def ready(self) -> bool:
+        return self._client.server_is_ready()
+
+    def call(
+        self,
+        goal: Any,
+        timeout: float,
+        token: Token,
+        presence: float = 5.0,
+        grace: float = 0.0,
+        feedback: Callable[[Any], None] | None = None,
+    ) -> Any:
+        """The result of a goal.
+
+        ``timeout`` is what the server itself is given; ``grace`` what is waited
+        beyond it for the answer.  A cancel, and a timeout, are forwarded to the
+        goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, BUSY or CANCELED.
+        """
+        deadline = time.monotonic() + timeout + grace
+        self.require(min(presence, timeout + grace), token)
+        callback = None if feedback is None else (lambda message: feedback(message.feedback))
+        accepting = self._client.send_goal_async(goal, feedback_callback=callback)
+        accepting.add_done_callback(token.poke)
+        try:
+            accepted = token.wait(accepting.done, deadline, alive=self._still_there)
+        except MagicError:
+            self._cancel_when_accepted(accepting)
+            raise
+        if not accepted:
+            self._cancel_when_accepted(accepting)
+            raise self._late("did not accept the goal", timeout + grace)
+        handle = accepting.result()
+        if not handle.accepted:
+            raise MagicError(Code.BUSY, f"the {self.server} ({self.name}) refused the goal")
+        future = handle.get_result_async()
+        future.add_done_callback(token.poke)
+        try:
+            if not token.wait(future.done, deadline, alive=self._still_there):
+                raise self._late("did not finish", timeout + grace)
+        except MagicError:
+            self._cancel(handle, future, token)
+            raise
+        response = future.result()
+        if response.status != GoalStatus.STATUS_SUCCEEDED and response.result.code == 0:
+            # rclpy answers an empty result where a server's handler raised.
+            raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {response.status} and no result")
+        return response.result
+
+    def _cancel(self, handle: Any, future: Any, token: Token) -> None:
+        if token.closing:
+            return
+        handle.cancel_goal_async()
+        try:
+            token.wait(future.done, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=self._still_there)
+        except MagicError:
+            pass  # whoever called gets the first reason, not this one
+
+    @staticmethod
+    def _cancel_when_accepted(accepting: Any) -> None:
+        """A goal that is accepted after nobody waits for it must not run on."""
+
+        def done(future: Any) -> None:
+            handle = future.result()
+            if handle is not None and handle.accepted:
+                handle.cancel_goal_async()
+
+        accepting.add_done_callback(done)

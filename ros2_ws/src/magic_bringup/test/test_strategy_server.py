@@ -1,0 +1,332 @@
+"""The strategy server against stand-ins of the other nodes."""
+
+import threading
+import time
+
+import pytest
+import rclpy
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from magic_bringup import fakes
+from magic_bringup.domain import free_domain
+from magic_bringup.remote import Token
+from magic_bringup.strategy_server import StrategyServer, complaint_code
+from magic_core import qos
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
+from magic_interfaces.srv import MatchContact
+from rclpy.action import ActionClient
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
+from visualization_msgs.msg import MarkerArray
+
+DEADLINE = 15.0
+
+
+class Bench:
+    """The server, the stand-ins and a client, spun by one executor in a thread."""
+
+    def __init__(self, folder, services=("match", "plan", "verify"), **parameters):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=free_domain())  # two benches may be open at once
+        values = {"strategies": str(folder), "server_timeout": 2.0, "objects_timeout": 1.0, "grace": 0.5, **parameters}
+        arguments = ["--ros-args"] + [x for k, v in values.items() for x in ("-p", f"{k}:={v}")]
+        original = Node.__init__
+        context = self.context
+
+        # The server takes no arguments, as a node started by its executable; give it this test's context and parameters.
+        def init(node, *args, **kwargs):
+            original(node, *args, **{**kwargs, "context": context, "cli_args": arguments})
+
+        Node.__init__ = init
+        try:
+            self.server = StrategyServer()
+        finally:
+            Node.__init__ = original
+        self.fakes = fakes.FakeServers(services=services, context=context)
+        self.node = Node("client", context=context)
+        self.client = ActionClient(self.node, RunStrategy, "run_strategy")
+        self.feedback = []
+        self.heard = threading.Condition()
+        self.messages = {"arm": [], "tool": [], "markers": []}
+        for key, kind, topic in (
+            ("arm", JointTrajectory, "verified_trajectory"),
+            ("tool", MultiDOFJointTrajectory, "verified_tool_trajectory"),
+            ("markers", MarkerArray, "strategy/markers"),
+        ):
+            self.node.create_subscription(kind, topic, lambda m, k=key: self._hear(k, m), qos.LATCHED)
+        self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.executor = MultiThreadedExecutor(8, context=context)
+        for node in (self.server, self.fakes, self.node):
+            self.executor.add_node(node)
+        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.thread.start()
+        assert self.client.wait_for_server(DEADLINE)
+
+    def _hear(self, key, message):
+        with self.heard:
+            self.messages[key].append(message)
+            self.heard.notify_all()
+
+    def wait(self, condition, timeout=DEADLINE):
+        with self.heard:
+            assert self.heard.wait_for(condition, timeout)
+
+    def send(self, **goal):
+        goal = {"strategy": "fake", "variant": "fg", "target_id": "object_2", **goal}
+        future = self.client.send_goal_async(RunStrategy.Goal(**goal), feedback_callback=lambda m: self.feedback.append(m.feedback))
+        handle = self.result(future)
+        assert handle.accepted
+        return handle
+
+    @staticmethod
+    def result(future, timeout=DEADLINE):
+        done = threading.Event()
+        future.add_done_callback(lambda f: done.set())
+        assert done.wait(timeout), "no answer before the deadline"
+        return future.result()
+
+    def run(self, **goal):
+        response = self.result(self.send(**goal).get_result_async())
+        return response.result, response.status
+
+    def close(self):
+        self.executor.shutdown(timeout_sec=2.0)
+        for node in (self.server, self.fakes, self.node):
+            node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+        self.thread.join(5.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("strategies")
+    strategies.save(fakes.strategy("fake"), root / "fake")
+    strategies.save(fakes.strategy("dynamic", simulatable=False), root / "dynamic")
+    return root
+
+
+@pytest.fixture(scope="module")
+def shared(folder):
+    bench = Bench(folder)
+    bench.fakes.publish(fakes.scene())
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def bench(shared):
+    shared.fakes.clear()
+    shared.feedback.clear()
+    for messages in shared.messages.values():
+        messages.clear()
+    return shared
+
+
+def test_a_verified_tool_trajectory_is_published(bench):
+    result, status = bench.run()
+    assert (result.code, result.verified, status) == (0, True, GoalStatus.STATUS_SUCCEEDED), result.message
+    assert (result.tool_id, result.target_id, result.features, result.simulations) == ("object_1", "object_2", "fake", 1)
+    assert [r.code for r in result.candidates] == [0]
+    assert result.times.total > 0
+    bench.wait(lambda: bench.messages["tool"] and bench.messages["markers"])
+    assert bench.messages["tool"][0].joint_names == ["object_1"]
+    assert not bench.messages["arm"]
+    assert {f.stage for f in bench.feedback} == {"perceive", "match", "plan", "verify"}
+
+
+def test_a_verified_arm_trajectory_is_published(bench):
+    result, _ = bench.run(variant="arm")
+    assert result.code == 0, result.message
+    bench.wait(lambda: bench.messages["arm"])
+    assert len(bench.messages["arm"][0].points) == 2
+    assert not bench.messages["tool"]
+
+
+def test_nothing_unverified_is_published(bench):
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+    result, status = bench.run()
+    assert (result.code, result.verified, status) == (Code.NO_CANDIDATE_SUCCEEDED, False, GoalStatus.STATUS_ABORTED)
+    # The mirrored second candidate is tried both ways.
+    assert [(r.reflection, r.code, r.message) for r in result.candidates] == [("keep", Code.DRIFT, "it drifted")] * 2 + [
+        ("turn", Code.DRIFT, "it drifted"),
+        ("keep", Code.DRIFT, "it drifted"),
+    ]
+    bench.wait(lambda: bench.messages["markers"])
+    texts = [m.text for m in bench.messages["markers"][-1].markers if m.ns == "reasons"]
+    assert len(texts) == 3
+    assert all("DRIFT" in t for t in texts)
+    assert not bench.messages["tool"]
+    assert not bench.messages["arm"]
+
+
+def test_goals_carry_what_the_servers_need(bench):
+    bench.run(variant="arm", seed=7)
+    names = [name for name, _ in bench.fakes.goals]
+    assert names == ["match", "plan_motion", "verify_motion"]
+    request, plan, verify = (goal for _, goal in bench.fakes.goals)
+    assert request.want_heatmap
+    assert (plan.tool.id, plan.target.id, plan.variant, plan.seed, plan.reflection) == ("object_1", "object_2", "arm", 7, "keep")
+    assert verify.plan.arm_trajectory.points
+    assert 0 < plan.timeout <= 30.0
+
+
+@pytest.mark.parametrize(
+    "goal, code, says",
+    [
+        ({"strategy": "juggling"}, Code.UNKNOWN_STRATEGY, ("juggling", "dynamic", "fake")),
+        ({"target_id": "object_9"}, Code.UNKNOWN_OBJECT, ("object_9", "object_1", "object_2")),
+        ({"tool_id": "object_8"}, Code.UNKNOWN_OBJECT, ("object_8", "object_1")),
+        ({"variant": "legs"}, Code.UNKNOWN_VARIANT, ("legs", "fg", "arm")),
+        ({"timeout": -1.0}, Code.BAD_REQUEST, ("-1",)),
+        ({"tool_id": "object_2"}, Code.BAD_REQUEST, ("object_2",)),
+        ({"strategy": "dynamic"}, Code.NOT_VERIFIABLE, ("dynamic", "allow_unverified")),
+    ],
+)
+def test_bad_goals_are_answered_before_any_work(bench, goal, code, says):
+    result, status = bench.run(**goal)
+    assert (result.code, status) == (code, GoalStatus.STATUS_ABORTED), result.message
+    assert all(s in result.message for s in says), result.message
+    assert not bench.fakes.goals
+
+
+def test_an_unverifiable_motion_is_returned_but_not_published(bench):
+    result, _ = bench.run(strategy="dynamic", allow_unverified=True)
+    assert (result.code, result.verified, result.simulations) == (0, False, 0), result.message
+    assert len(result.plan.tool_trajectory.points) == 2
+    # A verified run afterwards proves that the channel works and that nothing came before it.
+    bench.run()
+    bench.wait(lambda: bench.messages["tool"])
+    assert len(bench.messages["tool"]) == 1
+
+
+def test_the_matchers_reason_is_passed_on(bench):
+    bench.fakes.on_match = lambda request: MatchContact.Response(code=int(Code.NO_MATCH), message="nothing like a hook")
+    result, _ = bench.run()
+    assert (result.code, result.message) == (Code.NO_MATCH, "nothing like a hook")
+
+
+def test_a_second_goal_is_busy(bench):
+    bench.fakes.on_plan = fakes.FakeServers.until_canceled(PlanMotion.Result())
+    first = bench.send()
+    assert bench.fakes.started.wait(DEADLINE)
+    result, _ = bench.run()
+    assert result.code == Code.BUSY
+    bench.result(first.cancel_goal_async())
+    assert bench.result(first.get_result_async()).result.code == Code.CANCELED
+
+
+@pytest.mark.parametrize("stage", ["plan_motion", "verify_motion"])
+def test_cancel_inside_a_stage_reaches_its_server(bench, stage):
+    kind = PlanMotion if stage == "plan_motion" else VerifyMotion
+    setattr(bench.fakes, "on_" + stage.split("_")[0], fakes.FakeServers.until_canceled(kind.Result()))
+    handle = bench.send()
+    deadline = time.monotonic() + DEADLINE
+    while stage not in [name for name, _ in bench.fakes.goals]:
+        assert time.monotonic() < deadline
+        bench.fakes.started.wait(0.01)
+    begin = time.monotonic()
+    bench.result(handle.cancel_goal_async())
+    response = bench.result(handle.get_result_async())
+    assert (response.result.code, response.status) == (Code.CANCELED, GoalStatus.STATUS_CANCELED)
+    assert time.monotonic() - begin < 2.0
+    assert bench.fakes.canceled_goals == [stage]
+
+
+def test_cancel_while_matching(bench):
+    release, entered = threading.Event(), threading.Event()
+
+    def slow(request):
+        entered.set()
+        release.wait(DEADLINE)
+        return fakes.FakeServers.match(request)
+
+    bench.fakes.on_match = slow
+    handle = bench.send()
+    assert entered.wait(DEADLINE)
+    bench.result(handle.cancel_goal_async())
+    assert bench.result(handle.get_result_async()).result.code == Code.CANCELED
+    release.set()
+    result, _ = bench.run()
+    assert result.code == 0
+
+
+def test_a_handler_that_raises_drops_its_candidate(bench):
+    def broken(goal, canceled):
+        raise RuntimeError("a defect of the planner")
+
+    bench.fakes.on_plan = broken
+    result, _ = bench.run()
+    assert result.code == Code.NO_CANDIDATE_SUCCEEDED
+    assert {r.code for r in result.candidates} == {int(Code.INTERNAL)}
+
+
+def test_a_server_that_never_finishes(folder):
+    bench = Bench(folder, verify_timeout=0.5)
+    try:
+        bench.fakes.publish(fakes.scene())
+        bench.fakes.on_verify = fakes.FakeServers.until_canceled(VerifyMotion.Result())
+        begin = time.monotonic()
+        result, _ = bench.run()
+        assert result.code == Code.SERVER_TIMEOUT
+        assert "verifier" in result.message
+        assert time.monotonic() - begin < 5.0
+        assert bench.fakes.canceled_goals == ["verify_motion"]
+    finally:
+        bench.close()
+
+
+def test_missing_server_and_missing_objects(folder):
+    bench = Bench(folder, services=("match", "plan"))
+    try:
+        begin = time.monotonic()
+        result, _ = bench.run()
+        assert result.code == Code.SERVER_UNAVAILABLE
+        assert "verifier" in result.message
+        assert "/verify_motion" in result.message
+        assert time.monotonic() - begin < 5.0
+        late = fakes.FakeServers("late", services=("verify",), context=bench.context)
+        bench.executor.add_node(late)
+        result, _ = bench.run()
+        assert result.code == Code.NO_OBJECTS, result.message  # the stand-in has a publisher but has published nothing
+        assert "/objects" in result.message
+        bench.fakes.publish(fakes.scene(("object_1",)))
+        result, _ = bench.run(target_id="")
+        assert result.code == Code.NO_OBJECTS
+        assert "object_1" in result.message
+        status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="perception: left", message="no camera_info on /camera/left")
+        status.values = [KeyValue(key="code", value="101")]
+        bench.diagnostics.publish(DiagnosticArray(status=[status]))
+        deadline = time.monotonic() + DEADLINE
+        while bench.server.complaint() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        result, _ = bench.run(target_id="")
+        assert result.code == Code.NO_CAMERA_INFO
+        assert "no camera_info on /camera/left" in result.message
+    finally:
+        bench.close()
+
+
+def test_complaint_codes():
+    def status(value):
+        return DiagnosticStatus(values=[KeyValue(key="code", value=value)])
+
+    assert complaint_code(status("NO_TABLE")) == Code.NO_TABLE
+    assert complaint_code(status("105")) == Code.NO_TABLE
+    assert complaint_code(status("0")) is None
+    assert complaint_code(status("7")) is None
+    assert complaint_code(status("gibberish")) is None
+    assert complaint_code(DiagnosticStatus()) is None
+
+
+def test_token_wakes_and_cancels():
+    token = Token()
+    threading.Timer(0.05, token.cancel).start()
+    with pytest.raises(MagicError) as error:
+        token.wait(lambda: False, time.monotonic() + DEADLINE)
+    assert error.value.code == Code.CANCELED
+    assert not Token().wait(lambda: False, time.monotonic() + 0.01)
+    assert Token().wait(lambda: True, time.monotonic())
