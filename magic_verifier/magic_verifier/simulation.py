@@ -87,17 +87,12 @@ def reduced(points: NDArray[np.float64], limit: int = MAX_VERTICES) -> NDArray[n
     corners = points[hull.vertices]
     if len(corners) <= limit:
         return corners
-    # A Fibonacci sphere: directions spread evenly without chance.
-    k = np.arange(4 * limit) + 0.5
-    z = 1 - 2 * k / len(k)
+    # A Fibonacci sphere: directions spread evenly without chance; two of them may share their furthest corner.
+    k = np.arange(limit) + 0.5
+    z = 1 - 2 * k / limit
     angle = np.pi * (1 + 5**0.5) * k
     directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
-    chosen: list[int] = []
-    for index in np.argmax(corners @ directions.T, axis=0):
-        if index not in chosen:
-            chosen.append(int(index))
-        if len(chosen) == limit:
-            break
+    chosen = np.unique(np.argmax(corners @ directions.T, axis=0))
     return corners[chosen]
 
 
