@@ -1,0 +1,361 @@
+"""The arm and its gripper: where their description is, how they move, what they touch.
+
+Everything that is particular to one arm is in :class:`RobotConfig`.  MPlib loads
+URDF and SRDF, checks collisions and plans free motion; :mod:`magic_planner.kinematics`
+answers the many small questions.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_planner.budget import Budget
+from magic_planner.collision import Body, fcl_pose, hull
+from magic_planner.kinematics import Chain, load_chain
+
+#: Franka's ready pose.
+PANDA_HOME = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
+#: Franka's joint acceleration limits, rad/s^2 (Franka Control Interface documentation); a URDF has none.
+PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """Which arm and gripper, and how fast.
+
+    urdf, srdf: files; empty: the Panda of the package ``example-robot-data``.  package_root: what
+    ``package://`` in the URDF stands for; empty: the folder above the URDF in which its meshes are found.
+    move_group: the link between the fingertips, z out of the hand.  closing_axis: along which axis of
+    that link the fingers close.  opening: metres between the open fingers.  home: joint positions.
+    acceleration: limits in rad/s^2, one for each joint or one for all.  scales: share of the limits used.
+    """
+
+    urdf: str = ""
+    srdf: str = ""
+    package_root: str = ""
+    move_group: str = "panda_hand_tcp"
+    closing_axis: str = "y"
+    opening: float = 0.08
+    home: tuple[float, ...] = PANDA_HOME
+    acceleration: tuple[float, ...] = PANDA_ACCELERATION
+    velocity_scale: float = 0.3
+    acceleration_scale: float = 0.2
+    seeds: int = 6000
+
+    def __post_init__(self) -> None:
+        if self.closing_axis not in ("x", "y"):
+            raise MagicError(Code.BAD_REQUEST, "closing axis", self.closing_axis, ("x", "y"))
+        if not 0.005 <= self.opening <= 1.0:
+            raise MagicError(Code.BAD_REQUEST, "gripper opening", self.opening, "0.005 to 1 m")
+        for name in ("velocity_scale", "acceleration_scale"):
+            if not 0 < getattr(self, name) <= 1:
+                raise MagicError(Code.BAD_REQUEST, name, getattr(self, name), "above 0, up to 1")
+
+
+def panda_folder() -> Path:
+    """The Panda's description in the package ``example-robot-data``, wherever it is installed."""
+    try:
+        for file in metadata.files("example-robot-data") or ():
+            if file.name == "panda.urdf":
+                return Path(str(file.locate())).resolve().parents[1]
+    except metadata.PackageNotFoundError:
+        pass
+    raise MagicError(Code.BAD_REQUEST, "URDF of the Panda", "not found", "the Python package example-robot-data, or parameters urdf and srdf")
+
+
+@dataclass(frozen=True)
+class Collision:
+    """Two things that meet: names of links or objects."""
+
+    first: str
+    second: str
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second}"
+
+
+@dataclass
+class Attached:
+    """The object in the hand as the collision world knows it."""
+
+    name: str = ""
+    touching: tuple[str, ...] = field(default_factory=tuple)
+
+
+class Robot:
+    """The arm in its collision world.  Not thread-safe: one request at a time."""
+
+    def __init__(self, config: RobotConfig | None = None) -> None:
+        """Load the arm; raises BAD_REQUEST for a file, link or joint that is not there."""
+        import mplib
+
+        self.config = config or RobotConfig()
+        urdf, srdf = Path(self.config.urdf), Path(self.config.srdf)
+        if not self.config.urdf:
+            folder = panda_folder()
+            urdf, srdf = folder / "urdf" / "panda.urdf", folder / "srdf" / "panda.srdf"
+        for path, what in ((urdf, "URDF"), (srdf, "SRDF")):
+            if not path.is_file():
+                raise MagicError(Code.BAD_REQUEST, what, str(path), "an existing file")
+        self.chain: Chain = load_chain(urdf, self.config.move_group)
+        text = urdf.read_text()
+        root = Path(self.config.package_root) if self.config.package_root else _package_root(urdf.resolve(), text)
+        # MPlib writes a copy of a URDF that names package:// beside it; ours goes to a folder that can be written.
+        with tempfile.TemporaryDirectory() as scratch:
+            copy = Path(scratch) / urdf.name
+            # ... where it reads mesh names, absolute ones too, relative to the URDF.
+            copy.write_text(text.replace("package://", os.path.relpath(root.resolve(), Path(scratch).resolve()) + "/"))
+            try:
+                self.planner = mplib.Planner(urdf=str(copy), srdf=str(srdf), move_group=self.config.move_group, new_package_keyword="")
+            except (RuntimeError, ValueError, AssertionError) as error:
+                raise MagicError(Code.BAD_REQUEST, f"robot {urdf}", str(error).splitlines()[0], "a URDF and SRDF that MPlib reads") from error
+        self.world = self.planner.planning_world
+        self.count = self.chain.count
+        self.home = np.array(self.config.home, dtype=float)
+        if self.home.shape != (self.count,):
+            raise MagicError(Code.BAD_REQUEST, "home configuration", self.home.tolist(), f"{self.count} joint positions")
+        self.velocity_limits = self.chain.velocity * self.config.velocity_scale
+        acceleration = np.array(self.config.acceleration, dtype=float)
+        if acceleration.size not in (1, self.count):
+            raise MagicError(Code.BAD_REQUEST, "acceleration limits", acceleration.tolist(), f"1 or {self.count} numbers")
+        self.acceleration_limits = np.broadcast_to(acceleration, (self.count,)) * self.config.acceleration_scale
+        names = self.planner.user_joint_names
+        if list(names[: self.count]) != list(self.chain.names):
+            raise MagicError(Code.BAD_REQUEST, "joints of the URDF", list(names), f"the arm's joints first: {list(self.chain.names)}")
+        self.fingers = self.planner.joint_limits[self.count :]
+        self.link = self.planner.link_name_2_idx[self.config.move_group]
+        self.hand: dict[str, Mesh] = {}
+        self._read_hand()
+        self._attached = Attached()
+        self._library: tuple[cKDTree, NDArray[np.float64]] | None = None
+
+    # ------------------------------------------------------------ the gripper
+
+    @property
+    def closing(self) -> NDArray[np.float64]:
+        """(3,): the axis along which the fingers close, in the frame of the move group."""
+        return np.eye(3)["xy".index(self.config.closing_axis)]
+
+    def _finger_positions(self, width: float) -> NDArray[np.float64]:
+        share = np.clip(width / self.config.opening, 0.0, 1.0)
+        return self.fingers[:, 0] + share * (self.fingers[:, 1] - self.fingers[:, 0])
+
+    def open_to(self, width: float) -> None:
+        """Set the distance between the fingers in the collision world."""
+        self.planner.robot.set_qpos(np.concatenate([self.home, self._finger_positions(width)]), True)
+
+    def _read_hand(self) -> None:
+        """Convex hulls, in the frame of the move group and with open fingers, of the links that ride on the last joint."""
+        self.open_to(self.config.opening)
+        tip_from_base = transforms.inverse(self.chain.forward(self.home))
+        shapes = {o.name: o.shapes for o in self.planner.robot.get_fcl_model().get_collision_objects()}
+        before = {name: [s.pose.to_transformation_matrix() for s in found] for name, found in shapes.items()}
+        moved = self.home + np.where(np.arange(self.count) == self.count - 1, -0.3, 0.0)
+        self.planner.robot.set_qpos(np.concatenate([moved, self._finger_positions(self.config.opening)]), True)
+        after_from_base = transforms.inverse(self.chain.forward(moved))
+        for name, found in shapes.items():
+            local = [tip_from_base @ pose for pose in before[name]]
+            again = [after_from_base @ s.pose.to_transformation_matrix() for s in found]
+            if local and all(np.allclose(a, b, atol=1e-6) for a, b in zip(local, again, strict=True)):
+                points = [transforms.apply(pose, _shape_points(s.get_collision_geometry())) for pose, s in zip(local, found, strict=True)]
+                self.hand[name] = Mesh(*hull(np.concatenate(points)))
+        self.open_to(self.config.opening)
+        if not self.hand:
+            raise MagicError(Code.BAD_REQUEST, "gripper of the URDF", "no collision shape moves with the last joint", "a hand with collision geometry")
+        #: How far the fingertips reach beyond the tip frame's origin, metres.
+        self.tip_reach = float(max(m.vertices[:, 2].max() for m in self.hand.values()))
+        across = "xy".index(self.config.closing_axis)
+        depth = {name: m.vertices[:, 2].max() for name, m in self.hand.items()}
+        deepest = max(depth.values())
+        #: Links that touch what is held: those that reach as deep as the fingertips.
+        self.finger_links = tuple(n for n, d in depth.items() if d > deepest - 0.005 and abs(self.hand[n].vertices[:, across].mean()) > 1e-3)
+
+    def hand_body(self) -> Body:
+        """The open hand as one body in the frame of the move group."""
+        return Body.from_pieces("hand", self.hand.values())
+
+    # ------------------------------------------------------------ the world
+
+    def clear(self) -> None:
+        """Take everything out of the collision world but the arm."""
+        if self._attached.name:
+            self.world.detach_object(self._attached.name, also_remove=True)
+            self._attached = Attached()
+        for name in list(self.world.get_object_names()):
+            self.world.remove_object(name)
+        self.planner.acm.clear()
+
+    def add(self, name: str, pieces: Iterable[Mesh], world_from_object: NDArray[np.float64]) -> None:
+        """Put an object of convex pieces into the world, or put it elsewhere."""
+        from mplib.collision_detection import fcl
+
+        if self.world.has_object(name):
+            self.world.remove_object(name)
+        shapes = [fcl.CollisionObject(fcl.Convex(*hull(piece.vertices))) for piece in pieces]
+        self.world.add_object(fcl.FCLObject(name, fcl_pose(world_from_object), shapes, [fcl_pose(np.eye(4))] * len(shapes)))
+
+    def add_table(self, plane: NDArray[np.float64], name: str = "table", gap: float = 0.001) -> None:
+        """Put the table in as a slab 0.2 m thick whose top lies ``gap`` below the plane (4,); the arm's base may touch it."""
+        from mplib.collision_detection import fcl
+
+        normal = plane[:3]
+        pose = transforms.frame(-normal * (plane[3] + gap + 0.1), np.cross([0.0, 1.0, 0.0], normal), normal)
+        if self.world.has_object(name):
+            self.world.remove_object(name)
+        self.world.add_object(fcl.FCLObject(name, fcl_pose(pose), [fcl.CollisionObject(fcl.Box(4.0, 4.0, 0.2))], [fcl_pose(np.eye(4))]))
+        self.allow(name, self.chain.base_link)
+
+    def add_cloud(self, name: str, points: NDArray[np.float64], resolution: float) -> None:
+        """Put a point cloud (N, 3) into the world as an octree."""
+        if len(points):
+            self.world.add_point_cloud(name, np.asarray(points, dtype=float), resolution)
+
+    def allow(self, first: str, *others: str, allowed: bool = True) -> None:
+        """Let two things touch, or forbid it again."""
+        for other in others:
+            if allowed:
+                self.planner.acm.set_entry(first, other, True)
+            elif self.planner.acm.has_entry(first, other):
+                self.planner.acm.remove_entry(first, other)
+
+    def attach(self, name: str, pieces: Iterable[Mesh], tip_from_object: NDArray[np.float64], touching: Sequence[str]) -> None:
+        """Take an object of convex pieces into the hand; ``touching`` are the links that may touch it."""
+        self.detach()
+        self.add(name, pieces, np.eye(4))
+        self.world.attach_object(name, self.planner.robot.get_name(), self.link, fcl_pose(tip_from_object), list(touching))
+        self._attached = Attached(name, tuple(touching))
+
+    def detach(self) -> None:
+        """Let go of what is in the hand and take it out of the world."""
+        if self._attached.name:
+            self.world.detach_object(self._attached.name, also_remove=True)
+            if self.world.has_object(self._attached.name):
+                self.world.remove_object(self._attached.name)
+            self._attached = Attached()
+
+    def collides(self, q: NDArray[np.float64]) -> bool:
+        """Whether the arm at q (J,), with what it holds, touches itself or anything."""
+        self.world.set_qpos_all(q)
+        return bool(self.world.is_state_colliding())
+
+    def collision(self, q: NDArray[np.float64]) -> Collision | None:
+        """The first pair that touches at q (J,)."""
+        self.world.set_qpos_all(q)
+        if not self.world.is_state_colliding():
+            return None
+        found = self.world.check_collision()
+        if not found:
+            return Collision("the arm", "something")
+        return Collision(found[0].link_name1 or found[0].object_name1, found[0].link_name2 or found[0].object_name2)
+
+    def first_collision(self, path: NDArray[np.float64], step: float = 0.04, budget: Budget | None = None, stage: str = "") -> tuple[int, Collision] | None:
+        """Index of the first row of a path (N, J) before which the arm touches something, and the pair; rows are joined by straight lines checked every ``step`` rad."""
+        for i, q in enumerate(path):
+            if budget is not None and i % 16 == 0:
+                budget.check(stage)
+            between = [q]
+            if i:
+                parts = max(1, int(np.ceil(np.abs(q - path[i - 1]).max() / step)))
+                between = [path[i - 1] + (q - path[i - 1]) * n / parts for n in range(1, parts + 1)]
+            for point in between:
+                if self.collides(point):
+                    return i, self.collision(point) or Collision("the arm", "something")
+        return None
+
+    # ------------------------------------------------------------ inverse kinematics
+
+    def _seed_library(self) -> tuple[cKDTree, NDArray[np.float64]]:
+        """Joint positions free of self-collision that lie all over the workspace, to start the inverse kinematics from."""
+        if self._library is None:
+            rng = np.random.default_rng(20)
+            lower, upper = self.chain.lower, self.chain.upper
+            margin = 0.05 * (upper - lower)
+            q = rng.uniform(lower + margin, upper - margin, (self.config.seeds, self.count))
+            tips = self.chain.forward(q)
+            useful = (tips[:, 2, 3] > -0.1) & (tips[:, 2, 2] < 0.7)
+            q, tips = q[useful], tips[useful]
+            free = []
+            for row in q:
+                self.world.set_qpos_all(row)
+                free.append(not self.world.check_self_collision())
+            q, tips = q[free], tips[free]
+            self._library = (cKDTree(self._features(tips)), q)
+        return self._library
+
+    @staticmethod
+    def _features(tips: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([tips[:, :3, 3] * 4.0, tips[:, :3, 2], tips[:, :3, 0] * 0.7], axis=1)
+
+    def warm_up(self) -> None:
+        """Build what the first request would otherwise wait for."""
+        self.clear()
+        self._seed_library()
+        self.inverse(np.repeat(self.chain.forward(self.home)[None], 4, axis=0))
+
+    def inverse(
+        self, targets: NDArray[np.float64], starts: NDArray[np.float64] | None = None, seeds: int = 12, margin: float = 0.02
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """All solutions found for poses (N, 4, 4): index of the pose (S,) and joint positions (S, J), near duplicates left out.
+
+        starts (M, J): further configurations to start from, for every pose.
+        """
+        tree, library = self._seed_library()
+        seeds = min(seeds, len(library))
+        near = library[np.atleast_2d(tree.query(self._features(targets), k=seeds)[1].reshape(len(targets), seeds))]
+        if starts is not None and len(starts):
+            near = np.concatenate([near, np.broadcast_to(np.atleast_2d(starts)[None], (len(targets), *np.atleast_2d(starts).shape))], axis=1)
+        each = near.shape[1]
+        q, solved = self.chain.solve(np.repeat(targets, each, axis=0), near.reshape(-1, self.count), iterations=25)
+        inside = np.minimum(q - self.chain.lower, self.chain.upper - q).min(axis=1) > margin
+        index = np.repeat(np.arange(len(targets)), each)
+        keep_index: list[int] = []
+        keep_q: list[NDArray[np.float64]] = []
+        for i in range(len(targets)):
+            mine: list[NDArray[np.float64]] = []
+            for row in q[(index == i) & solved & inside]:
+                if all(np.abs(row - other).max() > 0.15 for other in mine):
+                    mine.append(row)
+            keep_index += [i] * len(mine)
+            keep_q += mine
+        return np.array(keep_index, dtype=int), np.array(keep_q).reshape(-1, self.count)
+
+
+def _package_root(urdf: Path, text: str) -> Path:
+    """The folder above a URDF under which the first mesh that it names by package:// lies."""
+    named = re.search(r"package://([^\"']+)", text)
+    if named:
+        for folder in urdf.parents:
+            if (folder / named.group(1)).is_file():
+                return folder
+        raise MagicError(Code.BAD_REQUEST, f"mesh of {urdf}", named.group(0), "parameter package_root: the folder that package:// stands for")
+    return urdf.parent
+
+
+def _shape_points(geometry: Any) -> NDArray[np.float64]:
+    """Points (N, 3) whose convex hull holds an FCL shape."""
+    kind = type(geometry).__name__
+    if hasattr(geometry, "get_vertices"):
+        return np.asarray(geometry.get_vertices(), dtype=float).reshape(-1, 3)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    if kind == "Box":
+        return corners * np.asarray(geometry.side, dtype=float).reshape(3) / 2
+    if kind == "Sphere":
+        return corners * float(geometry.radius)
+    if kind in ("Capsule", "Cylinder", "Cone"):
+        radius, length = float(geometry.radius), float(geometry.lz)
+        return corners * [radius, radius, length / 2 + (radius if kind == "Capsule" else 0.0)]
+    raise MagicError(Code.BAD_REQUEST, "collision shape of the hand", kind, ("mesh", "Box", "Sphere", "Capsule", "Cylinder"))
