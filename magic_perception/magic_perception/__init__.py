@@ -1,0 +1,1 @@
+"""From RGB-D frames of a table-top to objects."""

@@ -1,0 +1,63 @@
+"""The numbers that perception works with, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magic_core.errors import Code, MagicError
+
+METHODS = ("completed", "paper")
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What :func:`magic_perception.pipeline.perceive` may be told; lengths in metres.
+
+    region_low, region_high (3,): the workspace box in the world frame; what is outside is not looked at.
+    table_tilt: largest angle in degrees between the table's normal and the world's up.
+    table_band: points this near to a plane hypothesis agree with it.
+    snap_height, snap_tilt: a table found this near (metres, degrees) to the plane z = 0 is taken to be that plane,
+    and the cameras' small errors of calibration are taken out; 0 turns it off.
+    min_height: least height above the table that depth alone may call an object.
+    min_pixels, min_extent: smaller things are noise.
+    cluster_eps, cluster_points: DBSCAN's radius and neighbours on the thinned cloud.
+    known_margin: points this near to a known object belong to it.
+    resolution: cell of the occupancy grids that outlines come from.
+    wall: assumed wall thickness of things that are seen to be hollow from above.
+    use_color: refine masks by the colour difference to the table.
+    split: part touching objects at concave edges.
+    method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
+    """
+
+    region_low: tuple[float, float, float] = (-np.inf, -np.inf, -0.05)
+    region_high: tuple[float, float, float] = (np.inf, np.inf, 0.6)
+    table_tilt: float = 15.0
+    table_band: float = 0.008
+    snap_height: float = 0.008
+    snap_tilt: float = 1.5
+    min_height: float = 0.004
+    min_pixels: int = 120
+    min_extent: float = 0.008
+    cluster_eps: float = 0.012
+    cluster_points: int = 4
+    known_margin: float = 0.012
+    resolution: float = 0.0015
+    wall: float = 0.003
+    use_color: bool = True
+    split: bool = False
+    method: str = "completed"
+    max_objects: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        low, high = np.asarray(self.region_low, float), np.asarray(self.region_high, float)
+        if low.shape != (3,) or high.shape != (3,) or not np.all(low < high):
+            raise MagicError(Code.BAD_REQUEST, "region of interest", f"{self.region_low} to {self.region_high}", "a lower corner below the upper one on x, y and z")
+        if self.method not in METHODS:
+            raise MagicError(Code.BAD_REQUEST, "method of reconstruction", self.method, METHODS)
+        for name in ("table_tilt", "table_band", "min_height", "cluster_eps", "resolution", "wall"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise MagicError(Code.BAD_REQUEST, name, value, "a number above 0")

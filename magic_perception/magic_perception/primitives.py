@@ -1,0 +1,115 @@
+"""Spheres and upright cylinders, where the points say so: the target objects of most tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """centre (3,) and radius in metres; ``residual`` is the 90th percentile of the points' distances to the surface."""
+
+    centre: NDArray[np.float64]
+    radius: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder on the table z = 0: centre (2,), radius and height in metres; ``residual`` as for Sphere."""
+
+    centre: NDArray[np.float64]
+    radius: float
+    height: float
+    residual: float
+
+
+def fit_circle(points: NDArray[np.float64], rounds: int = 4, band: float | None = None) -> tuple[NDArray[np.float64], float]:
+    """Centre (2,) and radius of the circle through points (N, 2), by least squares, refitted to the nearest 80 %."""
+    kept = points
+    centre, radius = points.mean(axis=0), 0.0
+    for _ in range(rounds):
+        mean = kept.mean(axis=0)
+        local = kept - mean
+        solution = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), np.sum(local**2, axis=1), rcond=None)[0]
+        centre = mean + solution[:2]
+        radius = float(np.sqrt(max(solution[2] + solution[:2] @ solution[:2], 0)))
+        residual = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        kept = points[residual <= max(np.percentile(residual, 80), 1e-4 if band is None else band)]
+    return centre, radius
+
+
+def fit_sphere(points: NDArray[np.float64]) -> Sphere | None:
+    """The sphere through points (N, 3), by least squares, refitted to the nearest 85 %; ``None`` for fewer than 30 points."""
+    if len(points) < 30:
+        return None
+    kept = points
+    for _ in range(4):
+        mean = kept.mean(axis=0)
+        local = kept - mean
+        solution = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), np.sum(local**2, axis=1), rcond=None)[0]
+        centre = mean + solution[:3]
+        radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 0)))
+        residual = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        kept = points[residual <= np.percentile(residual, 85)]
+    return Sphere(centre, radius, float(np.percentile(residual, 90)))
+
+
+def fit_cylinder(points: NDArray[np.float64]) -> Cylinder | None:
+    """The upright cylinder that stands on z = 0 and has the points (N, 3) on its side or its top; ``None`` where there are too few."""
+    height = float(np.percentile(points[:, 2], 98))
+    top = points[points[:, 2] > height - max(0.004, 0.06 * height)]
+    side = points[(points[:, 2] < height - max(0.005, 0.08 * height)) & (points[:, 2] > 0.15 * height)]
+    if len(side) < 30 or len(top) < 10:
+        return None
+    centre, radius = fit_circle(side[:, :2])
+    if not 0.004 < radius < 0.15:
+        return None
+    height = float(np.median(top[:, 2]))
+    outward = np.linalg.norm(points[:, :2] - centre, axis=1) - radius
+    above = points[:, 2] - height
+    # Distance to the surface of the solid: from inside the nearer of side and top, from outside the true distance.
+    distance = np.where((outward < 0) & (above < 0), np.minimum(-outward, -above), np.hypot(np.maximum(outward, 0), np.maximum(above, 0)))
+    return Cylinder(centre, radius, height, float(np.percentile(distance, 90)))
+
+
+def sphere_mesh(sphere: Sphere, subdivisions: int = 3) -> Mesh:
+    """An icosphere whose volume is that of the sphere to a percent."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=sphere.radius)
+    return Mesh(ball.vertices + sphere.centre, ball.faces)
+
+
+def revolve(profile: NDArray[np.float64], centre: NDArray[np.float64], segments: int = 48) -> Mesh:
+    """The solid that a polyline (K, 2) of (radius, z) sweeps about the upright axis through ``centre`` (2,).
+
+    The line starts and ends on the axis (radius 0) or is closed there; it runs so that the solid lies on its left
+    (from the bottom up on the outside).  Watertight.
+    """
+    profile = np.asarray(profile, float)
+    if profile[0, 0] > 0:
+        profile = np.vstack([[0.0, profile[0, 1]], profile])
+    if profile[-1, 0] > 0:
+        profile = np.vstack([profile, [0.0, profile[-1, 1]]])
+    inner = profile[1:-1]
+    angle = np.arange(segments) * 2 * np.pi / segments
+    rings = np.stack([inner[:, None, 0] * np.cos(angle), inner[:, None, 0] * np.sin(angle), np.repeat(inner[:, 1:2], segments, axis=1)], axis=-1)
+    k = len(inner)
+    vertices = np.concatenate([rings.reshape(-1, 3), [[0, 0, profile[0, 1]], [0, 0, profile[-1, 1]]]])
+    vertices[:, :2] += centre
+    i = np.arange(segments)
+    j = (i + 1) % segments
+    faces = []
+    for row in range(k - 1):
+        a, b = row * segments, (row + 1) * segments
+        faces += [np.column_stack([a + i, a + j, b + j]), np.column_stack([a + i, b + j, b + i])]
+    last = (k - 1) * segments
+    faces.append(np.column_stack([np.full(segments, k * segments), j, i]))
+    faces.append(np.column_stack([np.full(segments, k * segments + 1), last + i, last + j]))
+    return Mesh(vertices, np.concatenate(faces))

@@ -1,0 +1,696 @@
+"""From what cameras saw of one thing to a closed solid with convex pieces.
+
+Everything here is in the table frame: z = 0 is the table, z up.  The paper projects the points to the table,
+takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstruct` does better where that fails:
+
+* balls and upright cylinders are recognised by their residual;
+* flat things are carved: a cell of the table is part of the thing if the whole upright column above it, up to the
+  measured thickness, falls into the thing's mask in every camera.  For a prism this is its visual hull; it takes its
+  sharpness from the colour image, not from depth, and a hole through which the table is seen stays open;
+* things that lie become a height field on the table, or, where they are seen to be hollow from above (a spoon's
+  bowl), a shell;
+* things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where the
+  inside was seen, with the handle carved in its own upright plane in the same way as a flat thing;
+* other standing things are stacked from layers, completed by point symmetry where no camera saw through the completion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from magic_core import transforms
+from magic_core.camera import Intrinsics
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh, concatenate
+from magic_perception import clusters, polygons, primitives
+from magic_perception.parameters import Parameters
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One camera's view of one thing.
+
+    mask (H, W) bool: the thing; hidden (H, W) bool: something else in front may hide it, so that a miss there says nothing.
+    depth (H, W) float32 metres, NaN none; heights (H, W) float32 above the table; sigma: noise of the heights at the thing.
+    """
+
+    intrinsics: Intrinsics
+    table_from_camera: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+    hidden: NDArray[np.bool_]
+    depth: NDArray[np.float32]
+    heights: NDArray[np.float32]
+    sigma: float
+
+    @property
+    def eye(self) -> NDArray[np.float64]:
+        """(3,): where the camera is."""
+        return self.table_from_camera[:3, 3]
+
+    def sample(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """At points (..., 3): the mask (0..1, interpolated; 1 where hidden or outside of the picture), the points' and the measured depth."""
+        camera = transforms.apply(transforms.inverse(self.table_from_camera), points)
+        pixels = self.intrinsics.project(camera)
+        u, v = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
+        shape = u.shape
+        u, v = u.reshape(len(u), -1), v.reshape(len(v), -1)
+        field = (self.mask | self.hidden).astype(np.float32)
+        inside = cv2.remap(field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
+        depth = cv2.remap(self.depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+        return inside.reshape(shape), camera[..., 2].astype(np.float32), depth.reshape(shape)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """mesh and convex pieces in the table frame; ``shape`` names how they came about; confidence 0..1."""
+
+    mesh: Mesh
+    pieces: tuple[Mesh, ...]
+    shape: str
+    confidence: float
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """An upright height map: origin (2,) of cell (0, 0)'s centre, cell size, top (rows, columns) metres, NaN empty."""
+
+    origin: NDArray[np.float64]
+    cell: float
+    top: NDArray[np.float32]
+
+    def centres(self) -> NDArray[np.float64]:
+        """(rows, columns, 2): x, y of the cells."""
+        rows, columns = self.top.shape
+        y, x = np.mgrid[0:rows, 0:columns]
+        return np.stack([x, y], axis=-1) * self.cell + self.origin
+
+
+def surface(sight: Sight, upsample: int = 2) -> NDArray[np.float64]:
+    """The thing's visible surface as points (N, 3), also where depth is missing in the mask, twice as dense as the pixels.
+
+    Heights are filled from the nearest pixel and smoothed in the mask; each point is where its pixel's ray reaches its height.
+    """
+    rows, columns = np.nonzero(sight.mask)
+    if len(rows) == 0:
+        return np.zeros((0, 3))
+    pad = 3
+    r0, r1 = max(rows.min() - pad, 0), min(rows.max() + pad + 1, sight.mask.shape[0])
+    c0, c1 = max(columns.min() - pad, 0), min(columns.max() + pad + 1, sight.mask.shape[1])
+    mask = sight.mask[r0:r1, c0:c1]
+    heights = sight.heights[r0:r1, c0:c1]
+    known = mask & np.isfinite(heights)
+    if known.sum() < 5:
+        return np.zeros((0, 3))
+    distance, index = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    value = np.zeros(int(index.max()) + 1, np.float32)
+    value[index[known]] = heights[known]
+    filled = cv2.medianBlur(value[index], 5)
+    mask = mask & (distance < 12)
+    if upsample > 1:
+        size = (mask.shape[1] * upsample, mask.shape[0] * upsample)
+        mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
+        filled = cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR)
+    v, u = np.nonzero(mask)
+    h = filled[v, u]
+    u = (u + 0.5) / upsample - 0.5 + c0
+    v = (v + 0.5) / upsample - 0.5 + r0
+    k = sight.intrinsics
+    rays = np.column_stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(u))]) @ sight.table_from_camera[:3, :3].T
+    down = np.minimum(rays[:, 2], -1e-3)
+    points = sight.eye + rays * ((h - sight.eye[2]) / down)[:, None]
+    # A grazing ray turns a small error of height into a large one in the plane.
+    return points[np.linalg.norm(points - sight.eye, axis=1) < 4.0]
+
+
+def _height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> _Grid:
+    low = points[:, :2].min(axis=0) - margin * cell
+    size = np.ceil((points[:, :2].max(axis=0) - low) / cell).astype(int) + margin + 1
+    if size.max() > 1200:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "extent of one object in metres", np.round(size * cell, 2).tolist(), f"below {1200 * cell}")
+    index = np.round((points[:, :2] - low) / cell).astype(int)
+    flat = index[:, 1] * size[0] + index[:, 0]
+    order = np.argsort(points[:, 2], kind="stable")
+    top = np.full(size[0] * size[1], np.nan, np.float32)
+    top[flat[order]] = points[order, 2]  # the last, highest, wins
+    top = top.reshape(size[1], size[0])
+    occupied = np.isfinite(top).astype(np.uint8)
+    closed = cv2.morphologyEx(occupied, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
+    closed = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+    filled = _nearest(top, occupied > 0)
+    filled = cv2.medianBlur(filled, 5)
+    return _Grid(low, cell, np.where(closed, filled, np.nan).astype(np.float32))
+
+
+def _nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Values everywhere: where unknown, those of the nearest known cell."""
+    if not known.any():
+        return np.zeros_like(values)
+    _, index = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    table = np.zeros(int(index.max()) + 1, np.float32)
+    table[index[known]] = values[known]
+    return table[index]
+
+
+def _carve(sights: list[Sight], columns: list[NDArray[np.float64]], see_through: float | None = None) -> NDArray[np.float32]:
+    """Occupancy (rows, columns) 0..1 of cells, given the points (rows, columns, 3) of each cell's column: mean over cameras of the least mask.
+
+    With ``see_through`` metres a camera that measured depth farther than that behind a cell saw it empty, and one
+    that measured depth nearer than that before it says nothing.
+    """
+    total = np.zeros(columns[0].shape[:2], np.float32)
+    weight = np.zeros_like(total)
+    for sight in sights:
+        least = np.ones_like(total)
+        blind = np.zeros(total.shape, bool)
+        for points in columns:
+            inside, z, measured = sight.sample(points)
+            if see_through is not None:
+                with np.errstate(invalid="ignore"):
+                    inside = np.where(measured > z + see_through, 0, inside)
+                    behind = measured < z - see_through
+                blind |= behind
+                inside = np.where(behind, 1, inside)
+            least = np.minimum(least, inside)
+        share = np.where(blind & (least > 0.5), 0.05, 1.0).astype(np.float32)
+        total += share * least
+        weight += share
+    return total / np.maximum(weight, 1e-6)
+
+
+# ---------------------------------------------------------------- the whole
+
+
+def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
+    """The solid of one thing from all cameras that saw it.  Raises ``RECONSTRUCTION_FAILED`` where there is too little."""
+    clouds = [surface(sight) for sight in sights]
+    points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
+    points = points[points[:, 2] > -0.01]
+    if len(points) < 50:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "points of one object", len(points), "at least 50")
+    points[:, 2] = np.maximum(points[:, 2], 0)
+    noise = float(np.median([s.sigma for s in sights]))
+    if parameters.method == "paper":
+        return as_in_paper(points)
+    height = float(np.percentile(points[:, 2], 98))
+    found = _primitive(points, height, noise)
+    if found is not None:
+        return found
+    spread = points[:, :2] - points[:, :2].mean(axis=0)
+    axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
+    length = float(np.max(np.ptp(spread @ axes.T, axis=0)))
+    if height > 0.04 and height > 0.45 * length:
+        found = _standing_round(sights, points, height, noise, parameters)
+        return found if found is not None else _layers(sights, points, height, parameters)
+    return _lying(sights, points, height, noise, parameters)
+
+
+def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 0.005) -> Reconstruction:
+    """The paper's completion: points projected to the table, their alpha shape, pulled up to the highest point.
+
+    ``alpha`` and ``voxel`` are those of the authors' library; one piece, the hull of each part cut convexly.
+    """
+    thin, _ = clusters.thin(points, voxel)
+    parts = polygons.alpha_shape(thin[:, :2], alpha)
+    if not parts:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "alpha shape", "empty", "points that span an area")
+    height = max(float(points[:, 2].max()), 0.002)
+    return _extruded(parts[:1], height, "paper", 0.5)
+
+
+def _extruded(parts: list[Polygon], height: float, shape: str, confidence: float, tolerance: float = 0.0004) -> Reconstruction:
+    pieces = [polygons.prism(ring, 0.0, height) for part in parts for ring in polygons.convex_parts(part.simplify(0.0005), tolerance)]
+    return Reconstruction(concatenate([polygons.extrude(part, 0.0, height) for part in parts]), tuple(pieces), shape, confidence)
+
+
+# ---------------------------------------------------------------- balls and cylinders
+
+
+def _primitive(points: NDArray[np.float64], height: float, noise: float) -> Reconstruction | None:
+    if height < 0.012 or height > 0.3:
+        return None
+    sample = points[:: max(1, len(points) // 3000)]
+    sample = sample[sample[:, 2] > min(0.004, 0.1 * height)]
+    if len(sample) < 60:
+        return None
+    limit = max(0.0025, 2.5 * noise)
+    ball = primitives.fit_sphere(sample)
+    tin = primitives.fit_cylinder(sample)
+    if ball is not None and not (0.006 < ball.radius < 0.12 and ball.residual < limit and abs(ball.centre[2] - ball.radius) < max(0.005, 0.2 * ball.radius)):
+        ball = None
+    if tin is not None and not (tin.residual < limit and tin.radius < 0.08 and tin.height > 0.3 * tin.radius):
+        tin = None
+    if ball is not None and (tin is None or ball.residual < tin.residual):
+        # It touches the table: its height above it is its radius, to which both measurements count.
+        radius = (ball.radius + (ball.centre[2] + ball.radius) / 2) / 2
+        ball = primitives.Sphere(np.array([*ball.centre[:2], radius]), radius, ball.residual)
+        mesh = primitives.sphere_mesh(ball)
+        return Reconstruction(mesh, (primitives.sphere_mesh(ball, 2),), "sphere", _trust(ball.residual, limit))
+    if tin is not None:
+        profile = np.array([[tin.radius, 0], [tin.radius, tin.height]])
+        mesh = primitives.revolve(profile, tin.centre)
+        return Reconstruction(mesh, (mesh,), "cylinder", _trust(tin.residual, limit))
+    return None
+
+
+def _trust(residual: float, limit: float) -> float:
+    return float(np.clip(1.0 - 0.5 * residual / limit, 0.3, 1.0))
+
+
+# ---------------------------------------------------------------- lying things
+
+
+def _lying(sights: list[Sight], points: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction:
+    grid = _height_map(points, parameters.resolution)
+    occupied = np.isfinite(grid.top)
+    inner = cv2.erode(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
+    sample = grid.top[inner] if inner.sum() > 30 else grid.top[occupied]
+    low, middle, high = np.percentile(sample, [12, 55, 95])
+    flat = high - low < max(0.004, 0.2 * high, 3.0 * noise)
+    centres = grid.centres()
+    thickness = float(max(middle if flat else high, 0.002))
+    if flat and thickness < 0.06:
+        columns = [np.concatenate([centres, np.full((*centres.shape[:2], 1), z)], axis=-1) for z in np.linspace(0, thickness, 2 + int(thickness / 0.006))]
+        field = _carve(sights, columns)
+        near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+        field = cv2.GaussianBlur(field * near, (0, 0), 0.8)
+    else:
+        columns = [np.concatenate([centres, np.nan_to_num(grid.top)[..., None]], axis=-1)]
+        # The top of each cell must be seen; two pixels of grace for errors of height and calibration.
+        seen = np.ones(occupied.shape, bool)
+        for sight in sights:
+            wide = Sight(sight.intrinsics, sight.table_from_camera, cv2.dilate(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, sight.hidden, sight.depth, sight.heights, sight.sigma)
+            seen &= wide.sample(columns[0])[0] > 0.3
+        field = polygons.smooth_field(occupied & seen)
+    parts = [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > 4e-5]
+    if not parts:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
+    parts = [p for p in parts if p.area > 0.08 * parts[0].area]
+    if flat:
+        return _extruded(parts, thickness, "flat", 0.9)
+    top = cv2.GaussianBlur(_nearest(grid.top, occupied), (0, 0), 1.2)
+    depression = _filled(np.where(occupied, top, 0)) - top
+    hollow = (depression > max(0.004, 3 * noise)) & inner
+    if hollow.sum() * grid.cell**2 > 1.5e-4:
+        spread = int(np.ceil(parameters.wall / grid.cell / 2))
+        bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - parameters.wall
+        bottom = np.clip(bottom, 0, top - 0.001)
+        shape = "shell"
+    else:
+        bottom = np.zeros_like(top)
+        shape = "height field"
+    meshes, pieces = [], []
+    for part in parts:
+        meshes.append(_relief(part, grid, top, bottom))
+        pieces += _relief_pieces(part, grid, top, bottom)
+    return Reconstruction(concatenate(meshes), tuple(pieces), shape, 0.8)
+
+
+def _filled(top: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A height map with its depressions filled to their lowest rim, in steps of a millimetre."""
+    result = top.copy()
+    for level in np.arange(0.001, float(top.max()) + 0.001, 0.001):
+        above = (top >= level).astype(np.uint8)
+        outside = np.pad(1 - above, 1, constant_values=1)
+        cv2.floodFill(outside, None, (0, 0), 2)
+        closed = outside[1:-1, 1:-1] == 1
+        result[closed] = np.maximum(result[closed], level)
+    return result
+
+
+def _at(field: NDArray[np.float32], grid: _Grid, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A field over the grid at points (N, 2), interpolated."""
+    local = ((xy - grid.origin) / grid.cell).astype(np.float32)
+    return cv2.remap(field, local[:, 0:1], local[:, 1:2], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(float)
+
+
+def _relief(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], step: float = 0.003) -> Mesh:
+    """The solid between two height maps over a polygon: Delaunay over its rings and a lattice inside, with walls; watertight."""
+    from scipy.spatial import Delaunay
+
+    ring = polygons.ring_points(part, step * 0.8)
+    x0, y0, x1, y1 = part.bounds
+    y, x = np.mgrid[y0 : y1 : step, x0 : x1 : step]
+    lattice = np.column_stack([x.ravel(), y.ravel()])
+    lattice = lattice[shapely.contains_xy(part.buffer(-0.6 * step), lattice)]
+    flat = np.concatenate([ring, lattice])
+    faces = Delaunay(flat).simplices.astype(np.int64)
+    middle = flat[faces].mean(axis=1)
+    p = flat[faces]
+    turn = (p[:, 1, 0] - p[:, 0, 0]) * (p[:, 2, 1] - p[:, 0, 1]) - (p[:, 1, 1] - p[:, 0, 1]) * (p[:, 2, 0] - p[:, 0, 0])
+    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    faces = faces[shapely.contains_xy(part, middle) & (np.abs(turn) > 1e-12)]
+    used, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    flat = flat[used]
+    n = len(flat)
+    high = np.maximum(_at(top, grid, flat), 0.001)
+    low = np.minimum(_at(bottom, grid, flat), high - 0.001)
+    vertices = np.concatenate([np.column_stack([flat, low]), np.column_stack([flat, high])])
+    return Mesh(vertices, np.concatenate([faces[:, ::-1], faces + n, *polygons._walls(faces, n)]))
+
+
+def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.0015, least: float = 0.006) -> list[Mesh]:
+    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide."""
+    pieces = []
+    queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.0007), 0.0005)]
+    while queue:
+        cell, depth = queue.pop()
+        box = np.array(cell.bounds)
+        size = box[2:] - box[:2]
+        n = np.maximum(np.ceil(size / 0.0025).astype(int), 2)
+        y, x = np.meshgrid(np.linspace(box[1], box[3], n[1]), np.linspace(box[0], box[2], n[0]), indexing="ij")
+        lattice = np.column_stack([x.ravel(), y.ravel()])
+        lattice = lattice[shapely.contains_xy(cell, lattice)]
+        xy = np.concatenate([np.asarray(cell.exterior.coords)[:-1], lattice])
+        high, low = np.maximum(_at(top, grid, xy), 0.001), _at(bottom, grid, xy)
+        if depth < 10 and size.max() > least and max(_bend(xy, high), _bend(xy, low)) > tolerance:
+            long = int(np.argmax(size))
+            half = (box[long] + box[long + 2]) / 2
+            first, second = box.copy(), box.copy()
+            first[long + 2], second[long] = half, half
+            for b in (first, second):
+                queue += [(p, depth + 1) for p in polygons.parts_of(shapely.clip_by_rect(cell, *b)) if p.area > 1e-6]
+            continue
+        low = np.minimum(low, high - 0.001)
+        mesh = _hull(np.concatenate([np.column_stack([xy, low]), np.column_stack([xy, high])]))
+        if mesh is not None:
+            pieces.append(mesh)
+    return pieces
+
+
+def _bend(xy: NDArray[np.float64], z: NDArray[np.float64]) -> float:
+    """Largest distance of z from its best plane."""
+    a = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
+    return float(np.max(np.abs(a @ np.linalg.lstsq(a, z, rcond=None)[0] - z)))
+
+
+def _hull(points: NDArray[np.float64]) -> Mesh | None:
+    """The convex hull of points (N, 3), faces outward; ``None`` where they are flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    vertices = points[used]
+    p = vertices[faces]
+    normals = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    inward = np.sum(normals * hull.equations[:, :3], axis=1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return Mesh(vertices, faces)
+
+
+# ---------------------------------------------------------------- standing things
+
+
+@dataclass(frozen=True)
+class _Body:
+    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not."""
+
+    axis: NDArray[np.float64]
+    profile: NDArray[np.float64]
+    open: bool
+
+    def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(z, self.profile[:, 1], self.profile[:, 0])
+
+
+def _round_body(points: NDArray[np.float64], height: float, noise: float, seed: int) -> _Body | None:
+    """The body of revolution on which most of the side points lie, or ``None``.
+
+    x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in a parabola q, so that conical and bulged bodies fit at once.
+    """
+    sample = points[(points[:, 2] > 0.08 * height) & (points[:, 2] < 0.94 * height)]
+    if len(sample) < 150:
+        return None
+    rng = np.random.default_rng(seed)
+    sample = sample[rng.permutation(len(sample))[:4000]]
+    band = max(0.003, 2 * noise)
+    best, support = None, 0
+    slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
+    members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
+    members = [m for m in members if len(m) > 20]
+    if not members:
+        return None
+    for _ in range(160):
+        m = members[rng.integers(len(members))]
+        p = sample[rng.choice(m, 3, replace=False), :2]
+        a = 2 * (p[1:] - p[0])
+        if abs(np.linalg.det(a)) < 1e-7:
+            continue
+        centre = np.linalg.solve(a, np.sum(p[1:] ** 2, axis=1) - p[0] @ p[0])
+        radius = np.linalg.norm(p[0] - centre)
+        if not 0.01 < radius < 0.12:
+            continue
+        count = int(np.sum(np.abs(np.linalg.norm(sample[:, :2] - centre, axis=1) - radius) < band * 1.5))
+        if count > support:
+            best, support = (centre, radius), count
+    if best is None:
+        return None
+    origin = best[0]
+    near = np.abs(np.linalg.norm(sample[:, :2] - origin, axis=1) - best[1]) < max(0.008, 0.15 * best[1])
+    axis, model = origin, None
+    for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
+        p = sample[near]
+        if len(p) < 60:
+            return None
+        local, z = p[:, :2] - origin, p[:, 2] / height
+        matrix = np.column_stack([2 * local, np.ones(len(p)), z, z**2])
+        model = np.linalg.lstsq(matrix, np.sum(local**2, axis=1), rcond=None)[0]
+        axis = origin + model[:2]
+        z = sample[:, 2] / height
+        radius = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6))
+        residual = np.linalg.norm(sample[:, :2] - axis, axis=1) - radius
+        near = np.abs(residual) < width
+    share = float(near.mean())
+    angles = np.arctan2(*(sample[near, :2] - axis).T[::-1])
+    coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
+    # What reaches beyond the body must be little: a box's corner reaches 0.4 r beyond its inscribed circle.
+    if share < 0.5 or coverage < 0.28:
+        return None
+    top = float(np.percentile(sample[near, 2], 99))
+    around = points[np.abs(np.linalg.norm(points[:, :2] - axis, axis=1) - float(np.median(radius))) < 0.012]
+    top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 20 else top)
+    levels = np.linspace(0, top, max(4, int(top / 0.008)) + 1)
+    zs = levels / height
+    radii = np.sqrt(np.maximum(model[2] + model[3] * zs + model[4] * zs**2 + model[:2] @ model[:2], 1e-6))
+    rho = np.linalg.norm(sample[:, :2] - axis, axis=1)
+    for i, level in enumerate(levels):
+        here = rho[(np.abs(sample[:, 2] - level) < 0.006) & (np.abs(rho - radii[i]) < 2.5 * band)]
+        if len(here) > 15:
+            radii[i] = 0.5 * radii[i] + 0.5 * np.median(here)
+    inside = points[np.linalg.norm(points[:, :2] - axis, axis=1) < 0.6 * radii[-1]]
+    hollow = len(inside) > 25 and np.median(inside[:, 2]) < top - max(0.012, 0.15 * top)
+    return _Body(axis, np.column_stack([radii, levels]), bool(hollow))
+
+
+def _standing_round(sights: list[Sight], points: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction | None:
+    body = _round_body(points, height, noise, parameters.seed)
+    if body is None:
+        return None
+    top = body.profile[-1, 1]
+    away = points[:, :2] - body.axis
+    rho = np.linalg.norm(away, axis=1)
+    beyond = rho - body.radius(points[:, 2])
+    out = points[beyond > max(0.005, 2.5 * noise)]
+    over = points[(points[:, 2] > top + 0.012) & (beyond < 0)]
+    if len(over) > 0.08 * len(points):
+        return None  # more than a body of revolution with a flat end, a bottle's neck say
+    handle = None
+    if len(out) > 60:
+        out = out[clusters.largest(out, 0.012, 4, 0.003)]
+        reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
+        if np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010 and len(out) > 0.02 * len(points):
+            handle = _handle(sights, out, body, parameters)
+            if handle is None and len(out) > 0.15 * len(points):
+                return None
+        elif len(out) > 0.2 * len(points):
+            return None
+    wall = max(parameters.wall, 0.0035)
+    mesh, pieces = _turned(body, wall)
+    if handle is None:
+        return Reconstruction(mesh, tuple(pieces), "round", 0.85)
+    bars, handle_pieces = handle
+    try:
+        import trimesh
+
+        joined = trimesh.boolean.union([mesh.to_trimesh(), *[b.to_trimesh() for b in bars]], engine="manifold")
+        mesh = Mesh(joined.vertices, joined.faces)
+    except Exception:  # the boolean library refuses a degenerate solid: overlapping closed parts still bound the same solid
+        mesh = concatenate([mesh, *bars])
+    return Reconstruction(mesh, tuple(pieces + handle_pieces), "round with handle", 0.85)
+
+
+def _turned(body: _Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mesh]]:
+    """Mesh and convex pieces of a round body: a stack of frusta, or a floor and wall sectors where it is open."""
+    profile = body.profile
+    simple = np.asarray(shapely.LineString(profile).simplify(0.0008).coords)
+    if not body.open or profile[:, 0].min() < 2.5 * wall:
+        mesh = primitives.revolve(profile, body.axis)
+        pieces = [primitives.revolve(simple[i : i + 2], body.axis, 24) for i in range(len(simple) - 1)]
+        chord = np.interp(profile[:, 1], profile[[0, -1], 1], profile[[0, -1], 0])
+        if np.all(profile[:, 0] > chord - 0.001) and np.all(np.diff(profile[:, 0], 2) < 0.0015):
+            hull = _hull(primitives.revolve(simple, body.axis, 32).vertices)
+            pieces = [hull] if hull is not None else pieces
+        return mesh, pieces
+    floor = min(0.006, 0.2 * profile[-1, 1])
+    inner = np.column_stack([profile[:, 0] - wall, profile[:, 1]])
+    inner = np.vstack([[np.interp(floor, inner[:, 1], inner[:, 0]), floor], inner[inner[:, 1] > floor + 0.001]])
+    mesh = primitives.revolve(np.vstack([profile, inner[::-1]]), body.axis)
+    pieces = [primitives.revolve(np.array([[np.interp(0, simple[:, 1], simple[:, 0]), 0], [np.interp(floor, simple[:, 1], simple[:, 0]), floor]]), body.axis, 24)]
+    levels = simple[:, 1].copy()
+    levels[0] = floor
+    levels = levels[(levels >= floor)]
+    angles = np.linspace(0, 2 * np.pi, sectors + 1)
+    for z0, z1 in zip(levels[:-1], levels[1:], strict=True):
+        outer0, outer1 = np.interp([z0, z1], simple[:, 1], simple[:, 0])
+        for a, b in zip(angles[:-1], angles[1:], strict=True):
+            corners = [
+                [body.axis[0] + r * np.cos(t), body.axis[1] + r * np.sin(t), z]
+                for t in (a, b)
+                for r, z in ((outer0, z0), (outer0 - wall, z0), (outer1, z1), (outer1 - wall, z1))
+            ]
+            hull = _hull(np.array(corners))
+            if hull is not None:
+                pieces.append(hull)
+    return mesh, pieces
+
+
+def _handle(sights: list[Sight], out: NDArray[np.float64], body: _Body, parameters: Parameters) -> tuple[list[Mesh], list[Mesh]] | None:
+    """A handle as bars in the upright plane through the body's axis: meshes and convex pieces, or ``None`` if nothing is left after carving."""
+    local = out[:, :2] - body.axis
+    direction = local.mean(axis=0)
+    angle = float(np.arctan2(direction[1], direction[0]))
+    for _ in range(3):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        low, high = np.percentile(local @ across, [4, 96])
+        angle += float(np.arctan2((low + high) / 2, np.median(local @ along)))
+    thickness = float(np.clip(high - low, 0.005, 0.03))
+    along = np.array([np.cos(angle), np.sin(angle)])
+    e_s, e_z = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
+    e_n = np.cross(e_s, e_z)
+    cell = 0.001
+    reach = float(np.percentile(local @ along, 99.5))
+    start = float(body.profile[:, 0].min()) - 0.004
+    top = float(max(body.profile[-1, 1], np.percentile(out[:, 2], 99))) + 0.004
+    s = np.arange(start, reach + 0.006, cell)
+    z = np.arange(0.0, top, cell)
+    grid_s, grid_z = np.meshgrid(s, z)
+    base = np.array([*body.axis, 0.0])
+    plane = base + grid_s[..., None] * e_s + grid_z[..., None] * e_z
+    facing = [abs(float((plane.mean(axis=(0, 1)) - sight.eye) @ e_n)) / np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye) for sight in sights]
+    useful = [sight for sight, f in zip(sights, facing, strict=True) if f > 0.25]
+    splat = np.zeros(grid_s.shape, np.uint8)
+    column = np.round((local @ along - start) / cell).astype(int)
+    row = np.round(out[:, 2] / cell).astype(int)
+    good = (column >= 0) & (column < len(s)) & (row >= 0) & (row < len(z))
+    splat[row[good], column[good]] = 1
+    near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
+    if useful:
+        columns = [plane + n * e_n for n in np.linspace(-thickness / 2, thickness / 2, 3)]
+        field = _carve(useful, columns, see_through=max(0.02, 1.5 * thickness))
+    else:
+        field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
+    within = grid_s < body.radius(grid_z)
+    attach = within & (grid_s > body.radius(grid_z) - 0.0025) & (grid_z < body.profile[-1, 1])
+    solid = (field > 0.5) & near & ~within
+    # Where the bar meets the body its points are few: join them over 5 mm.
+    reachable = cv2.dilate(attach.astype(np.uint8), np.ones((1, 11), np.uint8)) > 0
+    solid |= reachable & (field > 0.5) & ~within & (cv2.dilate(solid.astype(np.uint8), np.ones((5, 11), np.uint8)) > 0)
+    touching = attach & (cv2.dilate(solid.astype(np.uint8), np.ones((3, 7), np.uint8)) > 0)
+    solid |= touching
+    solid = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    parts = [p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5]
+    # Only what reaches farther out than noise is a handle.
+    parts = [p for p in parts if p.bounds[2] - float(body.radius(np.array((p.bounds[1] + p.bounds[3]) / 2))) > 0.008]
+    if not parts:
+        return None
+    frame = transforms.make(np.column_stack([e_s, e_z, e_n]), base)
+    bars = [polygons.extrude(p, -thickness / 2, thickness / 2).transformed(frame) for p in parts]
+    pieces = [
+        polygons.prism(ring, -thickness / 2, thickness / 2).transformed(frame)
+        for p in parts
+        for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)
+    ]
+    return bars, pieces
+
+
+def _layers(sights: list[Sight], points: NDArray[np.float64], height: float, parameters: Parameters) -> Reconstruction:
+    """A standing thing of any form: outlines of layers, each at least what lies above it, stacked."""
+    eye = np.mean([s.eye for s in sights], axis=0)
+    centre = points[:, :2].mean(axis=0)
+    view = centre - eye[:2]
+    view = view / max(np.linalg.norm(view), 1e-9)
+    side = np.array([-view[1], view[0]])
+    band = points[(points[:, 2] > 0.1 * height) & (points[:, 2] < 0.9 * height)]
+    band = band if len(band) > 50 else points
+    lateral, depth = band[:, :2] @ side, band[:, :2] @ view
+    left, right = np.percentile(lateral, [1, 99])
+    edge = [np.median(depth[lateral < left + 0.005]), np.median(depth[lateral > right - 0.005])]
+    middle = side * (left + right) / 2 + view * float(np.mean(edge))
+    mirrored = np.column_stack([2 * middle - points[:, :2], points[:, 2]])
+    inside = np.ones(len(mirrored), bool)
+    for sight in sights:
+        shown, z, measured = sight.sample(mirrored[:, None, :])
+        with np.errstate(invalid="ignore"):
+            inside &= ~((shown[:, 0] < 0.3) | (measured[:, 0] > z[:, 0] + 0.015))
+    if inside.mean() > 0.8:
+        everything = np.concatenate([points, mirrored[inside]])
+        confidence = 0.7
+    else:
+        everything = points
+        confidence = 0.5
+    count = int(np.clip(height / 0.008, 3, 20))
+    levels = np.linspace(0, height, count + 1)
+    shapes: list[shapely.Geometry] = []
+    above: shapely.Geometry = Polygon()
+    for low, high in zip(levels[::-1][1:], levels[::-1][:-1], strict=True):
+        here = everything[(everything[:, 2] >= low - 0.003) & (everything[:, 2] <= high + 0.003), :2]
+        shape = above
+        if len(here) > 10:
+            hull = polygons.convex_hull(here)
+            if len(hull) > 2:
+                shape = Polygon(hull)
+                # Nothing hangs in the air: a layer carries what stands on it, unless it was seen to be narrower.
+                if not above.is_empty and shape.area < 0.6 * above.area:
+                    shape = above
+        if shape.is_empty:
+            continue
+        shapes.append(shape.simplify(0.0006))
+        above = shape
+    if not shapes:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "layers of one object", "empty", "points that span an area")
+    step = height / count
+    stack: list[tuple[shapely.Geometry, float, float]] = []
+    z = height
+    for shape in shapes:
+        if stack and stack[-1][0].symmetric_difference(shape).area < 0.06 * shape.area:
+            old, _, upper = stack[-1]
+            stack[-1] = (old if old.area > shape.area else shape, z - step, upper)
+        else:
+            stack.append((shape, z - step, z))
+        z -= step
+    pieces = [polygons.prism(polygons.convex_hull(np.asarray(s.exterior.coords)), max(low, 0.0), high) for s, low, high in stack if s.geom_type == "Polygon"]
+    if not pieces:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "layers of one object", "empty", "points that span an area")
+    mesh = concatenate(pieces)
+    if len(pieces) > 1:
+        try:
+            import trimesh
+
+            # Layers overlap by a micrometre so that the union is one solid.
+            solids = [Mesh(p.vertices + [0, 0, 0] + np.where(p.vertices[:, 2:] == p.vertices[:, 2].max(), [0, 0, 1e-6], 0.0), p.faces).to_trimesh() for p in pieces]
+            joined = trimesh.boolean.union(solids, engine="manifold")
+            mesh = Mesh(joined.vertices, joined.faces)
+        except Exception:  # see _standing_round
+            pass
+    return Reconstruction(mesh, tuple(pieces), "layers", confidence)

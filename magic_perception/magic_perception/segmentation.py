@@ -1,0 +1,311 @@
+"""Which pixels belong to which thing on the table.
+
+A segmenter maps frames and the table to instance labels.  ``depth`` needs no weights: what stands above the
+table, helped by the table's own colour where depth is too coarse (a 4 mm hook) or missing (a handle's edge).
+``sam`` and ``sam2`` (module :mod:`magic_perception.sam`) refine its masks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.camera import RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_perception import clusters
+from magic_perception.parameters import Parameters
+from magic_perception.table import Plane, fit_plane
+
+SEGMENTERS = ("depth", "sam2", "sam")
+
+
+@dataclass(frozen=True)
+class Looked:
+    """One frame over the table.
+
+    points (H, W, 3) float32 world metres, NaN without depth; heights (H, W) float32 metres above the table, the
+    camera's own small error of calibration taken out, lightly smoothed; raw heights are unsmoothed.
+    inside (H, W): in the region of interest.  sigma (H, W): standard deviation of ``heights``, measured on the table.
+    """
+
+    frame: RgbdFrame
+    points: NDArray[np.float32]
+    raw: NDArray[np.float32]
+    heights: NDArray[np.float32]
+    inside: NDArray[np.bool_]
+    sigma: NDArray[np.float32]
+
+
+class Segmenter(Protocol):
+    """Anything that labels instances."""
+
+    name: str
+
+    def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
+        """Labels (H, W) int32 for each look: 0 none, i >= 1 the same thing in all cameras, -1 a known object."""
+
+
+def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean of values over a size x size window, counting only where weights are, and the share of the window that counts."""
+    share = cv2.blur(weights, (size, size), borderType=cv2.BORDER_CONSTANT)
+    total = cv2.blur(values * (weights[..., None] if values.ndim == 3 else weights), (size, size), borderType=cv2.BORDER_CONSTANT)
+    safe = np.maximum(share, 1e-6)
+    return total / (safe[..., None] if values.ndim == 3 else safe), share
+
+
+def find_table(frames: list[RgbdFrame], parameters: Parameters) -> tuple[Plane, list[Plane]]:
+    """The table in world coordinates, and as each camera sees it (which takes small errors of calibration out).
+
+    A camera whose own plane is off by more than 20 mm or 2 degrees, or that sees no plane, uses the common one.
+    """
+    clouds = []
+    for frame in frames:
+        points = transforms.apply(frame.world_from_camera, frame.intrinsics.unproject(frame.depth)[::4, ::4].reshape(-1, 3))
+        low, high = np.asarray(parameters.region_low) - [0, 0, 0.05], np.asarray(parameters.region_high)
+        with np.errstate(invalid="ignore"):
+            keep = np.all((points > low) & (points < high), axis=1)
+        clouds.append(points[keep])
+    up = (0.0, 0.0, 1.0)
+    both = fit_plane(np.concatenate(clouds), up, parameters.table_tilt, parameters.table_band, seed=parameters.seed)
+    own = []
+    for cloud in clouds:
+        plane = both
+        near = cloud[np.abs(both.heights(cloud)) < 0.025]
+        if len(near) > 300:
+            try:
+                found = fit_plane(near, both.normal, 3.0, parameters.table_band, iterations=80, seed=parameters.seed)
+                centre = near.mean(axis=0)
+                if found.tilt(both.normal) < 2.0 and abs(found.heights(centre) - both.heights(centre)) < 0.02:
+                    plane = found
+            except MagicError:
+                pass
+        own.append(plane)
+    return both, own
+
+
+def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], parameters: Parameters) -> Looked:
+    """Heights above the table of one frame; the frame is moved by the small motion that carries ``plane`` onto z = 0 of the table frame."""
+    correction = transforms.inverse(_frame_on(plane, world_from_table))
+    # Correct the pose, not the heights alone, so that both cameras agree in the table's plane too.
+    pose = world_from_table @ correction @ frame.world_from_camera
+    frame = RgbdFrame(frame.color, frame.depth, frame.intrinsics, pose, frame.camera, frame.stamp)
+    k = frame.intrinsics
+    table_from_camera = transforms.inverse(world_from_table) @ pose
+    v, u = np.mgrid[0 : k.height, 0 : k.width].astype(np.float32)
+    z = frame.depth.astype(np.float32)
+    rays = np.stack([(u - np.float32(k.cx)) / np.float32(k.fx), (v - np.float32(k.cy)) / np.float32(k.fy), np.ones_like(u)], axis=-1)
+    points = (rays * z[..., None]) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
+    row = table_from_camera[2].astype(np.float32)
+    raw = z * (rays @ row[:3]) + row[3]
+    low, high = np.asarray(parameters.region_low, np.float32), np.asarray(parameters.region_high, np.float32)
+    with np.errstate(invalid="ignore"):
+        # Without depth a pixel counts as inside where its ray meets the table there.
+        reach = -row[3] / np.minimum(rays @ row[:3], -1e-3)
+        ground = (rays * reach[..., None]) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
+        where = np.where(np.isfinite(points[..., 2:]), points, ground)
+        inside = np.all((where > low) & (where < high), axis=-1) & (reach < 5.0)
+    valid = np.isfinite(raw)
+    zero = np.where(valid, raw, 0).astype(np.float32)
+    # Bias of depth over the table, which varies slowly over the picture.
+    near = (valid & (np.abs(zero) < 0.008)).astype(np.float32)
+    bias, share = masked_mean(zero, near, 81)
+    bias = np.where(share > 0.15, bias, 0)
+    raw = (raw - bias).astype(np.float32)
+    zero = np.where(valid, raw, 0).astype(np.float32)
+    # Smooth over nearby pixels of like height only: an edge of 10 mm must not smear.
+    smooth, share = masked_mean(zero, valid.astype(np.float32), 3)
+    heights = np.where(valid & (np.abs(smooth - zero) < 0.01), smooth, raw).astype(np.float32)
+    flat = valid & (np.abs(zero) < 0.01) & inside
+    with np.errstate(invalid="ignore"):
+        unit = np.abs(heights[flat]) / z[flat] ** 2 if flat.sum() > 100 else np.array([0.002])
+        sigma = (1.4826 * np.median(unit) * z**2).astype(np.float32)
+    return Looked(frame, points, raw, heights, inside, np.maximum(np.nan_to_num(sigma, nan=0.002), 3e-4))
+
+
+def _frame_on(plane: Plane, world_from_table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """world-from-plane pose nearest to ``world_from_table``, expressed so that look() can undo a camera's error."""
+    z0 = world_from_table[:3, 2]
+    z1 = plane.normal
+    axis = np.cross(z0, z1)
+    angle = float(np.arctan2(np.linalg.norm(axis), z0 @ z1))
+    turn = transforms.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle)
+    origin = world_from_table[:3, 3]
+    origin = origin - plane.heights(origin) * z1
+    return transforms.make(turn[:3, :3] @ world_from_table[:3, :3], origin)
+
+
+def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
+    """How far each pixel's colour is from the table's around it, in squared standard deviations, and the threshold of notice.
+
+    The table's colour and its spread are local means over the pixels of ``table`` (a wooden grain has a large
+    spread, so nothing stands out from it lightly); the threshold is what 99.7 % of the table stays below, at least 25.
+    """
+    lab = cv2.cvtColor(cv2.GaussianBlur(looked.frame.color, (3, 3), 0), cv2.COLOR_RGB2LAB)
+    small = cv2.resize(lab, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32)
+    weights = (cv2.resize(table.astype(np.float32), small.shape[1::-1], interpolation=cv2.INTER_AREA) > 0.99).astype(np.float32)
+    mean, share = masked_mean(small, weights, 31)
+    variance, _ = masked_mean((small - mean) ** 2, weights, 31)
+    far = share < 0.05
+    if weights.sum() > 50:
+        whole = small[weights > 0]
+        mean[far], variance[far] = whole.mean(axis=0), whole.var(axis=0)
+    size = lab.shape[1::-1]
+    mean, variance = cv2.resize(mean, size), cv2.resize(variance, size)
+    # Floor: 3 grey levels of noise in lightness, 2 in colour.
+    distance = np.sum((lab.astype(np.float32) - mean) ** 2 / (variance + np.array([9.0, 4.0, 4.0], np.float32)), axis=-1)
+    sample = distance[table]
+    threshold = max(25.0, float(np.percentile(sample[::7], 99.7))) if len(sample) > 500 else np.inf
+    return distance, threshold
+
+
+def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
+    """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it."""
+    h = looked.heights
+    valid = np.isfinite(h)
+    zero = np.where(valid, h, 0)
+    limit = np.maximum(parameters.min_height, 4.0 * looked.sigma)
+    raised = valid & (zero > limit) & looked.inside
+    raised = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(bool)
+    if not parameters.use_color:
+        return raised
+    around = cv2.dilate(raised.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    table = valid & (np.abs(zero) < limit) & looked.inside & ~around
+    if table.sum() < 500:
+        return raised
+    distance, threshold = color_distance(looked, table)
+    if not np.isfinite(threshold):
+        return raised
+    other = (distance > threshold) & looked.inside
+    # Of another colour and a little above the table on the average of a window: a thin thing.  A shadow or a print lies at 0.
+    weights = (other & valid & (zero < 0.03)).astype(np.float32)
+    mean, share = masked_mean(np.where(valid, looked.raw, 0).astype(np.float32), weights, 9)
+    thin = other & (share * 81 > 8) & (mean > np.maximum(0.0015, looked.sigma * 1.2))
+    core = raised | thin
+    # Grow into pixels without depth that have another colour and touch what is there.
+    unseen = other & ~valid
+    joined = core | unseen
+    count, labels = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
+    touched = np.zeros(count, bool)
+    touched[np.unique(labels[core])] = True
+    touched[0] = False
+    result = touched[labels]
+    # Depth is fattened at edges: a border pixel of the table's colour is table, where the thing itself stands out in colour.
+    like = distance < 0.5 * threshold
+    inner = cv2.erode(core.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
+    count, labels = cv2.connectedComponents(result.astype(np.uint8), connectivity=8)
+    seen = np.bincount(labels[inner], minlength=count)
+    unlike = np.bincount(labels[inner & other], minlength=count)
+    separable = (seen > 30) & (unlike > 0.9 * seen)
+    edge = result & ~cv2.erode(result.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11))).astype(bool)
+    result &= ~(edge & like & separable[labels])
+    return cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)).astype(bool)
+
+
+def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...], margin: float) -> NDArray[np.bool_]:
+    """(H, W): pixels of ``mask`` that belong to known meshes (world): within ``margin`` of them, or seen inside or behind them."""
+    result = np.zeros_like(mask)
+    if not known:
+        return result
+    import open3d as o3d
+
+    where = np.nonzero(mask & np.isfinite(looked.heights))
+    scene = o3d.t.geometry.RaycastingScene()
+    for mesh in known:
+        scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    if len(where[0]):
+        points = np.ascontiguousarray(looked.points[where], dtype=np.float32)
+        near = scene.compute_distance(o3d.core.Tensor(points), nthreads=2).numpy() < margin
+        eye = looked.frame.world_from_camera[:3, 3].astype(np.float32)
+        rays = np.concatenate([np.broadcast_to(eye, points.shape), points - eye], axis=1)
+        # t = 1 is the measured point: a hit before it means that the point lies inside of or behind a known thing.
+        behind = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)), nthreads=2)["t_hit"].numpy() < 1.0
+        result[where] = near | behind
+    # Pixels without depth on the known thing's silhouette.
+    rest = mask & ~np.isfinite(looked.heights)
+    if rest.any():
+        for mesh in known:
+            hull = np.concatenate([mesh.vertices])
+            pixels = looked.frame.intrinsics.project(transforms.apply(transforms.inverse(looked.frame.world_from_camera), hull))
+            if np.all(np.isfinite(pixels)):
+                drawn = np.zeros(mask.shape, np.uint8)
+                for face in mesh.faces:
+                    cv2.fillConvexPoly(drawn, np.clip(pixels[face], -4000, 4000).round().astype(np.int32), 1)
+                drawn = cv2.dilate(drawn, np.ones((7, 7), np.uint8)).astype(bool)
+                result |= rest & drawn
+    return result
+
+
+class DepthSegmenter:
+    """Table plane, table colour, clusters: no weights."""
+
+    name = "depth"
+
+    def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
+        """See :class:`Segmenter`."""
+        masks = [foreground(looked, parameters) for looked in looks]
+        fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
+        masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
+        solid = [mask & np.isfinite(looked.heights) for mask, looked in zip(masks, looks, strict=True)]
+        cloud = np.concatenate([looked.points[s] for looked, s in zip(looks, solid, strict=True)])
+        counts = [int(s.sum()) for s in solid]
+        instance = clusters.cluster(cloud, parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
+        labels = []
+        start = 0
+        for mask, s, count, known_pixels in zip(masks, solid, counts, fixed, strict=True):
+            image = np.zeros(mask.shape, np.int32)
+            image[s] = instance[start : start + count] + 1
+            start += count
+            labels.append(_fill(image, mask))
+            labels[-1][known_pixels] = -1
+        return _sizeable(labels, looks, parameters)
+
+
+def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 12.0) -> NDArray[np.int32]:
+    """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels."""
+    if not (mask & (labels == 0)).any() or not (labels > 0).any():
+        return labels
+    distance, index = cv2.distanceTransformWithLabels((labels <= 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    table = np.zeros(int(index.max()) + 1, np.int32)
+    seen = labels > 0
+    table[index[seen]] = labels[seen]
+    return np.where(mask & (labels == 0) & (distance <= reach), table[index], labels).astype(np.int32)
+
+
+def _sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
+    """Drop what is too small, and number the rest from 1, by their pixels, most first."""
+    top = max((int(image.max()) for image in labels), default=0)
+    pixels = np.zeros((len(labels), top + 1), int)
+    for i, image in enumerate(labels):
+        pixels[i] = np.bincount(np.maximum(image, 0).ravel(), minlength=top + 1)
+    keep = []
+    for label in range(1, top + 1):
+        if pixels[:, label].max() < parameters.min_pixels:
+            continue
+        points = np.concatenate([looked.points[image == label] for looked, image in zip(looks, labels, strict=True)])
+        points = points[np.isfinite(points[:, 0])]
+        if len(points) < 20 or np.max(np.percentile(points, 97, axis=0) - np.percentile(points, 3, axis=0)) < parameters.min_extent:
+            continue
+        keep.append((pixels[:, label].sum(), label))
+    keep.sort(reverse=True)
+    table = np.zeros(top + 2, np.int32)
+    table[-1] = -1
+    for new, (_, old) in enumerate(keep[: parameters.max_objects]):
+        table[old] = new + 1
+    return [table[image] for image in labels]
+
+
+def make_segmenter(name: str, weights: str = "", device: str = "cpu") -> Segmenter:
+    """The segmenter of that name; raises ``UNKNOWN_SEGMENTER``, or ``SEGMENTER_WEIGHTS`` where its weights cannot be loaded."""
+    if name == "depth":
+        return DepthSegmenter()
+    if name in ("sam", "sam2"):
+        from magic_perception.sam import SamSegmenter
+
+        return SamSegmenter(name, weights, device)
+    raise MagicError(Code.UNKNOWN_SEGMENTER, "segmenter", name, SEGMENTERS)
