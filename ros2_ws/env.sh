@@ -8,7 +8,7 @@ if [ -n "${ZSH_VERSION:-}" ]; then
 else
   _magic_ws=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) && _magic_shell=bash
 fi
-if [ ! -f "$_magic_ws/install/.build_state" ] || [ ! -x "$_magic_ws/.venv/bin/python" ]; then
+if [ ! -f "$_magic_ws/install/local_setup.bash" ] || [ ! -x "$_magic_ws/.venv/bin/python" ]; then
   echo "magic: the workspace is not set up yet; run: bash $_magic_ws/setup.sh" >&2
   unset _magic_ws _magic_shell
   return 1 2>/dev/null || exit 1

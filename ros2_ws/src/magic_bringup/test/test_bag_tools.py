@@ -1,0 +1,253 @@
+"""The bag player and recorder: what goes through them comes out byte for byte, with its QoS; bad bags are refused in one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+DOMAIN = str(1 + (os.getpid() * 7 + 11) % 100)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+import rclpy  # noqa: E402
+from builtin_interfaces.msg import Time  # noqa: E402
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from magic_bringup import bag_file, bag_qos  # noqa: E402
+from magic_bringup.bag_player import PlayOptions, Player  # noqa: E402
+from magic_bringup.bag_recorder import RecordOptions  # noqa: E402
+from magic_core.errors import Code, MagicError  # noqa: E402
+from magic_core.qos import LATCHED, SENSOR  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import Image  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
+
+FOREVER = QosTime(9223372036, 854775807)
+
+
+def profile(reliable: bool, latched: bool, depth: int = 5) -> Qos:
+    return Qos(
+        QosHistory.KEEP_LAST,
+        depth,
+        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        FOREVER,
+        FOREVER,
+        QosLiveliness.AUTOMATIC,
+        FOREVER,
+        False,
+    )
+
+
+def image(number: int) -> bytes:
+    message = Image(height=4, width=6, encoding="16UC1", step=12, data=bytes([number] * 48))
+    message.header.stamp = Time(sec=number)
+    message.header.frame_id = "left_color_optical_frame"
+    return serialize_message(message)
+
+
+def static_transforms() -> bytes:
+    transform = TransformStamped(child_frame_id="left_color_optical_frame")
+    transform.header.frame_id = "panda_link0"
+    transform.transform.rotation.w = 1.0
+    return serialize_message(TFMessage(transforms=[transform]))
+
+
+#: topic, type, profile, stamps in ns from 100 s, messages
+CONTENT = [
+    ("/camera/left/color/image_raw", "sensor_msgs/msg/Image", profile(False, False), [(i * 50_000_000, image(i)) for i in range(10)]),
+    ("/tf_static", "tf2_msgs/msg/TFMessage", profile(True, True), [(0, static_transforms()), (1, static_transforms())]),
+]
+
+
+@pytest.fixture(params=["storage", "message", "file", "none"])
+def compression(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def write(path: Path, compression: str = "storage") -> Path:
+    writer = bag_file.BagWriter(path, "mcap", compression)
+    for topic, kind, qos, _ in CONTENT:
+        writer.add_topic(topic, kind, (qos,))
+    for stamp, topic, data in sorted((stamp, topic, data) for topic, _, _, messages in CONTENT for stamp, data in messages):
+        writer.write(topic, 100 * 10**9 + stamp, data)
+    writer.close()
+    return path
+
+
+def content(path: Path) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    with bag_file.open_bag(path) as reader:
+        for connection, _, data in reader.messages():
+            found.setdefault(connection.topic, []).append(bytes(data))
+    return found
+
+
+def expected() -> dict[str, list[bytes]]:
+    return {topic: [data for _, data in messages] for topic, _, _, messages in CONTENT}
+
+
+def test_a_written_bag_is_read_back_byte_for_byte(tmp_path: Path, compression: str) -> None:
+    bag = write(tmp_path / "bag", compression)
+    assert content(bag) == expected()
+    info = bag_file.info(bag)
+    assert (info.storage, info.count, info.start, info.end) == ("mcap", 12, 100 * 10**9, 100 * 10**9 + 450_000_000)
+    assert {t.name: t.qos for t in info.topics} == {topic: (qos,) for topic, _, qos, _ in CONTENT}
+    text = info.format()
+    assert "Topic: /tf_static | Type: tf2_msgs/msg/TFMessage | Count: 2 | Serialization Format: cdr" in text
+    assert "Duration:          0.450000000s" in text
+
+
+def test_type_hashes_are_those_of_jazzy() -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind in ("tf2_msgs/msg/TFMessage", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"):
+        definition, digest = bag_file.message_definition(kind)
+        assert digest == store.hash_rihs01(kind)
+        assert definition.count("MSG: ") >= 1
+
+
+def test_offered_profile_keeps_latched_topics_latched() -> None:
+    latched = bag_qos.offered([profile(True, True, depth=0)], 7)
+    assert (latched.durability, latched.reliability, latched.depth) == (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE, 7)
+    sensor = bag_qos.offered([profile(False, False, depth=0)], 1000)
+    assert (sensor.durability, sensor.reliability, sensor.depth) == (DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT, 10)
+    # One latched publisher of two does not make the topic latched: the other's messages were not.
+    assert bag_qos.offered([profile(True, True), profile(True, False)], 3).durability == DurabilityPolicy.VOLATILE
+    assert bag_qos.offered([], 3) == QoSProfile(depth=10)
+
+
+@pytest.fixture
+def node():
+    rclpy.init(domain_id=int(DOMAIN))
+    node = rclpy.create_node("bag_test")
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "ROS_DOMAIN_ID": DOMAIN, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
+
+
+def test_record_what_is_published(node, tmp_path: Path) -> None:
+    """A recording of live topics: every message after the discovery, byte for byte, and the QoS that the publishers offer."""
+    images = node.create_publisher(Image, "/camera/left/color/image_raw", SENSOR)
+    words = node.create_publisher(String, "/words", LATCHED)
+    words.publish(String(data="said before the recorder came"))
+    bag = tmp_path / "recorded"
+    command = [sys.executable, "-m", "magic_bringup.bag_recorder", "-o", str(bag), "/camera/left/color/image_raw", "/words"]
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True) as recorder:
+        deadline = time.monotonic() + 20
+        while not (images.get_subscription_count() and words.get_subscription_count()):
+            assert time.monotonic() < deadline and recorder.poll() is None, "the recorder did not subscribe"
+            rclpy.spin_once(node, timeout_sec=0.05)
+        for number in range(5):
+            images.publish(image(number))
+            rclpy.spin_once(node, timeout_sec=0.05)
+        words.publish(String(data="the end"))
+        assert words.wait_for_all_acked(rclpy.duration.Duration(seconds=10))
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait(20) == 0, recorder.stderr.read()
+    found = content(bag)
+    assert found["/camera/left/color/image_raw"] == [image(n) for n in range(5)]
+    # The middleware pads a message's end to four bytes: strings are compared decoded.
+    assert [deserialize_message(data, String).data for data in found["/words"]] == ["said before the recorder came", "the end"]
+    qos = {t.name: t.qos[0] for t in bag_file.info(bag).topics}
+    assert qos["/words"].durability == QosDurability.TRANSIENT_LOCAL and qos["/words"].reliability == QosReliability.RELIABLE
+    assert qos["/camera/left/color/image_raw"].reliability == QosReliability.BEST_EFFORT
+
+
+
+def test_play_reaches_late_and_early_subscribers(node, tmp_path: Path) -> None:
+    """Best-effort images arrive byte for byte in order and in time; a latched topic also reaches who subscribes afterwards."""
+    bag = write(tmp_path / "bag")
+    received: list[bytes] = []
+    stamps: list[float] = []
+    clocks: list[float] = []
+    late: list[bytes] = []
+
+    def take(data: bytes) -> None:
+        received.append(data)
+        stamps.append(time.monotonic())
+
+    player_node = rclpy.create_node("player")
+    node.create_subscription(Image, "/renamed", take, SENSOR, raw=True)
+    node.create_subscription(Clock, "/clock", lambda m: clocks.append(m.clock.sec + m.clock.nanosec * 1e-9), 100)
+    remap = (("/camera/left/color/image_raw", "/renamed"),)
+    player = Player(player_node, PlayOptions(str(bag), rate=0.5, clock_hz=20.0, delay=1.0, remap=remap))
+    import threading
+
+    counts: list[int] = []
+    thread = threading.Thread(target=lambda: counts.append(player.play()))
+    thread.start()
+    deadline = time.monotonic() + 20
+    while thread.is_alive() or len(received) < 10:
+        assert time.monotonic() < deadline
+        rclpy.spin_once(node, timeout_sec=0.05)
+    thread.join()
+    assert counts == [12]
+    assert received == expected()["/camera/left/color/image_raw"]
+    # 0.45 s of bag at half rate; arrival jitter is the executor's.
+    assert stamps[-1] - stamps[0] == pytest.approx(0.9, abs=0.25)
+    assert len(clocks) >= 15 and clocks == sorted(clocks) and clocks[-1] <= 100.451
+    node.create_subscription(TFMessage, "/tf_static", late.append, QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL), raw=True)
+    while len(late) < 2:
+        assert time.monotonic() < deadline, "the latched messages did not come"
+        rclpy.spin_once(node, timeout_sec=0.05)
+    assert late == expected()["/tf_static"]
+    player_node.destroy_node()
+
+
+def run_player(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "magic_bringup.bag_player", *arguments]
+    return subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=30)
+
+
+def test_player_refuses_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "rubbish.mcap").write_bytes(b"no bag")
+    bag_file.BagWriter(tmp_path / "nothing").close()
+    for path, words in (("absent", "no such bag"), ("empty", "metadata.yaml"), ("rubbish.mcap", "cannot read"), ("nothing", "is empty")):
+        result = run_player(str(tmp_path / path))
+        assert result.returncode == 1
+        assert words in result.stderr and str(Code.BAD_BAG.value) in result.stderr and path in result.stderr
+        assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_bad_options_are_named(tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag")
+    for options, words in ((["--rate", "0"], "rate"), (["--topics", "/nowhere"], "/nowhere"), (["--start-offset", "9"], "start_offset")):
+        result = run_player(str(bag), *options)
+        assert result.returncode == 1 and words in result.stderr and "Traceback" not in result.stderr
+    with pytest.raises(MagicError) as caught:
+        RecordOptions(output="x")
+    assert caught.value.code == Code.BAD_REQUEST
+
+
+def test_looping_player_ends_cleanly_on_signals(tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        command = [sys.executable, "-m", "magic_bringup.bag_player", "--loop", "--clock", "--delay", "0.0", str(bag)]
+        with subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True) as player:
+            rclpy.init(domain_id=int(DOMAIN))
+            node = rclpy.create_node("listener")
+            heard: list[Clock] = []
+            node.create_subscription(Clock, "/clock", heard.append, 10)
+            deadline = time.monotonic() + 20
+            while not heard and time.monotonic() < deadline:
+                rclpy.spin_once(node, timeout_sec=0.05)
+            node.destroy_node()
+            rclpy.try_shutdown()
+            player.send_signal(number)
+            assert player.wait(10) == 0 and heard
+            assert "Traceback" not in player.stderr.read()
