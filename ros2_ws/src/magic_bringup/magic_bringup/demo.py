@@ -1,0 +1,441 @@
+"""The main job from a recorded bag: start the graph, replay, run the strategy, write ``summary.json`` and ``report.html``.
+
+Run by ``ros2_ws/demo.sh``; it needs the built workspace.  Exit status: 0 when a
+verified trajectory was published, 1 when not, 2 for wrong arguments, 130 when interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_core.motion import VARIANTS
+
+from magic_bringup.domain import isolated
+from magic_bringup.graph import Graph, peak_memory
+
+#: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
+START_TIMEOUT = 120.0
+#: How long to wait for objects after the bag has ended, s.
+AFTER_BAG = 3.0
+#: Between the advertisement and the first message of the replay, s, so that the subscriptions have met their publishers.
+PLAYER_DELAY = 0.7
+
+STAGES = ("perceive", "match", "plan", "verify", "total")
+CAMERA_TOPIC = re.compile(r"^(?P<camera>.*/)(?P<image>color|aligned_depth_to_color)/(?P<part>image_raw|camera_info)$")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself."""
+
+    strategy: str
+    variant: str
+    bag: Path
+    out: Path
+    features: str = "auto"
+    tool: str = ""
+    target: str = ""
+    seed: int = 0
+    timeout: float = 120.0
+
+
+@dataclass
+class Record:
+    """What a run left behind, in messages; the report is drawn from it."""
+
+    summary: dict[str, Any]
+    images: dict[str, Any] = field(default_factory=dict)  # topic -> sensor_msgs/Image
+    scene: Any = None  # magic_interfaces/SceneObjectArray
+    result: Any = None  # magic_interfaces/action/RunStrategy.Result
+
+
+def empty_summary(options: Options) -> dict[str, Any]:
+    """The summary of a run that has not begun."""
+    return {
+        "strategy": options.strategy,
+        "variant": options.variant,
+        "features": options.features,
+        "success": False,
+        "code": int(Code.INTERNAL),
+        "message": "the run did not begin",
+        "candidates": [],
+        "simulations": 0,
+        "seconds": dict.fromkeys(STAGES, 0.0),
+        "peak_memory_mb": {},
+    }
+
+
+def candidate_summary(report: Any) -> dict[str, Any]:
+    """One CandidateReport as plain data."""
+    c = report.candidate
+    return {
+        "tool_id": c.tool_id,
+        "score": round(c.score, 6),
+        "s_dino": round(c.s_dino, 6),
+        "s_curv": round(c.s_curv, 6),
+        "rotation": round(c.rotation, 6),
+        "flipped": c.flipped,
+        "reflection": report.reflection,
+        "stage": report.stage,
+        "code": int(report.code),
+        "reason": f"{Code(report.code).name}: {report.message}" if report.message else Code(report.code).name,
+    }
+
+
+def camera_topics(bag: Path) -> dict[str, str]:
+    """The camera topics of a bag with messages in them: topic -> type.  Raises BAD_BAG for what is no bag or an empty one."""
+    from magic_bringup import bag_file
+
+    info = bag_file.info(bag)
+    if info.count == 0:
+        raise MagicError(Code.BAD_BAG, "the bag is empty", str(bag), "a bag with at least one message")
+    return {t.name: t.type_name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)}
+
+
+class Watcher:
+    """The demo's own node: hears images and objects as they pass, and runs the action.  Spins in a thread of its own."""
+
+    def __init__(self, topics: dict[str, str], say: Any) -> None:
+        import rclpy
+        from magic_core import qos
+        from magic_interfaces.action import RunStrategy
+        from magic_interfaces.msg import SceneObjectArray
+        from rclpy.action import ActionClient
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        from rclpy.signals import SignalHandlerOptions
+        from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
+
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        self._rclpy = rclpy
+        self._say = say
+        self._goal_type = RunStrategy.Goal
+        self.node = Node("demo")
+        self.client = ActionClient(self.node, RunStrategy, "run_strategy")
+        self.changed = threading.Condition()
+        self.first: dict[str, tuple[float, bytes]] = {}
+        self.topics = topics
+        self.scene: Any = None
+        self.objects_at: float | None = None
+        self.trajectory: Any = None
+        self._last = ""
+        self.node.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED)
+        self.node.create_subscription(JointTrajectory, "verified_trajectory", self._on_trajectory, qos.LATCHED)
+        self.node.create_subscription(MultiDOFJointTrajectory, "verified_tool_trajectory", self._on_trajectory, qos.LATCHED)
+        self._camera_subs = {}
+        from sensor_msgs.msg import CameraInfo, Image
+
+        for topic in topics:
+            kind = Image if topic.endswith("image_raw") else CameraInfo
+            self._camera_subs[topic] = self.node.create_subscription(
+                kind, topic, lambda data, t=topic: self._on_raw(t, data), qos.SENSOR, raw=True
+            )
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def _on_raw(self, topic: str, data: bytes) -> None:
+        with self.changed:
+            self.first.setdefault(topic, (time.monotonic(), data))
+            self.changed.notify_all()
+
+    def _on_objects(self, message: Any) -> None:
+        with self.changed:
+            self.scene = message
+            if self.objects_at is None and any(o.source == "camera" for o in message.objects):
+                self.objects_at = time.monotonic()
+            self.changed.notify_all()
+
+    def _on_trajectory(self, message: Any) -> None:
+        with self.changed:
+            self.trajectory = message
+            self.changed.notify_all()
+
+    def forget_cameras(self) -> None:
+        """Stop listening to the cameras once each topic was heard: their images are large."""
+        for topic in [t for t in self._camera_subs if t in self.first]:
+            self.node.destroy_subscription(self._camera_subs.pop(topic))
+
+    def images(self) -> dict[str, Any]:
+        """The first image of each image topic."""
+        from rclpy.serialization import deserialize_message
+        from sensor_msgs.msg import Image
+
+        return {t: deserialize_message(data, Image) for t, (_, data) in self.first.items() if t.endswith("image_raw")}
+
+    def perceive_seconds(self) -> float:
+        """From the first moment at which every camera had sent colour, depth and their camera_info, to the first objects seen by a camera."""
+        if self.objects_at is None or not self.first:
+            return 0.0
+        return max(0.0, self.objects_at - max(at for at, _ in self.first.values()))
+
+    def ready(self) -> list[str]:
+        """What of the graph is still missing."""
+        missing = []
+        services = {name for name, _ in self.node.get_service_names_and_types()}
+        for server, name in (
+            ("matcher", "match_contact"),
+            ("planner", "plan_motion/_action/send_goal"),
+            ("verifier", "verify_motion/_action/send_goal"),
+            ("strategy_server", "run_strategy/_action/send_goal"),
+        ):
+            if self.node.resolve_service_name(name) not in services:
+                missing.append(server)
+        if ("perception", "/") not in self.node.get_node_names_and_namespaces() or not self.node.count_publishers("objects"):
+            missing.append("perception")
+        return missing
+
+    def send(self, options: Options) -> Any:
+        """Send the goal; returns a holder whose ``result`` is filled in."""
+        goal = self._goal_type(
+            strategy=options.strategy,
+            variant=options.variant,
+            tool_id=options.tool,
+            target_id=options.target,
+            seed=options.seed,
+            timeout=options.timeout,
+        )
+        return Pending(self, self.client.send_goal_async(goal, feedback_callback=self._on_feedback))
+
+    def _on_feedback(self, message: Any) -> None:
+        line = f"{message.feedback.stage}: {message.feedback.message}"
+        if line != self._last:
+            self._last = line
+            self._say(line)
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=2.0)
+        self.node.destroy_node()
+        self._rclpy.try_shutdown()
+        self._thread.join(2.0)
+
+
+class Pending:
+    """A goal on its way."""
+
+    def __init__(self, watcher: Watcher, future: Any) -> None:
+        self.handle: Any = None
+        self.result: Any = None
+        self._watcher = watcher
+        future.add_done_callback(self._accepted)
+
+    def _accepted(self, future: Any) -> None:
+        self.handle = future.result()
+        self.handle.get_result_async().add_done_callback(self._done)
+
+    def _done(self, future: Any) -> None:
+        with self._watcher.changed:
+            self.result = future.result().result
+            self._watcher.changed.notify_all()
+
+
+class Demo:
+    """One replay with one run."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.record = Record(empty_summary(options))
+        self._begin = time.monotonic()
+
+    def say(self, line: str) -> None:
+        """One line of progress."""
+        print(f"[{time.monotonic() - self._begin:6.1f} s] {line}", flush=True)
+
+    def run(self) -> Record:
+        """Do it all; what goes wrong ends up in the summary's code and message."""
+        summary = self.record.summary
+        try:
+            self._run()
+        except MagicError as error:
+            summary.update(code=int(error.code), message=error.message, success=False)
+        except KeyboardInterrupt:
+            summary.update(code=int(Code.CANCELED), message="interrupted", success=False)
+        except Exception as error:
+            import traceback
+
+            traceback.print_exc()
+            summary.update(code=int(Code.INTERNAL), message=f"{type(error).__name__}: {error}", success=False)
+        return self.record
+
+    def _run(self) -> None:
+        options = self.options
+        strategies.find(options.strategy)  # a wrong name is told before anything is started
+        topics = camera_topics(options.bag)
+        env = isolated()
+        os.environ.update({k: env[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
+        parameters: dict[str, dict[str, object]] = {
+            "matcher": {"features": options.features},
+            "strategy_server": {"objects_timeout": 5.0},
+        }
+        with Graph(options.out / "logs", env) as graph:
+            self.say(f"starting the graph (ROS domain {env['ROS_DOMAIN_ID']})")
+            graph.start_nodes(parameters)
+            watcher = Watcher(topics, self.say)
+            try:
+                self._drive(graph, watcher)
+            finally:
+                self._collect(graph, watcher)
+                watcher.close()
+
+    def _wait(self, graph: Graph, watcher: Watcher, done: Any, timeout: float) -> bool:
+        """Wait on the watcher's events; raises where a node dies."""
+        deadline = time.monotonic() + timeout
+        while True:
+            with watcher.changed:
+                if watcher.changed.wait_for(done, min(0.25, max(0.0, deadline - time.monotonic()))):
+                    return True
+            graph.sample()
+            graph.check()
+            if time.monotonic() >= deadline:
+                return False
+
+    def _drive(self, graph: Graph, watcher: Watcher) -> None:
+        options = self.options
+        missing: list[str] = watcher.ready()
+
+        def up() -> bool:
+            nonlocal missing
+            now = watcher.ready()
+            for name in [n for n in missing if n not in now]:
+                self.say(f"{name} is up")
+            missing = now
+            return not now
+
+        if not self._wait(graph, watcher, up, START_TIMEOUT):
+            raise MagicError(Code.SERVER_UNAVAILABLE, f"not up after {START_TIMEOUT:g} s: {', '.join(missing)}")
+        self.say(f"replaying {options.bag}")
+        player = graph.start("bag_player", "magic_bringup", "bag_player", str(options.bag), "--delay", str(PLAYER_DELAY))
+        self._wait(graph, watcher, lambda: watcher.objects_at is not None or player.status is not None, 600.0)
+        if player.status is not None and player.status != 0:
+            raise MagicError(Code.BAD_BAG, f"the bag cannot be played: {player.tail(1)}")
+        if watcher.objects_at is None and not self._wait(graph, watcher, lambda: watcher.objects_at is not None, AFTER_BAG):
+            self.say("the bag has ended and no objects have come")
+        else:
+            ids = ", ".join(o.id for o in watcher.scene.objects)
+            self.say(f"perceive: objects after {watcher.perceive_seconds():.2f} s: {ids}")
+        watcher.forget_cameras()
+        pending = watcher.send(options)
+        if not self._wait(graph, watcher, lambda: pending.result is not None, options.timeout + 30.0):
+            raise MagicError(Code.SERVER_TIMEOUT, f"the strategy_server (run_strategy) did not answer within {options.timeout + 30:g} s")
+        result = self.record.result = pending.result
+        summary = self.record.summary
+        summary.update(code=int(result.code), message=result.message, simulations=int(result.simulations))
+        summary["features"] = result.features or options.features
+        summary["candidates"] = [candidate_summary(r) for r in result.candidates]
+        times = result.times
+        perceive = watcher.perceive_seconds()
+        summary["seconds"] = {
+            "perceive": perceive,
+            "match": times.match,
+            "plan": times.plan,
+            "verify": times.verify,
+            # The server's own perceive is its wait for objects that are there already.
+            "total": perceive + times.total - times.perceive,
+        }
+        summary["seconds"] = {k: round(v, 3) for k, v in summary["seconds"].items()}
+        if result.verified and result.code == 0:
+            came = self._wait(graph, watcher, lambda: watcher.trajectory is not None, 5.0)
+            summary["success"] = came
+            if came:
+                self.say(f"verified trajectory with {len(watcher.trajectory.points)} points published")
+            else:
+                summary.update(code=int(Code.INTERNAL), message="physics agreed, but no trajectory was published")
+
+    def _collect(self, graph: Graph, watcher: Watcher) -> None:
+        graph.sample()
+        graph.stop()
+        memory = graph.peak_memory_mb()
+        memory["demo"] = round(peak_memory(os.getpid()), 1)
+        self.record.summary["peak_memory_mb"] = memory
+        self.record.images = watcher.images()
+        self.record.scene = watcher.scene
+
+
+def parse(argv: list[str] | None = None) -> Options:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="demo.sh", description="From a recorded bag to a trajectory that physics has agreed to.")
+    parser.add_argument("--strategy", default="hooking", help="hooking, hanging, scooping, or the folder of a strategy (default hooking)")
+    parser.add_argument("--variant", default="arm", choices=VARIANTS, help="fg: a floating gripper; arm: the Panda (default arm)")
+    parser.add_argument("--bag", type=Path, help="folder of the bag (default bags/<strategy>)")
+    parser.add_argument("--features", default="auto", help="feature backend: auto, embedded or dinov2 (default auto)")
+    parser.add_argument("--out", type=Path, help="folder for summary.json and report.html (default out/<strategy>_<variant>)")
+    parser.add_argument("--tool", default="", help="object id of the tool (default: the matcher chooses)")
+    parser.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
+    parser.add_argument("--timeout", type=float, default=120.0, help="s for the run from match to verify (default 120)")
+    parser.add_argument("--root", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
+    a = parser.parse_args(argv)
+    name = Path(a.strategy).name
+    return Options(
+        strategy=str(Path(a.strategy).resolve()) if "/" in a.strategy else a.strategy,
+        variant=a.variant,
+        bag=(a.bag or a.root / "bags" / name).resolve(),
+        out=(a.out or a.root / "out" / f"{name}_{a.variant}").resolve(),
+        features=a.features,
+        tool=a.tool,
+        target=a.target,
+        seed=a.seed,
+        timeout=a.timeout,
+    )
+
+
+def _interrupt(_signum: int, _frame: Any) -> None:
+    """The first signal ends the run; the stopping of the processes that follows takes bounded time and is not to be cut short."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the demo; returns the exit status."""
+    options = parse(argv)
+    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        print(f"demo: cannot write into {options.out}: {error.strerror}", file=sys.stderr)
+        return 2
+    demo = Demo(options)
+    record = demo.run()
+    summary = record.summary
+    # Once everything has stopped, a further signal must not leave half a file.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    (options.out / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    try:
+        from magic_bringup import report
+
+        report.save(record, options.out)
+        report.write(record, options.out / "report.html", options.out / "logs")
+    except Exception as error:  # the summary counts, the pictures are an addition
+        import traceback
+
+        traceback.print_exc()
+        print(f"demo: the report could not be drawn: {error}", file=sys.stderr)
+    verdict = "verified" if summary["success"] else f"not verified ({summary['code']} {Code(summary['code']).name})"
+    demo.say(f"{verdict}: {summary['message']}")
+    seconds = ", ".join(f"{k} {v:.2f}" for k, v in summary["seconds"].items())
+    demo.say(f"seconds: {seconds}; simulations: {summary['simulations']}")
+    demo.say("peak memory, MB: " + ", ".join(f"{k} {v:.0f}" for k, v in summary["peak_memory_mb"].items()))
+    print(f"summary: {options.out / 'summary.json'}\nreport:  {options.out / 'report.html'}", flush=True)
+    if summary["success"]:
+        return 0
+    return 130 if summary["code"] == Code.CANCELED else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

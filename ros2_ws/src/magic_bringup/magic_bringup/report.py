@@ -1,0 +1,494 @@
+"""The report of a run: one HTML file that needs nothing else.
+
+``ros2 run magic_bringup report DIR`` draws it again from what the demo left in DIR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import html
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from magic_core import conversions, transforms
+from magic_core import strategy as strategies
+from magic_core.camera import Intrinsics
+from magic_core.contact import Contact
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.scene import CanonicalView, Scene, SceneObject
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from magic_bringup.demo import Record
+
+Image = NDArray[np.uint8]
+
+#: Colours of objects, in the order of the scene (a colour-blind safe palette, Okabe and Ito).
+PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+NORMAL, CIRCLE, POINT = (0, 200, 255), (255, 80, 200), (255, 40, 40)
+PICTURE = 520
+
+STYLE = """
+:root{--ink:#1d2430;--soft:#5b6678;--line:#e3e7ee;--good:#12805c;--bad:#b3261e;--paper:#fff;--ground:#f4f6f9;--accent:#1f5fbf}
+*{box-sizing:border-box}body{margin:0;background:var(--ground);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
+main{max-width:1180px;margin:0 auto;padding:28px 20px 60px}h1{font-size:26px;margin:0 0 4px}h2{font-size:18px;margin:0 0 12px}
+p{margin:4px 0 12px}.soft{color:var(--soft)}section,header{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:20px 22px;margin:0 0 18px}
+.badge{display:inline-block;padding:4px 12px;border-radius:999px;color:#fff;font-weight:600;font-size:14px}.good{background:var(--good)}.bad{background:var(--bad)}
+.row{display:flex;flex-wrap:wrap;gap:16px}figure{margin:0;flex:1 1 240px;min-width:0}figure img{width:100%;border-radius:8px;display:block;background:#0b0d11}
+figcaption{font-size:13px;color:var(--soft);margin-top:6px}table{border-collapse:collapse;width:100%;font-size:14px}th,td{text-align:left;padding:7px 10px;border-bottom:1px solid var(--line);vertical-align:top}
+th{color:var(--soft);font-weight:600;white-space:nowrap}td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}tr.kept td{background:#eaf6f0}
+.bar{display:flex;height:26px;border-radius:8px;overflow:hidden;background:var(--line);margin:6px 0 10px}.bar div{color:#fff;font-size:12px;line-height:26px;padding-left:6px;white-space:nowrap;overflow:hidden}
+.facts{display:flex;flex-wrap:wrap;gap:8px 28px;margin-top:12px}.facts b{display:block;font-size:12px;color:var(--soft);font-weight:600}
+pre{background:#0f1420;color:#d5dbe6;padding:12px;border-radius:8px;overflow:auto;font-size:12px;max-height:260px}details summary{cursor:pointer;color:var(--accent)}
+"""
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def data_uri(image: Image, quality: int = 0) -> str:
+    """An RGB picture (H, W, 3) as a data URI; PNG, or JPEG of a quality above 0."""
+    kind, parameters = ("jpg", [cv2.IMWRITE_JPEG_QUALITY, quality]) if quality else ("png", [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    ok, buffer = cv2.imencode("." + kind, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)
+    if not ok:
+        raise MagicError(Code.BAD_IMAGE, "picture for the report", image.shape)
+    return f"data:image/{'jpeg' if quality else 'png'};base64,{base64.b64encode(buffer.tobytes()).decode()}"
+
+
+def depth_picture(depth: NDArray[np.float32]) -> Image:
+    """Depth (H, W) metres in colours between its 2nd and 98th percentile; black where there is none."""
+    known = np.isfinite(depth)
+    if not known.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    low, high = np.percentile(depth[known], [2, 98])
+    level = np.clip((np.nan_to_num(depth, nan=low) - low) / max(high - low, 1e-6), 0, 1)
+    picture = cv2.cvtColor(cv2.applyColorMap((255 * (1 - level)).astype(np.uint8), cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    picture[~known] = 0
+    return picture
+
+
+def masks_picture(color: Image, masks: list[tuple[str, NDArray[np.bool_], tuple[int, int, int]]]) -> Image:
+    """A colour image with objects tinted, outlined and named."""
+    picture = color.copy()
+    for name, mask, tint in masks:
+        if mask.shape != color.shape[:2] or not mask.any():
+            continue
+        picture[mask] = (0.5 * picture[mask] + 0.5 * np.array(tint)).astype(np.uint8)
+        outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, outline, -1, tint, 2, cv2.LINE_AA)
+        v, u = np.argwhere(mask).min(axis=0)
+        place = (int(u), int(max(14, v - 6)))
+        cv2.putText(picture, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(picture, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def heat_picture(view: CanonicalView, heatmap: NDArray[np.float32]) -> Image:
+    """A canonical view under its heat map (any size, 0..1), on the object only."""
+    heat = cv2.resize(np.nan_to_num(heatmap.astype(np.float32)), view.mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    colors = cv2.cvtColor(cv2.applyColorMap((255 * np.clip(heat, 0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    return np.where(view.mask[..., None], (0.35 * view.image + 0.65 * colors).astype(np.uint8), view.image)
+
+
+def contact_picture(view: CanonicalView, contact: Contact, base: Image | None = None) -> Image:
+    """A canonical view with the contact point, its outward normal (an arrow) and the circle of curvature."""
+    scale = PICTURE / max(view.mask.shape)
+    picture = cv2.resize(view.image if base is None else base, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    # The contact's place is taken from its frame, which holds in any view of the object along the same direction.
+    frame = contact.object_from_contact
+    at = (view.pixels(frame[:3, 3]) + 0.5) * scale - 0.5
+    tip = view.pixels(frame[:3, 3] + 0.05 * frame[:3, 0]) - view.pixels(frame[:3, 3])
+    normal = tip / max(float(np.linalg.norm(tip)), 1e-9)
+
+    def fixed(point: NDArray[np.float64]) -> tuple[int, int]:
+        return int(round(16 * point[0])), int(round(16 * point[1]))
+
+    radius = contact.radius / view.metres_per_pixel * scale
+    if np.isfinite(radius) and radius < 6 * PICTURE:
+        center = at + (1 if contact.concave else -1) * radius * normal
+        cv2.circle(picture, fixed(center), int(round(16 * radius)), CIRCLE, 2, cv2.LINE_AA, 4)
+    else:
+        tangent = PICTURE * np.array([-normal[1], normal[0]])
+        cv2.line(picture, fixed(at - tangent), fixed(at + tangent), CIRCLE, 2, cv2.LINE_AA, 4)
+    head = at + 60 * normal
+    for start, end in ((at, head), (head, head - 12 * normal + 7 * normal[::-1] * [1, -1]), (head, head - 12 * normal - 7 * normal[::-1] * [1, -1])):
+        cv2.line(picture, fixed(start), fixed(end), NORMAL, 2, cv2.LINE_AA, 4)
+    cv2.circle(picture, fixed(at), 16 * 6, (255, 255, 255), -1, cv2.LINE_AA, 4)
+    cv2.circle(picture, fixed(at), 16 * 4, POINT, -1, cv2.LINE_AA, 4)
+    return picture
+
+
+def look_at(eye: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """world_from_camera of an optical frame at ``eye`` that looks at ``point``, world z up in the picture."""
+    z = transforms.unit(point - eye)
+    x = transforms.unit(np.cross(z, [0.0, 0.0, 1.0]))
+    return transforms.make(np.column_stack([x, np.cross(z, x), z]), eye)
+
+
+def scene_picture(scene: Scene, path: NDArray[np.float64] | None = None, size: tuple[int, int] = (480, 720)) -> Image:
+    """The reconstructed objects on the table, ray-cast; ``path`` (N, 3) world metres is drawn over it."""
+    from magic_core.rendering import Raycaster, shade
+
+    meshes = []
+    for index, item in enumerate(scene.objects):
+        mesh = item.mesh.transformed(item.world_from_object)
+        meshes.append(mesh if mesh.colors is not None and mesh.colors.any() else mesh.painted(PALETTE[index % len(PALETTE)]))
+    points = np.concatenate([m.vertices for m in meshes] + ([path] if path is not None and len(path) else []))
+    low, high = points.min(axis=0), points.max(axis=0)
+    center, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.15)
+    meshes.append(_table(scene.table, center, 1.2 * reach))
+    # From the robot's right front: far enough that the sphere around everything fits a field of view of 40 degrees.
+    world_from_camera = look_at(center + 1.25 * reach * transforms.unit([-0.75, -0.8, 0.85]), center)
+    focal = size[0] / 2 / np.tan(np.radians(20))
+    intrinsics = Intrinsics(size[1], size[0], focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2)
+    cast, _ = Raycaster(meshes).perspective(intrinsics, world_from_camera)
+    picture = shade(cast, light=(-0.5, -0.3, 1.0), background=(236, 239, 244))
+    if path is not None and len(path) > 1:
+        pixels = intrinsics.project(transforms.apply(transforms.inverse(world_from_camera), path))
+        pixels = pixels[np.all(np.isfinite(pixels), axis=1)]
+        if len(pixels) > 1:
+            cv2.polylines(picture, [np.round(16 * pixels).astype(np.int32)], False, (31, 95, 191), 2, cv2.LINE_AA, 4)
+    return picture
+
+
+def _table(plane: NDArray[np.float64], center: NDArray[np.float64], half: float) -> Mesh:
+    a, b, c, d = (float(x) for x in plane)
+    corners = []
+    for x, y in ((-half, -half), (half, -half), (half, half), (-half, half)):
+        px, py = center[0] + x, center[1] + y
+        corners.append((px, py, -(a * px + b * py + d) / c - 1e-3))
+    return Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])).painted((214, 209, 200))
+
+
+def tool_view(item: SceneObject, kind: str) -> CanonicalView:
+    """The object's view of that kind: the published one, or drawn again as the matcher does."""
+    if item.view.kind == kind:
+        return item.view
+    from magic_core.views import find_view
+
+    return find_view(item.mesh, item.pieces, kind)
+
+
+def target_view(item: SceneObject, strategy: strategies.Strategy) -> CanonicalView:
+    """The target as the strategy looks at it: along its view direction, world z up (x up from above)."""
+    from magic_core.rendering import canonical_view
+
+    direction = strategy.target_view_direction
+    up = np.array([1.0, 0.0, 0.0]) if abs(direction[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    object_from_world = transforms.inverse(item.world_from_object)[:3, :3]
+    return canonical_view(item.mesh, object_from_world @ direction, object_from_world @ up, strategy.view)
+
+
+def _figure_image(figure: Any) -> Image:
+    figure.canvas.draw()
+    return np.ascontiguousarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
+
+
+def _phases(axes: Any, phases: Any) -> None:
+    for index, phase in enumerate(phases):
+        axes.axvspan(phase.start, phase.end, color="#1f5fbf", alpha=0.05 if index % 2 else 0.11, lw=0)
+        axes.text((phase.start + phase.end) / 2, 1.01, phase.name, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=8, rotation=25)
+
+
+def motion_picture(plan: Any) -> Image:
+    """Joints (variant arm) or the tool's pose (fg) over time, with the phases named."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    arm = plan.arm_motion
+    figure = Figure(figsize=(11, 6.2), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    if arm is not None:
+        t = arm.times
+        for j, name in enumerate(arm.joint_names):
+            upper.plot(t, arm.positions[:, j], lw=1.4, label=name.replace("panda_", ""))
+            lower.plot(t, arm.velocities[:, j], lw=1.2)
+        for moment, label in ((arm.grasp_time, "close"), (arm.release_time, "open")):
+            if moment is not None:
+                for axes in (upper, lower):
+                    axes.axvline(moment, color="#b3261e", lw=1, ls="--")
+                upper.annotate(label, (moment, upper.get_ylim()[1]), color="#b3261e", fontsize=8, va="top")
+        upper.set_ylabel("position, rad")
+        lower.set_ylabel("velocity, rad/s")
+        phases = arm.phases or plan.tool_motion.phases
+    else:
+        motion = plan.tool_motion
+        t = motion.times
+        for axis, name in enumerate("xyz"):
+            upper.plot(t, motion.world_from_tool[:, axis, 3], lw=1.5, label=name)
+        first = motion.world_from_tool[0]
+        lower.plot(t, [np.degrees(transforms.rotation_angle(first, pose)) for pose in motion.world_from_tool], lw=1.5)
+        upper.set_ylabel("tool position, m")
+        lower.set_ylabel("turn from the start, deg")
+        phases = motion.phases
+    lower.set_xlabel("time, s")
+    _phases(upper, phases)
+    upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    for axes in (upper, lower):
+        axes.grid(alpha=0.25)
+        axes.margins(x=0)
+    return _figure_image(figure)
+
+
+# ---------------------------------------------------------------- the page
+
+
+def _figure(image: Image, caption: str, quality: int = 0) -> str:
+    return f'<figure><img alt="{html.escape(caption)}" src="{data_uri(image, quality)}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+
+
+def _section(title: str, body: str, note: str = "") -> str:
+    note = f'<p class="soft">{html.escape(note)}</p>' if note else ""
+    return f"<section><h2>{html.escape(title)}</h2>{note}{body}</section>"
+
+
+def _guard(title: str, draw: Callable[[], str]) -> str:
+    """A section; one that cannot be drawn says why and leaves the others alone."""
+    try:
+        return draw()
+    except Exception as error:
+        return _section(title, f'<p class="soft">could not be drawn: {html.escape(f"{type(error).__name__}: {error}")}</p>')
+
+
+def _header(summary: dict[str, Any]) -> str:
+    success = summary["success"]
+    code = Code(summary["code"]).name
+    verdict = "verified" if success else f"{summary['code']} {code}"
+    badge = f'<span class="badge {"good" if success else "bad"}">{html.escape(verdict)}</span>'
+    facts = "".join(
+        f"<span><b>{label}</b>{html.escape(str(value))}</span>"
+        for label, value in (
+            ("strategy", summary["strategy"]),
+            ("variant", summary["variant"]),
+            ("features", summary["features"]),
+            ("simulations", summary["simulations"]),
+            ("perceive to verify", f"{summary['seconds']['total']:.2f} s"),
+        )
+    )
+    title = "Verified trajectory" if success else "No verified trajectory"
+    return f'<header><h1>{title} {badge}</h1><p>{html.escape(summary["message"])}</p><div class="facts">{facts}</div></header>'
+
+
+def _cameras(record: Record, scene: Scene | None) -> str:
+    blocks = []
+    colors = {t: m for t, m in record.images.items() if "/color/" in t}
+    for topic, message in sorted(colors.items()):
+        prefix = topic.rsplit("color/", 1)[0]
+        name = prefix.rstrip("/").rsplit("/", 1)[-1]
+        figures = []
+        try:
+            color = conversions.color_from_msg(message)
+            figures.append(_figure(color, f"{name}: colour, {color.shape[1]} x {color.shape[0]}", 88))
+        except MagicError as error:
+            color = None
+            figures.append(f"<p>{html.escape(f'{topic}: {error.message}')}</p>")
+        depth = record.images.get(prefix + "aligned_depth_to_color/image_raw")
+        if depth is not None:
+            try:
+                values = conversions.depth_from_msg(depth)
+                share = float(np.isfinite(values).mean())
+                figures.append(_figure(depth_picture(values), f"{name}: depth, {100 * share:.0f} % of the pixels have one"))
+            except MagicError as error:
+                figures.append(f"<p>{html.escape(f'{name} depth: {error.message}')}</p>")
+        if scene is not None and color is not None:
+            masks = [
+                (o.id, o.mask, PALETTE[i % len(PALETTE)]) for i, o in enumerate(scene.objects) if o.mask is not None and o.camera == name
+            ]
+            if masks:
+                figures.append(_figure(masks_picture(color, masks), f"{name}: masks of {', '.join(m[0] for m in masks)}", 90))
+        blocks.append(f'<div class="row">{"".join(figures)}</div>')
+    return _section("What the cameras saw", "<br>".join(blocks) or '<p class="soft">No image came.</p>')
+
+
+def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -> str:
+    figures = [
+        _figure(contact_picture(strategy.tool_view, strategy.tool_contact), f"demonstration: tool; r = {1000 * strategy.tool_contact.radius:.1f} mm, {'concave' if strategy.tool_contact.concave else 'convex'}"),
+        _figure(contact_picture(strategy.target_view, strategy.target_contact), f"demonstration: target; r = {1000 * strategy.target_contact.radius:.1f} mm"),
+    ]
+    if scene is not None and result is not None and result.candidates:
+        kept = next((r for r in result.candidates if r.code == Code.OK), result.candidates[0])
+        candidate = conversions.candidate_from_msg(kept.candidate)
+        best = conversions.candidate_from_msg(result.candidates[0].candidate)
+        tool = scene.find(candidate.tool_id)
+        view = tool_view(tool, strategy.view)
+        if len(result.heatmap.data):
+            heat = conversions.float_image_from_msg(result.heatmap)
+            first = tool_view(scene.find(best.tool_id), strategy.view)
+            figures.append(_figure(contact_picture(first, best.tool, heat_picture(first, heat)), f"{best.tool_id}: heat map of the match and the best candidate"))
+        what = "the contact that was kept" if kept.code == Code.OK else "the best candidate, not kept"
+        radius = f"r = {1000 * candidate.tool.radius:.1f} mm, {'concave' if candidate.tool.concave else 'convex'}"
+        figures.append(_figure(contact_picture(view, candidate.tool), f"{candidate.tool_id}: {what}; {radius}"))
+        if candidate.target is not None and result.target_id:
+            target = scene.find(result.target_id)
+            figures.append(_figure(contact_picture(target_view(target, strategy), candidate.target), f"{result.target_id}: its contact; r = {1000 * candidate.target.radius:.1f} mm"))
+    note = "Point: the contact. Arrow: its outward normal. Circle: the circle of curvature."
+    return _section("From the demonstrated contact to the new one", f'<div class="row">{"".join(figures)}</div>', note)
+
+
+def _meshes(scene: Scene, result: Any) -> str:
+    from magic_core.rendering import Raycaster, shade
+
+    path = None
+    if result is not None and result.plan.tool_trajectory.points:
+        path = np.array([[getattr(p.transforms[0].translation, a) for a in "xyz"] for p in result.plan.tool_trajectory.points])
+    figures = [_figure(scene_picture(scene, path), "the reconstructed scene" + (" with the tool's path" if path is not None else ""), 92)]
+    for index, item in enumerate(scene.objects):
+        mesh = item.mesh if item.mesh.colors is not None and item.mesh.colors.any() else item.mesh.painted(PALETTE[index % len(PALETTE)])
+        low, high = mesh.bounds
+        center, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.01)
+        camera = look_at(center + 1.5 * reach * transforms.unit([-0.6, -0.75, 0.8]), center)
+        intrinsics = Intrinsics(360, 300, 420.0, 420.0, 179.5, 149.5)
+        cast, _ = Raycaster([mesh]).perspective(intrinsics, camera)
+        extent = " x ".join(f"{1000 * x:.0f}" for x in mesh.extents)
+        caption = f"{item.id} ({item.source}): {extent} mm, {len(mesh.faces)} triangles, {len(item.pieces)} convex pieces"
+        figures.append(_figure(shade(cast, light=(-0.5, -0.3, 1.0), background=(236, 239, 244)), caption, 90))
+    return _section("What was reconstructed", f'<div class="row">{"".join(figures)}</div>')
+
+
+def _candidates(summary: dict[str, Any]) -> str:
+    if not summary["candidates"]:
+        return _section("Candidates", '<p class="soft">None was tried.</p>')
+    head = "<tr><th>#</th><th>tool</th><th>score</th><th>global</th><th>local</th><th>turn</th><th>face</th><th>stage</th><th>what became of it</th></tr>"
+    rows = ""
+    for index, c in enumerate(summary["candidates"], 1):
+        face = ("mirrored, " if c["flipped"] else "") + c["reflection"]
+        rows += (
+            f'<tr class="{"kept" if c["code"] == 0 else ""}"><td class="n">{index}</td><td>{html.escape(c["tool_id"])}</td><td class="n">{c["score"]:.3f}</td>'
+            f'<td class="n">{c["s_dino"]:.3f}</td><td class="n">{c["s_curv"]:.3f}</td><td class="n">{np.degrees(c["rotation"]):.0f}&deg;</td>'
+            f'<td>{face}</td><td>{c["stage"]}</td><td>{html.escape(c["reason"])}</td></tr>'
+        )
+    return _section("Candidates, in the order in which they were tried", f"<table>{head}{rows}</table>")
+
+
+def _costs(summary: dict[str, Any]) -> str:
+    seconds = summary["seconds"]
+    total = max(sum(seconds[s] for s in ("perceive", "match", "plan", "verify")), 1e-9)
+    bar = "".join(
+        f'<div style="width:{100 * seconds[s] / total:.2f}%;background:{color}" title="{s} {seconds[s]:.3f} s">{s} {seconds[s]:.2f} s</div>'
+        for s, color in (("perceive", "#1f5fbf"), ("match", "#7b4fb5"), ("plan", "#c2741b"), ("verify", "#12805c"))
+    )
+    rows = "".join(f'<tr><td>{html.escape(n)}</td><td class="n">{mb:.0f} MB</td></tr>' for n, mb in summary["peak_memory_mb"].items())
+    stages = "".join(f'<tr><td>{s}</td><td class="n">{seconds[s]:.3f} s</td></tr>' for s in ("perceive", "match", "plan", "verify", "total"))
+    tables = (
+        f'<div class="row"><figure><table><tr><th>stage</th><th>wall time</th></tr>{stages}</table></figure>'
+        f"<figure><table><tr><th>process</th><th>peak memory</th></tr>{rows}</table></figure></div>"
+    )
+    return _section("Time and memory", f'<div class="bar">{bar}</div>{tables}')
+
+
+def _logs(folder: Path | None) -> str:
+    blocks = ""
+    for path in sorted(folder.glob("*.log")) if folder is not None and folder.is_dir() else []:
+        text = "\n".join(path.read_text(errors="replace").splitlines()[-60:])
+        blocks += f"<details><summary>{html.escape(path.stem)}</summary><pre>{html.escape(text)}</pre></details>"
+    return _section("Logs", blocks) if blocks else ""
+
+
+def render(record: Record, logs: Path | None = None) -> str:
+    """The whole page."""
+    summary, result = record.summary, record.result
+    scene: Scene | None = None
+    strategy: strategies.Strategy | None = None
+    problems = []
+    try:
+        scene = conversions.scene_from_msg(record.scene) if record.scene is not None and record.scene.objects else None
+    except MagicError as error:
+        problems.append(f"objects: {error.message}")
+    try:
+        strategy = strategies.find(summary["strategy"])
+    except (MagicError, LookupError) as error:
+        problems.append(f"strategy: {error}")
+    parts = [_header(summary), _candidates(summary)]
+    parts.append(_guard("What the cameras saw", lambda: _cameras(record, scene)))
+    if strategy is not None:
+        parts.append(_guard("From the demonstrated contact to the new one", lambda: _contacts(strategy, scene, result)))
+    if scene is not None:
+        parts.append(_guard("What was reconstructed", lambda: _meshes(scene, result)))
+    if result is not None and len(result.film.data):
+        caption = "the last simulation, in reading order"
+        parts.append(_guard("Simulation", lambda: _section("Simulation", _figure(conversions.color_from_msg(result.film), caption, 90))))
+    if result is not None and result.plan.tool_trajectory.points:
+        title = "Joints" if summary["variant"] == "arm" else "Motion of the tool"
+        note = "" if summary["success"] else "This motion was not verified."
+        parts.append(_guard(title, lambda: _section(title, _figure(motion_picture(conversions.plan_from_msg(result.plan)), title), note)))
+    parts.append(_costs(summary))
+    if problems:
+        parts.append(_section("Left out", "".join(f"<p>{html.escape(p)}</p>" for p in problems)))
+    parts.append(_logs(logs))
+    title = f"{summary['strategy']} ({summary['variant']})"
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
+    )
+
+
+def write(record: Record, path: Path, logs: Path | None = None) -> None:
+    """Write the page of a record."""
+    path.write_text(render(record, logs), encoding="utf-8")
+
+
+# ---------------------------------------------------------------- records on disk
+
+
+def save(record: Record, folder: Path) -> None:
+    """Keep a record's messages (CDR) beside its summary, so that the report can be drawn again."""
+    from rclpy.serialization import serialize_message
+
+    messages = folder / "messages"
+    messages.mkdir(parents=True, exist_ok=True)
+    for old in messages.glob("*.cdr"):
+        old.unlink()
+    for topic, message in record.images.items():
+        (messages / f"image{topic.replace('/', '@')}.cdr").write_bytes(serialize_message(message))
+    for name, message in (("objects", record.scene), ("result", record.result)):
+        if message is not None:
+            (messages / f"{name}.cdr").write_bytes(serialize_message(message))
+
+
+def load(folder: Path) -> Record:
+    """What :func:`save` kept; raises BAD_REQUEST for a folder without a run."""
+    from magic_interfaces.action import RunStrategy
+    from magic_interfaces.msg import SceneObjectArray
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import Image as ImageMsg
+
+    from magic_bringup.demo import Record
+
+    if not (folder / "summary.json").is_file():
+        raise MagicError(Code.BAD_REQUEST, "folder of a run", str(folder), "one with a summary.json, as demo.sh writes it")
+    record = Record(json.loads((folder / "summary.json").read_text()))
+    messages = folder / "messages"
+    for path in sorted(messages.glob("image*.cdr")):
+        record.images[path.stem[len("image") :].replace("@", "/")] = deserialize_message(path.read_bytes(), ImageMsg)
+    for name, kind in (("objects", SceneObjectArray), ("result", RunStrategy.Result)):
+        path = messages / f"{name}.cdr"
+        if path.is_file():
+            setattr(record, "scene" if name == "objects" else name, deserialize_message(path.read_bytes(), kind))
+    return record
+
+
+def main(argv: list[str] | None = None) -> None:
+    """``ros2 run magic_bringup report DIR``."""
+    parser = argparse.ArgumentParser(prog="report", description="Draw report.html again from a folder that demo.sh wrote.")
+    parser.add_argument("folder", type=Path, help="the folder given to demo.sh by --out")
+    parser.add_argument("-o", "--output", type=Path, help="file to write (default FOLDER/report.html)")
+    arguments = parser.parse_args([a for a in (sys.argv[1:] if argv is None else argv) if a != "--ros-args"])
+    try:
+        output = arguments.output or arguments.folder / "report.html"
+        write(load(arguments.folder), output, arguments.folder / "logs")
+    except (MagicError, OSError) as error:
+        print(f"report: {error}", file=sys.stderr)
+        sys.exit(1)
+    print(output)
+
+
+if __name__ == "__main__":
+    main()
