@@ -1,0 +1,293 @@
+"""Makes the strategies that ship with the project from three demonstrations.
+
+Each demonstration is a reference tool, a target and fixtures from
+:mod:`magic_core.shapes` and the tool's motion in the world; contacts come from the
+analytic shapes.  Run ``python -m magic_bringup.make_strategies`` to write them anew
+(the same files each time) and ``test_strategies.py`` to replay them in physics.
+
+hooking   an L hook, flat at the height of the ball's middle, pulls a ball of radius
+          25 mm towards the robot: lowered behind it, the ball lies in the hook's
+          bend, whose middle leads.
+hanging   a coat hanger is slid on to a horizontal rod from its free end, which
+          points to the robot, is lowered on to it and let go.
+scooping  a spoon, handle upright, pushes a ball along the table towards the robot
+          and on to a quarter pipe, then turns by 90 degrees about an axis 0.2 m above
+          the table, so that the ball ends in the bowl, and lifts it.  The hand, which
+          took the spoon from above as it lay on its back, points away from the robot
+          at first and down at the end, both within easy reach.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import strategy as strategies, transforms
+from magic_core.contact import OPPOSED, Contact, contact_frame
+from magic_core.rendering import canonical_view
+from magic_core.scene import CanonicalView
+from magic_core.shapes import Shape, make, section_view
+from magic_core.shapes.fixtures import pose_data
+from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+
+Poses = NDArray[np.float64]
+
+#: Sampling of the demonstrated trajectories, seconds.
+SAMPLE = 0.05
+UP = np.array([0.0, 0.0, 1.0])
+
+#: Scooping: length of the slide, radius of the turn (axis above the table), lift; metres.
+SLIDE, TURN_RADIUS, LIFT = 0.15, 0.20, 0.05
+#: Scooping: how far beyond the turn's axis the quarter pipe's axis lies. Bowls reach further from the turn's axis than
+#: the demonstration's; so much room keeps their tips off the wall, and still less than the smallest ball's diameter.
+ARC_OFFSET = 0.025
+
+
+def _line(points: list[NDArray[np.float64]], speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rest-to-rest motion with a smooth start and stop along a polyline: times (T,), points (T, 3)."""
+    times, places, now = [0.0], [points[0]], 0.0
+    for a, b in zip(points[:-1], points[1:], strict=True):
+        length = float(np.linalg.norm(b - a))
+        duration = max(1.5 * length / speed, SAMPLE)  # a cubic's highest speed is 1.5 times its mean
+        count = max(int(np.ceil(duration / SAMPLE)), 1)
+        s = np.linspace(0, 1, count + 1)[1:]
+        times += list(now + s * duration)
+        places += [a + (b - a) * (3 * t**2 - 2 * t**3) for t in s]
+        now += duration
+    return np.array(times), np.array(places)
+
+
+def _target_view(shape: Shape, kind: str, direction: NDArray[np.float64]) -> CanonicalView:
+    """The view of a target that stands in its object frame: world up is up, world +x where it is seen from above."""
+    up = np.array([1.0, 0.0, 0.0]) if abs(direction[2]) > 0.9 else UP
+    return section_view(shape.mesh, direction, up) if kind == "section" else canonical_view(shape.mesh, direction, up, kind)
+
+
+def _target_contact(view: CanonicalView, point: NDArray[np.float64], normal: NDArray[np.float64], radius: float) -> Contact:
+    pixel = view.pixels(point)
+    picture = transforms.unit(normal @ view.object_from_view[:3, :2])
+    return Contact(pixel, picture, radius, False, 3.5 * radius, contact_frame(view, pixel, picture))
+
+
+def _through(waypoints: tuple[Waypoint, ...]) -> tuple[NDArray[np.float64], Poses]:
+    """Times (T,) and target_contact_from_tool_contact (T, 4, 4) through waypoints, squarely opposed."""
+    times, offsets = _line([w.offset for w in waypoints], 0.1)
+    return times, np.stack([transforms.make(translation=offset) @ OPPOSED for offset in offsets])
+
+
+def _trajectory(target: Contact, contacts: Poses, tool: Contact) -> Poses:
+    """target_from_tool (T, 4, 4) from the contact frames' relative motion."""
+    return target.object_from_contact @ contacts @ transforms.inverse(tool.object_from_contact)
+
+
+def hooking() -> Strategy:
+    """An L hook pulls a ball by 0.28 m."""
+    tool = make("l_hook", 0, length=0.25, tip=0.07, width=0.02, thickness=0.018, inner_radius=0.03, bend=np.pi / 2)
+    target = make("sphere", 0, radius=0.025)
+    tool_view = tool.view("top")
+    tool_contact = tool.contact("inner", tool_view)
+    direction, normal = -UP, np.array([1.0, 0.0, 0.0])
+    target_view = _target_view(target, "top", direction)
+    target_contact = _target_contact(target_view, 0.025 * normal, normal, 0.025)
+    waypoints = (
+        Waypoint("above", np.array([0.03, 0, -0.12]), "approach"),
+        Waypoint("behind", np.array([0.03, 0, 0]), "approach"),
+        Waypoint("touch", np.array([0.0, 0, 0]), "contact", 0.05),
+        Waypoint("pulled", np.array([-0.28, 0, 0]), "goal"),
+        Waypoint("clear", np.array([-0.25, 0, 0]), "retreat"),
+        Waypoint("up", np.array([-0.25, 0, -0.12]), "retreat"),
+    )
+    times, contacts = _through(waypoints)
+    return Strategy(
+        name="hooking",
+        description="An L hook lying flat is lowered behind a ball and pulls it towards the robot.",
+        view="top",
+        mode="plan",
+        tool_view=tool_view,
+        tool_contact=tool_contact,
+        target_view=target_view,
+        target_contact=target_contact,
+        target_normal=normal,
+        target_view_direction=direction,
+        times=times,
+        target_from_tool=_trajectory(target_contact, contacts, tool_contact),
+        tool_mesh=tool.mesh,
+        target_mesh=target.mesh,
+        waypoints=waypoints,
+        # The demonstration had no kicks; a round ball, other than a standing cylinder, would not bear them.
+        goal=Goal("hook", {"distance": 0.2, "max_speed": 0.5, "noise": 0.0}),
+        physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
+        environment={
+            "world_from_target": pose_data(transforms.make(translation=[0.70, 0.0, 0.025])),
+            "tool": {"family": "l_hook", "seed": 0, "parameters": dict(tool.parameters)},
+            "target": {"family": "sphere", "seed": 0, "parameters": dict(target.parameters)},
+        },
+    )
+
+
+#: The rod of the hanging demonstration and of the hanging scenes: generator parameters, and its place in the world.
+ROD = {"radius": 0.007, "height": 0.38, "length": 0.19, "foot": 0.05}
+ROD_X = 0.56
+
+
+def rod_pose(shape: Shape) -> NDArray[np.float64]:
+    """world_from_rod (4, 4): on the table in front of the robot, free end towards it."""
+    return transforms.make(translation=[ROD_X, 0.0, -shape.mesh.bounds[0, 2]])
+
+
+def hanging() -> Strategy:
+    """A hanger is hung on a rod."""
+    tool = make("hanger", 2, span=0.32, drop=0.09, width=0.012, thickness=0.012, inner_radius=0.022, neck=0.02, sweep=np.deg2rad(265), sag=0.0, bar="straight")
+    target = make("rod", 0, **ROD)
+    tool_view = tool.view("side")
+    tool_contact = tool.contact("hook", tool_view, towards=(0, -1, 0))
+    direction, normal = np.array([1.0, 0.0, 0.0]), UP
+    target_view = _target_view(target, "side", direction)
+    top = target.mesh.bounds[1, 2]
+    target_contact = _target_contact(target_view, np.array([0.0, 0.0, top]), normal, ROD["radius"])
+    waypoints = (
+        Waypoint("before", np.array([0.012, 0, -0.20]), "approach"),
+        Waypoint("over", np.array([0.012, 0, 0]), "approach"),
+        Waypoint("touch", np.array([0.0, 0, 0]), "contact", 0.03),
+        Waypoint("let_go", np.array([0.0, 0, 0]), "release"),
+        Waypoint("away", np.array([0.0, 0, -0.15]), "retreat"),
+    )
+    times, contacts = _through(waypoints[:4])
+    return Strategy(
+        name="hanging",
+        description="A coat hanger is slid on to a rod from its free end, lowered and let go.",
+        view="side",
+        mode="plan",
+        tool_view=tool_view,
+        tool_contact=tool_contact,
+        target_view=target_view,
+        target_contact=target_contact,
+        target_normal=normal,
+        target_view_direction=direction,
+        times=times,
+        target_from_tool=_trajectory(target_contact, contacts, tool_contact),
+        tool_mesh=tool.mesh,
+        target_mesh=target.mesh,
+        waypoints=waypoints,
+        goal=Goal("hang", {"height": 0.2, "max_speed": 0.5}),
+        physics=Physics(friction=3.0, tool_density=600.0, target_density=2700.0, target_is_fixed=True),
+        releases=True,
+        environment={
+            "world_from_target": pose_data(rod_pose(target)),
+            "tool": {"family": "hanger", "seed": 2, "parameters": dict(tool.parameters)},
+            "target": {"family": "rod", "seed": 0, "parameters": dict(target.parameters)},
+        },
+    )
+
+
+#: The quarter pipe of the scooping demonstration and of the scooping scenes.
+ARC = {"radius": TURN_RADIUS, "width": 0.16, "back": 0.02}
+BALL_X = 0.69
+
+
+def arc_from_target(shape: Shape) -> NDArray[np.float64]:
+    """Pose of the quarter pipe from the target's contact point on the table: it faces +x, away from the robot."""
+    half_turn = transforms.from_rpy(0, 0, np.pi)
+    # In its own frame the surface starts (level) at the box's low x.
+    low = shape.mesh.bounds[0]
+    return transforms.make(translation=[-SLIDE - ARC_OFFSET, 0, 0]) @ half_turn @ transforms.make(translation=[-low[0], 0, -low[2]])
+
+
+def scooping() -> Strategy:
+    """A spoon pushes a ball against a quarter pipe and turns it up."""
+    radius = 0.035
+    tool = make("spoon", 1, bowl_half_length=0.046, bowl_half_width=0.044, depth=0.030, wall=0.003, handle=0.24, rise=0.0, handle_thickness=0.012, handle_breadth=0.022)
+    target = make("sphere", 3, radius=radius)
+    arc = make("quarter_pipe", 0, **ARC)
+    tool_view = tool.view("section")
+    tool_contact = tool.contact("bowl", tool_view, towards=(0, 0, 1))
+    direction, normal = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    target_view = _target_view(target, "section", direction)
+    target_contact = _target_contact(target_view, radius * normal, normal, radius)
+
+    speed = 0.08
+    back = np.array([0.03, 0.0, 0.0])
+    times, slide = _line([back, np.zeros(3), np.array([-SLIDE, 0.0, 0.0])], speed)
+    # Contact frame of the target: x = +x, z = -y, y = +z of the world.
+    arm = TURN_RADIUS - radius
+    start = _stack(slide, 0.0)
+    angle_s = np.linspace(0, 1, int(1.5 * arm * np.pi / 2 / speed / SAMPLE) + 1)[1:]
+    angle = np.pi / 2 * (3 * angle_s**2 - 2 * angle_s**3)
+    turn_times = times[-1] + angle_s * 1.5 * arm * np.pi / 2 / speed
+    turn = np.stack([_spoke(np.array([-SLIDE, arm, 0.0]), arm, a) for a in angle])
+    lift_times, lift = _line([turn[-1][:3, 3], turn[-1][:3, 3] + [0, LIFT, 0]], speed)
+    end = np.repeat(turn[-1:], len(lift) - 1, axis=0)
+    end[:, :3, 3] = lift[1:]
+    contacts = np.concatenate([start, turn, end])
+    times = np.concatenate([times, turn_times, turn_times[-1] + lift_times[1:]])
+    waypoints = (
+        Waypoint("behind", back, "approach", speed),
+        Waypoint("touch", np.zeros(3), "approach", speed),
+        Waypoint("at_arc", np.array([-SLIDE, 0.0, 0.0]), "contact", speed),
+        Waypoint("scooped", turn[-1][:3, 3], "goal", speed),
+        Waypoint("lifted", end[-1][:3, 3], "goal", speed),
+    )
+    return Strategy(
+        name="scooping",
+        description="A spoon, handle upright, pushes a ball on to a quarter pipe, turns it up and lifts it in the bowl.",
+        view="section",
+        mode="retarget",
+        tool_view=tool_view,
+        tool_contact=tool_contact,
+        target_view=target_view,
+        target_contact=target_contact,
+        target_normal=normal,
+        target_view_direction=direction,
+        times=times,
+        target_from_tool=_trajectory(target_contact, contacts, tool_contact),
+        tool_mesh=tool.mesh,
+        target_mesh=target.mesh,
+        waypoints=waypoints,
+        goal=Goal("scoop", {"height": 0.2, "max_speed": 0.1}),
+        physics=Physics(friction=0.3, tool_density=600.0, target_density=300.0),
+        reflections=("turn",),
+        environment={
+            "world_from_target": pose_data(transforms.make(translation=[BALL_X, 0.0, radius])),
+            "tool": {"family": "spoon", "seed": 1, "parameters": dict(tool.parameters)},
+            "target": {"family": "sphere", "seed": 3, "parameters": dict(target.parameters)},
+            "fixtures": [{"id": "arc", "family": "quarter_pipe", "seed": 0, "parameters": dict(arc.parameters), "from_target": pose_data(arc_from_target(arc))}],
+        },
+    )
+
+
+def _stack(offsets: NDArray[np.float64], angle: float) -> Poses:
+    turn = transforms.from_rotvec([0, 0, angle])
+    return np.stack([transforms.make(translation=offset) @ turn @ OPPOSED for offset in offsets])
+
+
+def _spoke(axis: NDArray[np.float64], arm: float, angle: float) -> NDArray[np.float64]:
+    """The tool's contact frame on a spoke of length ``arm`` turned by ``angle`` about the axis point (3,); 0: straight down."""
+    # About the contact frame's z (world -y) the bottom of the circle moves towards -x for a negative angle.
+    turn = transforms.from_rotvec([0, 0, -angle])
+    return transforms.make(translation=axis) @ turn @ transforms.make(translation=[0, -arm, 0]) @ OPPOSED
+
+
+STRATEGIES = {"hooking": hooking, "hanging": hanging, "scooping": scooping}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write the strategy folders."""
+    parser = argparse.ArgumentParser(description="Write the strategies that ship with the project.")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "strategies", help="folder that gets one folder for each strategy")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(STRATEGIES)}; all of them by default")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.names if name not in STRATEGIES]
+    if unknown:
+        parser.error(f"unknown strategy {unknown[0]!r} (allowed: {', '.join(STRATEGIES)})")
+    for name in options.names or STRATEGIES:
+        strategies.save(STRATEGIES[name](), options.out / name)
+        print(f"wrote {options.out / name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
