@@ -31,7 +31,7 @@ def _painted(item: SceneObject, color: tuple[int, int, int], world_from_object: 
     return mesh.transformed(world_from_object)
 
 
-def _table(plane: NDArray[np.float64], centre: NDArray[np.float64], size: float = 2.4, square: float = 0.1) -> Mesh:
+def _table(plane: NDArray[np.float64], centre: NDArray[np.float64], size: float = 4.0, square: float = 0.1) -> Mesh:
     """A chequered piece of the table plane around a world point; squares of ``square`` metres, aligned with the world."""
     count = int(size / square)
     low = np.floor(centre[:2] / square) * square - count // 2 * square
@@ -128,7 +128,7 @@ def film_strip(
         from magic_verifier.panda import Panda
 
         panda = Panda()
-        way.append(np.array([[0.0, -0.2, 0.0], [0.0, 0.2, 0.85], [0.5, 0.0, 0.6]]))
+        way.append(np.array([[0.0, -0.1, 0.15], [0.0, 0.1, 0.65], [0.5, 0.0, 0.6]]))
     # What fell off and flew away would make everything else tiny.
     points = np.concatenate(way)
     points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < 1.5]

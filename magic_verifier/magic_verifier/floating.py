@@ -97,18 +97,18 @@ def make_setup(
         raise MagicError(Code.BAD_SCENE, "table plane", table, "a, b, c, d with a unit normal that points up")
     kind = STATIC if physics.target_is_fixed else DYNAMIC
     setup = Setup(body(tool), body(target), tuple(body(o) for o in obstacles), table, physics, kind, settings)
-    return replace(setup, target=_on_table(setup)) if kind == DYNAMIC else setup
+    return replace(setup, target=lifted_onto_table(setup.target, table)) if kind == DYNAMIC else setup
 
 
-def _on_table(setup: Setup) -> Body:
-    """The target raised out of the table, into which a reconstruction may reach by some millimetres."""
-    corners = transforms.apply(setup.target.world_from_object, setup.target.corners)
-    depth = -float((corners @ setup.table[:3] + setup.table[3]).min())
+def lifted_onto_table(body: Body, table: NDArray[np.float64]) -> Body:
+    """A free body raised out of the table, into which a reconstruction may reach by some millimetres."""
+    corners = transforms.apply(body.world_from_object, body.corners)
+    depth = -float((corners @ table[:3] + table[3]).min())
     if depth <= 0:
-        return setup.target
+        return body
     if depth > 0.02:
-        raise MagicError(Code.BAD_SCENE, f"lowest point of {setup.target.id}", f"{depth * 1000:.1f} mm below the table", "at most 20 mm below")
-    return replace(setup.target, world_from_object=transforms.make(translation=depth * setup.table[:3]) @ setup.target.world_from_object)
+        raise MagicError(Code.BAD_SCENE, f"lowest point of {body.id}", f"{depth * 1000:.1f} mm below the table", "at most 20 mm below")
+    return replace(body, world_from_object=transforms.make(translation=depth * table[:3]) @ body.world_from_object)
 
 
 def perturbed(setup: Setup, perturbation: Perturbation, rng: np.random.Generator) -> Setup:

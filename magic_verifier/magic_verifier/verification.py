@@ -204,12 +204,13 @@ def _run_once(
         end = run.duration + goal.settle
         if run.release_time is not None:
             end = max(end, run.release_time + goal.settle)
-        steps = int(np.ceil(end * setup.settings.frequency))
-        early = int(run.contact_time * setup.settings.frequency)
         watched = [TARGET] if setup.target_kind == "dynamic" else []
         watched += [o.id for o in setup.obstacles] if plan.variant == "arm" else []
         names = (TOOL, TARGET) if setup.target_kind == "dynamic" else (TOOL,)
-        for step in range(steps):
+        # The run's clock stands still while a gripper closes: the number of steps is bounded apart from it.
+        for step in range(int(np.ceil((end + 10.0) * setup.settings.frequency))):
+            if run.time >= end - 1e-9:
+                break
             goal.disturb(run)
             run.advance()
             goal.observe(run)
@@ -219,7 +220,7 @@ def _run_once(
                 run.world.check(names)
                 if progress is not None and step % (CHECK_EVERY * 10) == 0:
                     progress(run.phase, run.time)
-            if step < early and step % 4 == 0:
+            if step % 4 == 0 and run.time < run.contact_time:
                 _refuse_early_touch(run, watched, limits)
         run.world.check(names)
         judgement = goal.judge(run)

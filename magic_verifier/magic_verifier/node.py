@@ -1,0 +1,187 @@
+"""The ``verifier`` node: the action ``verify_motion``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from magic_interfaces.action import VerifyMotion
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+
+from magic_core import conversions as convert
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_core.node import describe, parameter, run
+from magic_verifier.arm_simulation import ArmOptions
+from magic_verifier.floating import Perturbation
+from magic_verifier.simulation import DYNAMIC, Settings, World, usable_pieces
+from magic_verifier.verification import Limits, Verdict, verify
+
+#: More repetitions than this in one goal are refused.
+MAX_REPETITIONS = 1000
+
+
+class VerifierNode(Node):
+    """Runs planned motions in physics, one at a time; a goal during another one is answered BUSY at once.
+
+    Action server: ``verify_motion`` (magic_interfaces/action/VerifyMotion).  The goal
+    carries everything; the node keeps no state between goals.
+
+    Parameters: see ``config/magic_verifier.param.yaml``.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("verifier", **kwargs)
+        self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
+        self._timeout = parameter(self, "timeout", 30.0, "Wall time in s for one goal that names none.", low=0.1, high=3600.0)
+        fg = parameter(self, "frequency", 240.0, "Steps per simulated second, floating gripper.", low=60.0, high=2000.0)
+        arm = parameter(self, "arm_frequency", 480.0, "Steps per simulated second, arm.", low=120.0, high=2000.0)
+        self._settings = {"fg": Settings(frequency=fg), "arm": Settings(frequency=arm)}
+        self._perturbation = Perturbation(
+            position=parameter(self, "noise.position", 0.002, "Standard deviation in m of the target's place in perturbed runs.", low=0.0, high=0.1),
+            turn=parameter(self, "noise.turn", 0.03, "Standard deviation in rad of the target's turn in perturbed runs.", low=0.0, high=3.2),
+            friction=parameter(self, "noise.friction", 0.2, "Half range of the friction's scale in perturbed runs.", low=0.0, high=0.9),
+            density=parameter(self, "noise.density", 0.2, "Half range of the densities' scale in perturbed runs.", low=0.0, high=0.9),
+        )
+        self._limits = Limits(
+            overlap=parameter(self, "limits.overlap", 0.0015, "Depth in m that the tool may be in static things before the contact.", low=0.0, high=0.1),
+            press=parameter(self, "limits.press", 0.01, "Depth in m that the tool may be in static things after that.", low=0.0, high=0.1),
+            nudge=parameter(self, "limits.nudge", 0.002, "Way in m that the target may be pushed before the contact.", low=0.0, high=0.1),
+            slip=parameter(self, "limits.slip", 0.02, "Way in m that the tool may slip in the gripper.", low=0.0, high=0.5),
+            slip_angle=parameter(self, "limits.slip_angle", 0.35, "Angle in rad that the tool may turn in the gripper.", low=0.0, high=3.2),
+            tracking=parameter(self, "limits.tracking", 0.1, "Angle in rad that a joint may lag behind its command.", low=0.001, high=3.2),
+            required_rate=parameter(self, "required_rate", 0.5, "Share of perturbed runs that must pass.", low=0.0, high=1.0),
+        )
+        self._arm = ArmOptions(
+            stiffness=parameter(self, "arm.stiffness", 4000.0, "Joint drive stiffness in Nm/rad.", low=1.0, high=1e6),
+            damping=parameter(self, "arm.damping", 120.0, "Joint drive damping in Nms/rad.", low=0.0, high=1e5),
+            grip_force=parameter(self, "arm.grip_force", 60.0, "Force in N with which each finger closes.", low=1.0, high=140.0),
+            finger_friction=parameter(self, "arm.finger_friction", 1.5, "Friction coefficient of the finger pads.", low=0.0, high=10.0),
+        )
+        self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
+        self._busy = threading.Lock()
+        self._server = ActionServer(
+            self,
+            VerifyMotion,
+            "verify_motion",
+            self._execute,
+            goal_callback=lambda _goal: GoalResponse.ACCEPT,
+            cancel_callback=lambda _handle: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
+        self._warm_up()
+        self.get_logger().info("ready: waiting for goals of verify_motion")
+
+    def destroy_node(self) -> None:
+        """Take the action server down with the node."""
+        self._server.destroy()
+        super().destroy_node()
+
+    def _warm_up(self) -> None:
+        """Load SAPIEN and step a small world, so that the first goal does not pay for it."""
+        from magic_core.mesh import Mesh
+
+        cube = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+        world = World(self._settings["fg"])
+        world.add_table(np.array([0, 0, 1.0, 0]), 0.5)
+        world.add("cube", usable_pieces("cube", (Mesh(cube, np.zeros((0, 3))),)), np.eye(4), DYNAMIC, 500.0, 0.5)
+        world.step()
+
+    def _execute(self, handle: Any) -> VerifyMotion.Result:
+        started = time.monotonic()
+        result = VerifyMotion.Result()
+        if not self._busy.acquire(blocking=False):
+            result.code, result.message = int(Code.BUSY), "a simulation is running; send the goal again when it has ended"
+            handle.abort()
+            return result
+        try:
+            verdict, film = self._verify(handle, started)
+            result.code, result.message = int(verdict.code), verdict.message
+            result.success = verdict.success
+            result.success_rate = float(verdict.success_rate)
+            result.metric_names = list(verdict.metrics)
+            result.metric_values = [float(v) for v in verdict.metrics.values()]
+            result.simulated = float(verdict.simulated)
+            result.film = film
+        except Exception as error:  # no handler lets an exception out
+            result.code, result.message = describe(self, error)
+        finally:
+            self._busy.release()
+        result.seconds = time.monotonic() - started
+        # A verdict is an answer, whatever it says; only what could not be judged aborts.
+        if result.code == Code.CANCELED and handle.is_cancel_requested:
+            handle.canceled()
+        elif result.code in (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY):
+            handle.abort()
+        else:
+            handle.succeed()
+        return result
+
+    def _verify(self, handle: Any, started: float) -> tuple[Verdict, Image]:
+        goal = handle.request
+        if goal.repetitions > MAX_REPETITIONS:
+            raise MagicError(Code.BAD_REQUEST, "repetitions", goal.repetitions, f"0 to {MAX_REPETITIONS}")
+        if not (np.isfinite(goal.timeout) and goal.timeout >= 0):
+            raise MagicError(Code.BAD_REQUEST, "timeout", goal.timeout, "0 or a number of seconds above it")
+        strategy = strategies.find(goal.strategy, self._strategies or None)
+        tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
+        ids = [tool.id, target.id, *(o.id for o in obstacles)]
+        if len(set(ids)) != len(ids):
+            raise MagicError(Code.BAD_REQUEST, "object ids", ", ".join(ids), "ids that differ")
+        table = convert.plane_from_msg(goal.table)
+        plan = convert.plan_from_msg(goal.plan)
+        candidate = convert.candidate_from_msg(goal.candidate) if goal.candidate.tool_id else None
+
+        def feedback(phase: str, simulated: float) -> None:
+            handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
+
+        verdict = verify(
+            strategy,
+            tool,
+            target,
+            obstacles,
+            table,
+            candidate,
+            plan,
+            seed=int(goal.seed),
+            repetitions=int(goal.repetitions),
+            deadline=started + (goal.timeout or self._timeout),
+            cancel=lambda: handle.is_cancel_requested,
+            progress=feedback,
+            settings=self._settings[plan.variant],
+            perturbation=self._perturbation,
+            limits=self._limits,
+            arm_options=self._arm,
+        )
+        self.get_logger().info(f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)")
+        film = Image()
+        if goal.want_film and verdict.recording is not None and verdict.code != Code.CANCELED:
+            try:
+                film = self._film(verdict, tool, target, obstacles, table)
+            except Exception as error:  # a picture that cannot be drawn changes no verdict
+                _, message = describe(self, error)
+                verdict = replace(verdict, message=f"{verdict.message}; no film: {message}")
+        return verdict, film
+
+    def _film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> Image:
+        from magic_verifier.film import film_strip
+
+        caption = f"{verdict.code.name}: {verdict.message}"
+        strip = film_strip(verdict.recording, tool, target, obstacles, table, frames=self._film_frames, caption=caption)
+        return convert.image_to_msg(strip, "rgb8")
+
+
+def main() -> None:
+    """Entry point of ``ros2 run magic_verifier verifier``."""
+    run(VerifierNode)
+
+
+if __name__ == "__main__":
+    main()
