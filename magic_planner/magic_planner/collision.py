@@ -62,15 +62,14 @@ def fcl_pose(transform: NDArray[np.float64]) -> Any:
     """A 4x4 transform as MPlib's Pose."""
     import mplib
 
-    return mplib.Pose(np.asarray(transform)[:3, 3], transforms.quaternion_wxyz(transform))
+    return mplib.Pose(np.ascontiguousarray(transform, dtype=float))
 
 
-def convex_shape(piece: Mesh) -> Any:
-    """A convex piece as FCL's convex geometry."""
+def convex_shapes(pieces: Iterable[Mesh]) -> list[Any]:
+    """Convex pieces as FCL's convex geometries."""
     from mplib.collision_detection import fcl
 
-    vertices, faces = hull(piece.vertices)
-    return fcl.Convex(vertices, faces)
+    return [fcl.Convex(*hull(piece.vertices)) for piece in pieces]
 
 
 class Body:

@@ -211,6 +211,24 @@ def refined_times(times: NDArray[np.float64], poses: NDArray[np.float64], length
     return np.concatenate([times[:1], *inner])
 
 
+def waypoint_times(strategy: Strategy) -> tuple[tuple[str, float], ...]:
+    """Names of the places the tool's motion passes and when, in seconds from its start, in order of time.
+
+    A ``plan`` strategy: its waypoints, at each of which the tool is at rest.  A ``retarget`` strategy:
+    the start, then the end of each phase.
+    """
+    if strategy.mode != "plan":
+        return (("start", 0.0), *((f"end of {p.name}", p.end) for p in demonstrated_motion(strategy)[2]))
+    waypoints = list(strategy.waypoints)
+    marks, now = [(waypoints[0].name, 0.0)], 0.0
+    for before, waypoint in zip(waypoints[:-1], waypoints[1:], strict=True):
+        if strategy.releases and before.phase == "release":
+            break
+        now += float(straight_line(float(np.linalg.norm(waypoint.offset - before.offset)), waypoint.speed)[0][-1])
+        marks.append((waypoint.name, now))
+    return tuple(marks)
+
+
 def join_phases(ends: Sequence[tuple[str, float]]) -> tuple[Phase, ...]:
     """Phases from (name, end in seconds) in order of time; neighbours of one name become one."""
     phases: list[Phase] = []

@@ -199,14 +199,14 @@ class Robot:
             self.world.remove_object(name)
         self.planner.acm.clear()
 
-    def add(self, name: str, pieces: Iterable[Mesh], world_from_object: NDArray[np.float64]) -> None:
-        """Put an object of convex pieces into the world, or put it elsewhere."""
+    def add(self, name: str, shapes: Iterable[Any], world_from_object: NDArray[np.float64]) -> None:
+        """Put an object of FCL shapes (:func:`magic_planner.collision.convex_shapes`) into the world, or put it elsewhere."""
         from mplib.collision_detection import fcl
 
         if self.world.has_object(name):
             self.world.remove_object(name)
-        shapes = [fcl.CollisionObject(fcl.Convex(*hull(piece.vertices))) for piece in pieces]
-        self.world.add_object(fcl.FCLObject(name, fcl_pose(world_from_object), shapes, [fcl_pose(np.eye(4))] * len(shapes)))
+        solids = [fcl.CollisionObject(shape) for shape in shapes]
+        self.world.add_object(fcl.FCLObject(name, fcl_pose(world_from_object), solids, [fcl_pose(np.eye(4))] * len(solids)))
 
     def add_table(self, plane: NDArray[np.float64], name: str = "table", gap: float = 0.001) -> None:
         """Put the table in as a slab 0.2 m thick whose top lies ``gap`` below the plane (4,); the arm's base may touch it."""
@@ -232,10 +232,10 @@ class Robot:
             elif self.planner.acm.has_entry(first, other):
                 self.planner.acm.remove_entry(first, other)
 
-    def attach(self, name: str, pieces: Iterable[Mesh], tip_from_object: NDArray[np.float64], touching: Sequence[str]) -> None:
-        """Take an object of convex pieces into the hand; ``touching`` are the links that may touch it."""
+    def attach(self, name: str, shapes: Iterable[Any], tip_from_object: NDArray[np.float64], touching: Sequence[str]) -> None:
+        """Take an object of FCL shapes into the hand; ``touching`` are the links that may touch it."""
         self.detach()
-        self.add(name, pieces, np.eye(4))
+        self.add(name, shapes, np.eye(4))
         self.world.attach_object(name, self.planner.robot.get_name(), self.link, fcl_pose(tip_from_object), list(touching))
         self._attached = Attached(name, tuple(touching))
 
