@@ -1,0 +1,66 @@
+"""Messages that only perception knows: transforms, markers, diagnostics.  Everything else is in :mod:`magic_core.conversions`."""
+
+from __future__ import annotations
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, TransformStamped, Vector3
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from magic_core import conversions as cv
+from magic_core import transforms
+from magic_core.errors import Code
+from magic_core.scene import Scene
+from magic_perception.tf import TransformBuffer
+
+#: Distinct colours for objects, RGB 0..1.
+PALETTE = ((0.90, 0.35, 0.25), (0.25, 0.60, 0.90), (0.30, 0.75, 0.35), (0.95, 0.75, 0.20), (0.65, 0.40, 0.85), (0.25, 0.80, 0.80))
+
+
+def remember_transform(buffer: TransformBuffer, msg: TransformStamped, static: bool) -> None:
+    """Put one TransformStamped into the buffer; raises BAD_REQUEST or NO_TRANSFORM for what is not one."""
+    buffer.set(msg.header.frame_id, msg.child_frame_id, cv.transform_from_msg(msg.transform), cv.time_from_msg(msg.header.stamp), static)
+
+
+def markers(scene: Scene) -> MarkerArray:
+    """A scene for RViz: DELETEALL, then for each object its mesh (``meshes``), its box (``boxes``) and its id (``names``); the table's height as a thin square (``table``)."""
+    head = cv.header(scene.frame_id, scene.stamp)
+    result = [Marker(header=head, action=Marker.DELETEALL)]
+
+    def add(ns: str, index: int, kind: int, pose: np.ndarray, color: tuple[float, float, float], alpha: float) -> Marker:
+        marker = Marker(header=head, ns=ns, id=index, type=kind, action=Marker.ADD, frame_locked=True)
+        marker.pose = cv.pose_to_msg(pose)
+        marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
+        r, g, b = color
+        marker.color = ColorRGBA(r=r, g=g, b=b, a=alpha)
+        result.append(marker)
+        return marker
+
+    for i, item in enumerate(scene.objects):
+        color = PALETTE[i % len(PALETTE)] if item.source == "camera" else (0.6, 0.6, 0.6)
+        mesh = add("meshes", i, Marker.TRIANGLE_LIST, item.world_from_object, color, 0.9)
+        mesh.points = [Point(x=x, y=y, z=z) for x, y, z in item.mesh.vertices[item.mesh.faces.ravel()].tolist()]
+        if item.mesh.colors is not None:
+            mesh.colors = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in (item.mesh.colors[item.mesh.faces.ravel()] / 255.0).tolist()]
+        if np.all(item.box_extents > 0):
+            box = add("boxes", i, Marker.LINE_LIST, item.world_from_box, color, 1.0)
+            box.scale = Vector3(x=0.0015, y=0.0, z=0.0)
+            corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * item.box_extents
+            for a in range(8):
+                for bit in (1, 2, 4):
+                    if not a & bit:
+                        box.points += [Point(x=p[0], y=p[1], z=p[2]) for p in corners[[a, a | bit]].tolist()]
+        top = item.world_from_object[2, 3] + float(item.mesh.extents[2]) / 2 if len(item.mesh.vertices) else item.world_from_object[2, 3]
+        text = add("names", i, Marker.TEXT_VIEW_FACING, transforms.make(None, [*item.world_from_object[:2, 3], top + 0.03]), (1.0, 1.0, 1.0), 1.0)
+        text.scale.z = 0.025
+        text.text = item.id
+    return MarkerArray(markers=result)
+
+
+def status(name: str, level: bytes, message: str, code: Code, values: dict[str, object]) -> DiagnosticStatus:
+    """One diagnostic status; its values begin with the code's number and name."""
+    pairs = {"code": int(code), "code_name": code.name, **values}
+    return DiagnosticStatus(
+        level=level, name=name, message=message, hardware_id="", values=[KeyValue(key=k, value=str(v)) for k, v in pairs.items()]
+    )

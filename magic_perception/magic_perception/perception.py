@@ -1,0 +1,362 @@
+"""The perception node: RGB-D topics in, ``objects`` out."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from functools import partial
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from magic_interfaces.msg import SceneObjectArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+from visualization_msgs.msg import MarkerArray
+
+from magic_core import conversions as cv
+from magic_core import transforms
+from magic_core.camera import RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_core.node import describe, parameter, run
+from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
+from magic_core.scene import Scene, SceneObject
+from magic_perception import conversions as pc
+from magic_perception.averaging import average
+from magic_perception.parameters import METHODS, Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.registration import register_depth
+from magic_perception.segmentation import SEGMENTERS, make_segmenter
+from magic_perception.stream import Pair, Stream
+from magic_perception.tf import TransformBuffer
+from magic_perception.tracking import Tracker
+
+
+class Perception(Node):
+    """Turns the newest frames of all cameras into objects, at most ``rate`` times a second.
+
+    Subscribes (sensor QoS), for each camera NAME of ``cameras``: ``camera/NAME/color/image_raw`` (rgb8, bgr8, rgba8, bgra8,
+    mono8), ``camera/NAME/color/camera_info`` and ``camera/NAME/aligned_depth_to_color/image_raw`` (16UC1 mm or 32FC1 m);
+    with ``aligned`` false, ``camera/NAME/depth/image_rect_raw`` and ``camera/NAME/depth/camera_info`` instead, and depth
+    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures.
+    Publishes ``objects`` and ``perception/markers`` (latched), ``/diagnostics`` (1 Hz).
+    """
+
+    def __init__(self) -> None:
+        super().__init__("perception")
+        p = partial(parameter, self)
+        self.cameras = list(p("cameras", ["left", "right"], "names of the cameras, used in their topics", read_only=True))
+        self.frame = p("frame", "panda_link0", "frame of the results, z up", read_only=True)
+        low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box in `frame`, m", read_only=True)
+        high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box in `frame`, m", read_only=True)
+        count = p("average", 3, "frames of a camera at rest that are averaged", low=1, high=30, read_only=True)
+        tolerance = p("pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0, read_only=True)
+        self.skew = p("camera_tolerance", 0.5, "a camera whose newest frame is older than the newest of all by more than this is left out, s", low=0.0, high=60.0, read_only=True)
+        self.patience = p("camera_timeout", 2.0, "a camera silent for this long is no longer waited for, s", low=0.1, high=60.0, read_only=True)
+        self.max_age = p("max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0, read_only=True)
+        rate = p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0, read_only=True)
+        self.aligned = p("aligned", True, "depth is registered to colour by the driver", read_only=True)
+        name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS, read_only=True)
+        weights = p("weights", "", "weights of the segmenter: a hub name or a local folder; empty: its default", read_only=True)
+        device = p("device", "cpu", "torch device of the segmenter", read_only=True)
+        method = p("method", "completed", "reconstruction", choices=METHODS, read_only=True)
+        use_color = p("use_color", True, "refine masks by the colour difference to the table", read_only=True)
+        split = p("split", True, "part touching objects at concave edges", read_only=True)
+        margin = p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1, read_only=True)
+        min_height = p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1, read_only=True)
+        seed = p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1, read_only=True)
+        if not self.cameras or len(set(self.cameras)) != len(self.cameras):
+            raise MagicError(Code.BAD_REQUEST, "parameter cameras", self.cameras, "at least one name, none twice")
+        if len(low) != 3 or len(high) != 3:
+            raise MagicError(Code.BAD_REQUEST, "parameters region_low, region_high", f"{list(low)}, {list(high)}", "three numbers each")
+        self.parameters = Parameters(
+            region_low=tuple(low), region_high=tuple(high), method=method, use_color=use_color, split=split,
+            known_margin=margin, min_height=min_height, seed=seed,
+        )  # fmt: skip
+        self.given: dict[str, np.ndarray] = {}
+        for camera in self.cameras:
+            numbers = list(p(f"extrinsics.{camera}", [0.0] * 7, f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF", read_only=True))
+            if any(numbers):
+                if len(numbers) != 7 or not 0.9 < np.linalg.norm(numbers[3:]) < 1.1:
+                    raise MagicError(Code.BAD_REQUEST, f"parameter extrinsics.{camera}", numbers, "x y z and a unit quaternion x y z w")
+                self.given[camera] = transforms.from_quaternion(numbers[:3], numbers[3:])
+        self.segmenter = make_segmenter(name, weights, device)
+        self.streams = {camera: Stream(camera, tolerance, count) for camera in self.cameras}
+        self.count = count
+        self.buffer = TransformBuffer()
+        self.tracker = Tracker()
+        self.known: tuple[SceneObject, ...] = ()
+        self.known_problem: tuple[Code, str] | None = None
+        self.done_stamp = -math.inf
+        self.done = 0
+        self.outcome: tuple[bytes, Code, str, dict[str, object]] = (DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
+        self.lock = threading.Lock()
+        self.started = time.monotonic()
+
+        inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
+        self.topics: dict[str, dict[str, str]] = {}
+        for camera in self.cameras:
+            base = f"camera/{camera}"
+            depth = "aligned_depth_to_color/image_raw" if self.aligned else "depth/image_rect_raw"
+            topics = {"color": f"{base}/color/image_raw", "camera_info": f"{base}/color/camera_info", "depth": f"{base}/{depth}"}
+            self.create_subscription(Image, topics["color"], partial(self.on_image, camera, "color"), SENSOR, callback_group=inputs)
+            self.create_subscription(Image, topics["depth"], partial(self.on_image, camera, "depth"), SENSOR, callback_group=inputs)
+            self.create_subscription(CameraInfo, topics["camera_info"], partial(self.on_info, camera, False), SENSOR, callback_group=inputs)
+            if not self.aligned:
+                topics["depth_camera_info"] = f"{base}/depth/camera_info"
+                self.create_subscription(CameraInfo, topics["depth_camera_info"], partial(self.on_info, camera, True), SENSOR, callback_group=inputs)
+            self.topics[camera] = topics
+        try:
+            from tf2_msgs.msg import TFMessage
+
+            self.create_subscription(TFMessage, "/tf", partial(self.on_tf, False), RELIABLE, callback_group=inputs)
+            self.create_subscription(TFMessage, "/tf_static", partial(self.on_tf, True), STATIC_TF, callback_group=inputs)
+        except ImportError:
+            self.get_logger().error("tf2_msgs is not installed: poses of cameras must be given as parameters extrinsics.NAME")
+        self.create_subscription(SceneObjectArray, "known_objects", self.on_known, LATCHED, callback_group=inputs)
+        self.objects_out = self.create_publisher(SceneObjectArray, "objects", LATCHED)
+        self.markers_out = self.create_publisher(MarkerArray, "perception/markers", LATCHED)
+        self.diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
+        self.last_run = -math.inf
+        self.period = 1.0 / rate
+        self.create_timer(min(0.05, self.period / 4), self.on_work, callback_group=work)
+        self.create_timer(1.0, self.on_report, callback_group=report)
+        self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
+
+    # ------------------------------------------------------------ input
+
+    def on_image(self, camera: str, what: str, msg: Image) -> None:
+        """One colour or depth image."""
+        now = time.monotonic()
+        stream = self.streams[camera]
+        with self.lock:
+            try:
+                stamp = cv.time_from_msg(msg.header.stamp)
+                if not msg.header.frame_id:
+                    raise MagicError(Code.NO_TRANSFORM, f"frame_id on {self.topics[camera][what]}", "empty", "the name of the optical frame")
+                if self.max_age > 0:
+                    age = self.get_clock().now().nanoseconds * 1e-9 - stamp
+                    if age > self.max_age:
+                        raise MagicError(Code.STALE_DATA, f"age in s of the image on {self.topics[camera][what]}", round(age, 2), f"at most {self.max_age}")
+                if what == "color":
+                    stream.color(stamp, cv.color_from_msg(msg), msg.header.frame_id, now)
+                else:
+                    stream.depth(stamp, cv.depth_from_msg(msg), msg.header.frame_id, now)
+            except Exception as error:
+                code, message = describe(self, error)
+                stream.last[what] = now
+                stream.wrong(what, Code(code), f"{self.topics[camera][what]}: {message}", now)
+
+    def on_info(self, camera: str, of_depth: bool, msg: CameraInfo) -> None:
+        """Intrinsics of the colour or of the depth camera."""
+        now = time.monotonic()
+        stream = self.streams[camera]
+        what = "depth_camera_info" if of_depth else "camera_info"
+        with self.lock:
+            try:
+                intrinsics = cv.intrinsics_from_msg(msg)
+                if of_depth:
+                    stream.depth_intrinsics = intrinsics
+                    stream.clear(what)
+                else:
+                    stream.info(intrinsics, now)
+            except Exception as error:
+                code, message = describe(self, error)
+                stream.wrong(what, Code(code), f"{self.topics[camera][what]}: {message}", now)
+
+    def on_tf(self, static: bool, msg: object) -> None:
+        """Transforms; a bad one is named in the log and left out."""
+        with self.lock:
+            for transform in msg.transforms:  # type: ignore[attr-defined]
+                try:
+                    pc.remember_transform(self.buffer, transform, static)
+                except Exception as error:
+                    self.get_logger().warning(f"transform left out: {describe(self, error)[1]}", throttle_duration_sec=5.0)
+
+    def on_known(self, msg: SceneObjectArray) -> None:
+        """Calibrated fixtures."""
+        try:
+            if msg.header.frame_id and msg.header.frame_id.lstrip("/") != self.frame:
+                raise MagicError(Code.NO_TRANSFORM, "frame of known_objects", msg.header.frame_id, self.frame)
+            known = cv.scene_from_msg(msg).objects
+            with self.lock:
+                self.known, self.known_problem = known, None
+                self.done_stamp = -math.inf  # look again at the newest frames
+        except Exception as error:
+            code, message = describe(self, error)
+            self.known_problem = (Code(code), f"known_objects: {message}")
+            self.get_logger().error(self.known_problem[1])
+
+    # ------------------------------------------------------------ work
+
+    def on_work(self) -> None:
+        """Perceive when there is something new; no exception leaves."""
+        now = time.monotonic()
+        if now - self.last_run < self.period:
+            return
+        try:
+            frames, notes = self.gather(now)
+            if not frames:
+                return
+            self.last_run = now
+            with self.lock:
+                known = self.known
+            report = Report(notes=notes)
+            scene = perceive(frames, known, self.parameters, self.segmenter, report)
+            scene = self.tracker.update(Scene(scene.objects, scene.table, scene.stamp, self.frame))
+            self.publish(scene)
+            seconds = time.monotonic() - now
+            self.done += 1
+            seen = [o for o in scene.objects if o.source == "camera"]
+            values: dict[str, object] = {"objects": ", ".join(o.id for o in scene.objects), "seconds": round(seconds, 3), "cameras": ", ".join(f.camera for f in frames)}
+            values.update({f"seconds {k}": round(v, 4) for k, v in report.seconds.items()})
+            values["notes"] = "; ".join(report.notes)
+            if seen:
+                level = DiagnosticStatus.WARN if report.notes else DiagnosticStatus.OK
+                self.outcome = (level, Code.OK, f"{len(seen)} objects seen, {len(scene.objects) - len(seen)} known" + (f"; {values['notes']}" if report.notes else ""), values)
+            else:
+                self.outcome = (DiagnosticStatus.WARN, Code.NO_OBJECTS, "[106 NO_OBJECTS] nothing stands on the table in the region of interest", values)
+            if self.done == 1:
+                self.get_logger().info(f"first scene after {now - self.started:.1f} s: {self.outcome[2]}, in {seconds:.2f} s")
+        except Exception as error:
+            code, message = describe(self, error)
+            self.last_run = now
+            self.outcome = (DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
+            self.get_logger().error(self.outcome[2], throttle_duration_sec=5.0)
+
+    def gather(self, now: float) -> tuple[list[RgbdFrame], list[str]]:
+        """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for."""
+        notes: list[str] = []
+        taken: list[tuple[Stream, list[Pair]]] = []
+        with self.lock:
+            newest = max((s.pairs[-1].stamp for s in self.streams.values() if s.pairs), default=None)
+            if newest is None:
+                return [], notes
+            if newest < self.done_stamp - 1.0:
+                self.done_stamp = -math.inf  # a bag began again
+            if newest <= self.done_stamp:
+                return [], notes
+            for camera, stream in self.streams.items():
+                silent = now - max(stream.last.get("pair", self.started), self.started)
+                if silent < self.patience and (stream.intrinsics is None or len(stream.pairs) < self.count):
+                    # The first frames of a camera that speaks, or the wait for one that has not spoken yet.
+                    first = stream.pairs[0].arrived if stream.pairs else self.started
+                    if now - first < self.patience:
+                        return [], notes
+                if stream.intrinsics is None:
+                    if stream.pairs or stream.counts["color"]:
+                        stream.wrong("camera_info", Code.NO_CAMERA_INFO, f"no camera_info received on {self.topics[camera]['camera_info']}", now)
+                    notes.append(f"camera {camera} left out: no camera_info")
+                elif not stream.pairs:
+                    notes.append(f"camera {camera} left out: no frames")
+                elif newest - stream.pairs[-1].stamp > self.skew:
+                    message = f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.skew} s)"
+                    stream.wrong("stamps", Code.STALE_DATA, f"{self.topics[camera]['color']}: {message}", now)
+                    notes.append(f"camera {camera} left out: {message}")
+                else:
+                    if "stamps" in stream.problems and now - stream.problems["stamps"].when > 3.0:
+                        stream.clear("stamps")
+                    taken.append((stream, list(stream.pairs)))
+        frames = []
+        for stream, pairs in taken:
+            try:
+                frames.append(self.frame_of(stream, pairs))
+                stream.clear("frames")
+            except MagicError as error:
+                stream.wrong("frames", error.code, f"camera {stream.name}: {error.message}", now)
+                notes.append(f"camera {stream.name} left out: {error.message}")
+        if not frames and taken:
+            worst = next(iter(s.problems["frames"] for s, _ in taken))
+            raise MagicError(worst.code, worst.message)
+        if frames:
+            self.done_stamp = newest
+        return frames, notes
+
+    def frame_of(self, stream: Stream, pairs: list[Pair]) -> RgbdFrame:
+        """The average of a camera's frames at rest, with its pose."""
+        intrinsics = stream.intrinsics
+        assert intrinsics is not None
+        with self.lock:
+            if stream.name in self.given:
+                poses = [self.given[stream.name]] * len(pairs)
+            else:
+                poses = [self.buffer.lookup(self.frame, p.frame_id, p.stamp) for p in pairs]
+            frames = []
+            for pair, pose in zip(pairs, poses, strict=True):
+                # Averaging is for a camera that stands still.
+                if np.linalg.norm(pose[:3, 3] - poses[-1][:3, 3]) > 0.001 or transforms.rotation_angle(pose, poses[-1]) > 0.002:
+                    continue
+                depth = pair.depth
+                if not self.aligned:
+                    if stream.depth_intrinsics is None:
+                        raise MagicError(Code.NO_CAMERA_INFO, f"camera_info of {stream.name}'s depth", "none received", self.topics[stream.name]["depth_camera_info"])
+                    color_from_depth = self.buffer.lookup(pair.frame_id, pair.depth_frame_id, pair.stamp)
+                    depth = register_depth(depth, stream.depth_intrinsics, intrinsics, color_from_depth)
+                elif pair.depth_frame_id.lstrip("/") != pair.frame_id.lstrip("/"):
+                    raise MagicError(Code.NO_TRANSFORM, f"frame of {self.topics[stream.name]['depth']}", pair.depth_frame_id, f"{pair.frame_id}, that of colour; else set aligned to false")
+                frames.append(RgbdFrame(pair.color, depth, intrinsics, poses[-1], stream.name, pair.stamp))
+        result = average(frames)
+        if np.isfinite(result.depth).sum() < 100:
+            raise MagicError(Code.NO_DEPTH, f"pixels with depth on {self.topics[stream.name]['depth']}", int(np.isfinite(result.depth).sum()), "at least 100")
+        return result
+
+    def publish(self, scene: Scene) -> None:
+        """Objects and markers."""
+        self.objects_out.publish(cv.scene_to_msg(scene))
+        self.markers_out.publish(pc.markers(scene))
+
+    # ------------------------------------------------------------ diagnostics
+
+    def on_report(self) -> None:
+        """Say once a second what is there and what is missing."""
+        try:
+            now = time.monotonic()
+            with self.lock:
+                states = [self.camera_status(camera, now) for camera in self.cameras]
+            level, code, message, values = self.outcome
+            worst = [s for s in states if s.level != DiagnosticStatus.OK]
+            if self.done == 0 and code is Code.NO_FRAMES and worst:
+                message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
+            states.append(pc.status(f"{self.get_name()}: scene", level, message, code, values))
+            if self.known_problem is not None:
+                states.append(pc.status(f"{self.get_name()}: known objects", DiagnosticStatus.ERROR, f"[{int(self.known_problem[0])} {self.known_problem[0].name}] {self.known_problem[1]}", self.known_problem[0], {}))
+            msg = DiagnosticArray(status=states)
+            msg.header.stamp = self.get_clock().now().to_msg()
+            self.diagnostics_out.publish(msg)
+        except Exception as error:
+            self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
+
+    def camera_status(self, camera: str, now: float) -> DiagnosticStatus:
+        """One camera: its problems, else what of it is silent, else OK."""
+        stream = self.streams[camera]
+        values: dict[str, object] = {}
+        for what, topic in self.topics[camera].items():
+            values[topic] = f"{stream.counts.get(what, 0)} messages" + (f", last {now - stream.last[what]:.1f} s ago" if what in stream.last else "")
+        if stream.pairs:
+            values["frame"] = stream.pairs[-1].frame_id
+            values["stamp"] = f"{stream.pairs[-1].stamp:.3f}"
+        name = f"{self.get_name()}: camera {camera}"
+        for what in ("camera_info", "depth_camera_info", "color", "depth", "stamps", "pairing", "frames"):
+            if what in stream.problems:
+                problem = stream.problems[what]
+                return pc.status(name, DiagnosticStatus.ERROR, f"[{int(problem.code)} {problem.code.name}] {problem.message}", problem.code, values)
+        for what in ("color", "depth", "camera_info"):
+            silent = now - stream.last.get(what, self.started)
+            limit = self.patience if what != "camera_info" else math.inf
+            if what not in stream.last or silent > limit:
+                topic = self.topics[camera][what]
+                publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+                other = [i.topic_type for i in publishers if i.topic_type != ("sensor_msgs/msg/CameraInfo" if what == "camera_info" else "sensor_msgs/msg/Image")]
+                if other:
+                    why = f"published as {other[0]}"
+                else:
+                    why = f"{len(publishers)} publishers" + (f", silent for {silent:.1f} s" if what in stream.last else ", nothing received")
+                code = Code.NO_CAMERA_INFO if what == "camera_info" else (Code.STALE_DATA if what in stream.last else Code.NO_FRAMES)
+                return pc.status(name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values)
+        return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run magic_perception perception``."""
+    run(Perception)
