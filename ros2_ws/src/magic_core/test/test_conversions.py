@@ -1,0 +1,269 @@
+"""Messages and plain types: there and back."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from magic_core import conversions as cv
+from magic_core import transforms as tf
+from magic_core.camera import Intrinsics
+from magic_core.contact import Contact, ContactCandidate, contact_frame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
+from magic_core.scene import CanonicalView, Scene, SceneObject
+
+number = st.floats(-5, 5, allow_nan=False)
+poses = st.builds(lambda r, t: tf.from_rotvec(r, t), st.tuples(number, number, number), st.tuples(number, number, number))
+fast = settings(max_examples=40, deadline=None)
+
+
+@given(st.floats(0, 4e9, allow_nan=False))
+@fast
+def test_time(seconds):
+    assert cv.time_from_msg(cv.time_to_msg(seconds)) == pytest.approx(seconds, abs=1e-6)
+    assert 0 <= cv.time_to_msg(seconds).nanosec < 1_000_000_000
+
+
+@given(poses)
+@fast
+def test_pose_and_transform(pose):
+    np.testing.assert_allclose(cv.pose_from_msg(cv.pose_to_msg(pose)), pose, atol=1e-9)
+    np.testing.assert_allclose(cv.transform_from_msg(cv.transform_to_msg(pose)), pose, atol=1e-9)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0, 1.0), (math.nan, 0.0, 0.0, 1.0)])
+def test_no_pose(quaternion):
+    msg = cv.pose_to_msg(np.eye(4))
+    msg.orientation.x, msg.orientation.y, msg.orientation.z, msg.orientation.w = quaternion
+    with pytest.raises(MagicError) as error:
+        cv.pose_from_msg(msg)
+    assert error.value.code == Code.BAD_REQUEST
+
+
+@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
+@fast
+def test_colour(image):
+    np.testing.assert_array_equal(cv.color_from_msg(cv.image_to_msg(image, "rgb8")), image)
+    np.testing.assert_array_equal(cv.color_from_msg(cv.image_to_msg(image, "bgr8")), image[..., ::-1])
+    grey = cv.color_from_msg(cv.image_to_msg(image[..., 0], "mono8"))
+    np.testing.assert_array_equal(grey, np.repeat(image[..., :1], 3, axis=2))
+
+
+@given(arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9))))
+@fast
+def test_depth_in_millimetres(raw):
+    depth = cv.depth_from_msg(cv.image_to_msg(raw, "16UC1"))
+    np.testing.assert_allclose(depth[raw > 0], raw[raw > 0] * 0.001, rtol=1e-6)
+    assert np.isnan(depth[raw == 0]).all()
+
+
+def test_depth_in_metres_and_what_is_none():
+    raw = np.array([[0.5, np.nan, 0.0, np.inf, -1.0]], np.float32)
+    np.testing.assert_array_equal(cv.depth_from_msg(cv.image_to_msg(raw, "32FC1")), [[np.float32(0.5)] + [np.nan] * 4])
+
+
+def test_rows_may_be_padded_and_bytes_swapped():
+    raw = np.arange(6, dtype=np.uint16).reshape(2, 3)
+    msg = cv.image_to_msg(raw, "16UC1")
+    padded = np.zeros((2, 8), np.uint8)
+    padded[:, :6] = raw.astype(">u2").view(np.uint8)
+    msg.is_bigendian, msg.step, msg.data = 1, 8, padded.tobytes()
+    depth = cv.depth_from_msg(msg)
+    np.testing.assert_allclose(np.nan_to_num(depth), raw * 0.001, rtol=1e-6)
+
+
+@pytest.mark.parametrize("change", [{"width": 9}, {"height": 0}, {"step": 1}, {"data": b"123"}])
+def test_images_that_contradict_themselves(change):
+    msg = cv.image_to_msg(np.zeros((4, 5, 3), np.uint8), "rgb8")
+    for key, value in change.items():
+        setattr(msg, key, value)
+    with pytest.raises(MagicError) as error:
+        cv.color_from_msg(msg)
+    assert error.value.code == Code.BAD_IMAGE
+
+
+def test_unknown_encodings_name_what_is_allowed():
+    msg = cv.image_to_msg(np.zeros((4, 5, 3), np.uint8), "rgb8")
+    msg.encoding = "bayer_rggb8"
+    with pytest.raises(MagicError, match="bayer_rggb8.*rgb8, bgr8") as error:
+        cv.color_from_msg(msg)
+    assert error.value.code == Code.BAD_ENCODING
+    with pytest.raises(MagicError, match="16UC1, mono16, 32FC1"):
+        cv.depth_from_msg(msg)
+
+
+def test_masks():
+    mask = np.random.default_rng(0).random((5, 7)) > 0.5
+    np.testing.assert_array_equal(cv.mask_from_msg(cv.image_to_msg(mask, "mono8")), mask)
+
+
+def test_the_image_does_not_share_the_messages_buffer():
+    msg = cv.image_to_msg(np.zeros((2, 2, 3), np.uint8), "rgb8")
+    image = cv.color_from_msg(msg)
+    msg.data[0] = 99
+    assert image.max() == 0
+    image[:] = 1  # and may be written to
+
+
+def test_intrinsics():
+    k = Intrinsics(640, 480, 600.5, 601.5, 320.25, 240.75)
+    assert cv.intrinsics_from_msg(cv.intrinsics_to_msg(k)) == k
+    msg = cv.intrinsics_to_msg(k)
+    msg.k[0] = 0.0
+    with pytest.raises(MagicError) as error:
+        cv.intrinsics_from_msg(msg)
+    assert error.value.code == Code.BAD_INTRINSICS
+
+
+def test_clouds():
+    rng = np.random.default_rng(0)
+    points, colors = rng.normal(size=(50, 3)), rng.integers(0, 256, (50, 3), dtype=np.uint8)
+    back, back_colors = cv.cloud_from_msg(cv.cloud_to_msg(points, colors, cv.header("world")))
+    np.testing.assert_allclose(back, points, atol=1e-6)
+    np.testing.assert_array_equal(back_colors, colors)
+    empty, _ = cv.cloud_from_msg(cv.cloud_to_msg(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), cv.header("world")))
+    assert empty.shape == (0, 3)
+
+
+@pytest.mark.parametrize("coef, plane", [((0, 0, 2, -1), (0, 0, 1, -0.5)), ((0, 0, -1, 0.5), (0, 0, 1, -0.5)), ((0, 0, 0, 0), (0, 0, 1, 0))])
+def test_planes_are_unit_and_point_up(coef, plane):
+    np.testing.assert_allclose(cv.plane_from_msg(cv.plane_to_msg(np.array(coef))), plane, atol=1e-12)
+
+
+# ---------------------------------------------------------------- composed types
+
+
+def tetrahedron():
+    vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    return Mesh(vertices, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.arange(12, dtype=np.uint8).reshape(4, 3))
+
+
+def view(kind="top"):
+    rng = np.random.default_rng(1)
+    mask = rng.random((6, 8)) > 0.5
+    depth = np.where(mask, rng.random((6, 8)), np.nan).astype(np.float32)
+    return CanonicalView(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), mask, 0.002, tf.from_rpy(0.1, 0.2, 0.3, [1, 2, 3]), kind, depth, 0.75)
+
+
+def contact():
+    v = view()
+    return Contact(np.array([3.0, 2.5]), tf.unit([1.0, -1.0]), 0.012, True, 0.004, contact_frame(v, np.array([3.0, 2.5]), tf.unit([1.0, -1.0])))
+
+
+def same_view(a, b):
+    np.testing.assert_array_equal(a.image, b.image)
+    np.testing.assert_array_equal(a.mask, b.mask)
+    np.testing.assert_array_equal(a.depth, b.depth)
+    np.testing.assert_allclose(a.object_from_view, b.object_from_view, atol=1e-9)
+    assert (a.kind, a.metres_per_pixel, a.confidence) == (b.kind, b.metres_per_pixel, b.confidence)
+
+
+def test_views():
+    same_view(cv.view_from_msg(cv.view_to_msg(view())), view())
+    msg = cv.view_to_msg(view())
+    msg.mask = cv.image_to_msg(np.zeros((5, 8), bool), "mono8")
+    with pytest.raises(MagicError) as error:
+        cv.view_from_msg(msg)
+    assert error.value.code == Code.BAD_REQUEST_IMAGE
+
+
+def test_scenes():
+    mesh = tetrahedron()
+    item = SceneObject(
+        id="object_1",
+        mesh=mesh,
+        pieces=(mesh, mesh.scaled(0.5)),
+        world_from_object=tf.from_rpy(0, 0, 1, [0.4, 0.1, 0.02]),
+        view=view(),
+        points=np.random.default_rng(2).normal(size=(9, 3)),
+        colors=np.zeros((9, 3), np.uint8),
+        mask=np.eye(4, 5, dtype=bool),
+        camera="left",
+        world_from_box=tf.from_rpy(0, 0, 0.5),
+        box_extents=np.array([0.1, 0.2, 0.3]),
+        confidence=0.5,
+    )
+    scene = Scene((item,), np.array([0, 0, 1.0, -0.01]), stamp=12.5)
+    back = cv.scene_from_msg(cv.scene_to_msg(scene))
+    assert (back.stamp, back.frame_id, back.table_height) == (12.5, "panda_link0", pytest.approx(0.01))
+    other = back.find("object_1")
+    np.testing.assert_allclose(other.mesh.vertices, mesh.vertices)
+    np.testing.assert_array_equal(other.mesh.faces, mesh.faces)
+    np.testing.assert_array_equal(other.mesh.colors, mesh.colors)
+    assert [len(p.faces) for p in other.pieces] == [4, 4]
+    np.testing.assert_allclose(other.world_from_object, item.world_from_object, atol=1e-9)
+    np.testing.assert_allclose(other.points, item.points, atol=1e-6)
+    np.testing.assert_array_equal(other.mask, item.mask)
+    np.testing.assert_allclose(other.box_extents, item.box_extents)
+    same_view(other.view, item.view)
+    with pytest.raises(MagicError, match="object_1") as error:
+        back.find("object_2")
+    assert error.value.code == Code.UNKNOWN_OBJECT
+
+
+def test_mesh_colours_of_the_wrong_length():
+    msg = cv.scene_to_msg(Scene((SceneObject("a", tetrahedron(), (), np.eye(4), view()),), np.array([0, 0, 1.0, 0])))
+    msg.objects[0].mesh_colors = msg.objects[0].mesh_colors[:-1]
+    with pytest.raises(MagicError) as error:
+        cv.scene_from_msg(msg)
+    assert error.value.code == Code.BAD_MESH
+
+
+@pytest.mark.parametrize("with_target", [True, False])
+def test_candidates(with_target):
+    before = ContactCandidate("object_1", contact(), contact() if with_target else None, 1.5, True, 0.5, 0.25, 0.75, tf.from_rpy(0.3, 0, 0, [1, 0, 0]))
+    pose = tf.from_rpy(0, 0, 0.5, [0.2, 0, 0])
+    msg = cv.candidate_to_msg(before, pose)
+    after = cv.candidate_from_msg(msg)
+    assert (after.tool_id, after.rotation, after.flipped, after.s_dino, after.s_curv, after.score) == ("object_1", 1.5, True, 0.5, 0.25, 0.75)
+    assert (after.target is not None) == with_target
+    np.testing.assert_allclose(after.tool.object_from_contact, before.tool.object_from_contact, atol=1e-9)
+    assert after.tool.signed_curvature == pytest.approx(-1 / 0.012)
+    np.testing.assert_allclose([msg.point.x, msg.point.y, msg.point.z], (pose @ before.tool.object_from_contact)[:3, 3])
+    assert math.isnan(cv.candidate_to_msg(before).point.x)
+
+
+def plan(variant):
+    times = np.array([0.0, 0.5, 1.25])
+    motion = ToolMotion(times, np.stack([tf.from_rpy(0, 0, t, [t, 0, 0]) for t in times]), (Phase("contact", 0.0, 0.5), Phase("goal", 0.5, 1.25)))
+    if variant == "fg":
+        return MotionPlan("fg", motion)
+    rng = np.random.default_rng(3)
+    names = tuple(f"panda_joint{i}" for i in range(1, 8))
+    arm = ArmMotion(times, names, rng.normal(size=(3, 7)), rng.normal(size=(3, 7)), rng.normal(size=(3, 7)), tf.from_rpy(1, 0, 0), 0.03, 0.25, None, motion.phases)
+    return MotionPlan("arm", motion, arm)
+
+
+@pytest.mark.parametrize("variant", ["fg", "arm"])
+def test_plans(variant):
+    before = plan(variant)
+    msg = cv.plan_to_msg(before, "object_1")
+    after = cv.plan_from_msg(msg)
+    assert msg.tool_trajectory.joint_names == ["object_1"]
+    np.testing.assert_allclose(after.tool_motion.times, before.tool_motion.times)
+    np.testing.assert_allclose(after.tool_motion.world_from_tool, before.tool_motion.world_from_tool, atol=1e-9)
+    assert after.tool_motion.phases == before.tool_motion.phases
+    if variant == "arm":
+        for name in ("times", "positions", "velocities", "accelerations", "tool_from_tcp"):
+            np.testing.assert_allclose(getattr(after.arm_motion, name), getattr(before.arm_motion, name), atol=1e-9)
+        assert after.arm_motion.release_time is None
+        assert after.arm_motion.joint_names == before.arm_motion.joint_names
+
+
+def test_plans_that_are_none():
+    def code(change):
+        msg = cv.plan_to_msg(plan("arm"), "object_1")
+        change(msg)
+        with pytest.raises(MagicError) as error:
+            cv.plan_from_msg(msg)
+        return error.value.code
+
+    assert code(lambda m: setattr(m, "variant", "legs")) == Code.UNKNOWN_VARIANT
+    assert code(lambda m: setattr(m.tool_trajectory, "points", [])) == Code.BAD_MOTION
+    assert code(lambda m: setattr(m.arm_trajectory, "points", [])) == Code.BAD_MOTION
+    assert code(lambda m: m.arm_trajectory.points[0].positions.pop()) == Code.BAD_MOTION
+    assert code(lambda m: m.tool_trajectory.points.reverse()) == Code.BAD_MOTION

@@ -1,0 +1,129 @@
+"""Strategies as folders: what is saved comes back, and what is wrong is named."""
+
+import numpy as np
+import pytest
+import yaml
+from magic_core import strategy as strategies
+from magic_core import transforms as tf
+from magic_core.contact import Contact, contact_frame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.scene import CanonicalView
+from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+
+
+def make():
+    rng = np.random.default_rng(0)
+
+    def view(kind):
+        mask = np.zeros((32, 32), bool)
+        mask[8:24, 8:24] = True
+        return CanonicalView(rng.integers(0, 256, (32, 32, 3), dtype=np.uint8), mask, 0.001, tf.from_rpy(np.pi, 0, 0.3, [0.01, 0.02, 0.03]), kind)
+
+    def contact(of, radius, concave):
+        pixel, normal = np.array([23.5, 16.0]), np.array([1.0, 0.0])
+        return Contact(pixel, normal, radius, concave, 0.008, contact_frame(of, pixel, normal))
+
+    mesh = Mesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    tool, target = view("top"), view("top")
+    times = np.linspace(0, 2, 5)
+    return Strategy(
+        name="pull",
+        description="pulls — with a hook",
+        view="top",
+        mode="plan",
+        tool_view=tool,
+        tool_contact=contact(tool, 0.02, True),
+        target_view=target,
+        target_contact=contact(target, float("inf"), False),
+        target_normal=np.array([1.0, 0, 0]),
+        target_view_direction=np.array([0, 0, -1.0]),
+        times=times,
+        target_from_tool=np.stack([tf.from_rpy(0, 0, t, [t, 0, 0]) for t in times]),
+        tool_mesh=mesh,
+        target_mesh=mesh.scaled(2),
+        waypoints=(Waypoint("behind", np.array([0.03, 0, 0]), "approach", 0.2), Waypoint("contact", np.zeros(3), "contact")),
+        goal=Goal("hook", {"distance": 0.2}),
+        physics=Physics(0.05, 500.0, 10.0, False),
+        reflections=("turn",),
+        releases=True,
+        simulatable=False,
+        environment={"rod": 0.3},
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    strategies.save(make(), tmp_path / "pull")
+    return tmp_path / "pull"
+
+
+def test_everything_comes_back(folder):
+    before, after = make(), strategies.load(folder)
+    for name in ("name", "description", "view", "mode", "goal", "physics", "reflections", "releases", "simulatable", "environment"):
+        assert getattr(after, name) == getattr(before, name), name
+    for name in ("target_normal", "target_view_direction", "times", "target_from_tool"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-7, err_msg=name)
+    for view in ("tool_view", "target_view"):
+        np.testing.assert_array_equal(getattr(after, view).image, getattr(before, view).image)
+        np.testing.assert_array_equal(getattr(after, view).mask, getattr(before, view).mask)
+    for name in ("tool_contact", "target_contact"):
+        np.testing.assert_allclose(getattr(after, name).object_from_contact, getattr(before, name).object_from_contact, atol=1e-9)
+        assert getattr(after, name).radius == getattr(before, name).radius
+        assert getattr(after, name).concave == getattr(before, name).concave
+    assert [(w.name, w.phase, w.speed, w.offset.tolist()) for w in after.waypoints] == [(w.name, w.phase, w.speed, w.offset.tolist()) for w in before.waypoints]
+    np.testing.assert_allclose(after.target_mesh.extents, 2 * after.tool_mesh.extents, rtol=1e-6)
+
+
+def test_found_by_name_and_by_path(folder):
+    assert strategies.find("pull", folder.parent).name == "pull"
+    assert strategies.find(str(folder)).name == "pull"
+
+
+@pytest.mark.parametrize("name", ["push", "", "../pull", "pull/.."])
+def test_unknown_names(folder, name):
+    with pytest.raises(MagicError) as error:
+        strategies.find(name, folder.parent)
+    assert error.value.code == Code.UNKNOWN_STRATEGY
+    if "/" not in name:
+        assert "pull" in error.value.message
+
+
+def edit(folder, change):
+    path = folder / "strategy.yaml"
+    data = yaml.safe_load(path.read_text())
+    change(data)
+    path.write_text(yaml.safe_dump(data))
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda d: d.update(mode="guess"), "guess"),
+        (lambda d: d.pop("goal"), "goal"),
+        (lambda d: d["tool"].pop("contact"), "contact"),
+        (lambda d: d["physics"].update(colour=1), "colour"),
+        (lambda d: d["target"].update(normal_in_world=[0, 0, 0]), "direction"),
+    ],
+)
+def test_wrong_keys_are_named(folder, change, says):
+    edit(folder, change)
+    with pytest.raises(MagicError, match=says) as error:
+        strategies.load(folder)
+    assert error.value.code == Code.BAD_STRATEGY
+
+
+@pytest.mark.parametrize("name", ["tool.png", "target_mask.png", "trajectory.csv", "tool.ply"])
+def test_missing_files_are_named(folder, name):
+    (folder / name).unlink()
+    with pytest.raises(MagicError) as error:
+        strategies.load(folder)
+    assert error.value.code in (Code.BAD_STRATEGY, Code.BAD_MESH)
+    assert name in error.value.message
+
+
+def test_what_is_no_yaml(folder):
+    (folder / "strategy.yaml").write_text("a: [1, ")
+    with pytest.raises(MagicError) as error:
+        strategies.load(folder)
+    assert error.value.code == Code.BAD_STRATEGY
