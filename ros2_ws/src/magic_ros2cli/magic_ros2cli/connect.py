@@ -1,0 +1,81 @@
+"""A short-lived node and the waiting that its verbs need: there is no daemon that knows the graph already."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+
+T = TypeVar("T")
+
+#: How long a named node, topic or service may take to be discovered, s.
+DISCOVERY = 5.0
+#: The graph counts as known when it has not changed for this long, s.
+SETTLED = 0.4
+
+
+@contextmanager
+def node(**options: Any) -> Iterator[Any]:
+    """A hidden node; SIGINT stays Python's KeyboardInterrupt."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    made = None
+    try:
+        name = options.pop("name", None) or f"_ros2cli_{os.getpid()}"
+        made = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False, **options)
+        yield made
+    finally:
+        if made is not None:
+            made.destroy_node()
+        rclpy.try_shutdown()
+
+
+def settle(query: Callable[[], T], shortest: float = 0.6, longest: float = 3.0) -> T:
+    """The answer of a graph query once it has stopped changing."""
+    start = changed = time.monotonic()
+    answer = query()
+    while True:
+        time.sleep(0.05)
+        now = time.monotonic()
+        before, answer = answer, query()
+        if answer != before:
+            changed = now
+        if (now - changed >= SETTLED and now - start >= shortest) or now - start >= longest:
+            return answer
+
+
+def wait_for(condition: Callable[[], T], seconds: float | None = DISCOVERY) -> T:
+    """Poll until the condition is true or the time is over (None: for ever); its last value."""
+    deadline = None if seconds is None else time.monotonic() + seconds
+    while True:
+        value = condition()
+        if value or (deadline is not None and time.monotonic() > deadline):
+            return value
+        time.sleep(0.02)
+
+
+def spin_until(made: Any, future: Any, seconds: float | None = None) -> Any | None:
+    """Spin the node until the future is done; its result, or None where the time was over (``seconds`` None: for ever).
+
+    In short steps: a signal is seen by Python only between two waits.
+    """
+    deadline = None if seconds is None else time.monotonic() + seconds
+    while not future.done():
+        if deadline is not None and time.monotonic() > deadline:
+            return None
+        rclpy.spin_once(made, timeout_sec=0.1)
+    return future.result()
+
+
+def absolute(name: str) -> str:
+    """A topic, service or action name as the graph has it."""
+    return name if name.startswith("/") else f"/{name}"
+
+
+def hidden(name: str) -> bool:
+    """Whether ros2cli leaves the name out of its lists."""
+    return any(part.startswith("_") for part in name.split("/"))
