@@ -130,7 +130,7 @@ def hooking() -> Strategy:
 
 
 #: The rod of the hanging demonstration and of the hanging scenes: generator parameters, and its place in the world.
-ROD = {"radius": 0.007, "height": 0.38, "length": 0.19, "foot": 0.05}
+ROD = {"radius": 0.006, "height": 0.38, "length": 0.19, "foot": 0.05}
 ROD_X = 0.56
 
 
@@ -152,9 +152,10 @@ def hanging() -> Strategy:
     waypoints = (
         Waypoint("before", np.array([0.012, 0, -0.20]), "approach"),
         Waypoint("over", np.array([0.012, 0, 0]), "approach"),
-        Waypoint("touch", np.array([0.0, 0, 0]), "contact", 0.03),
-        Waypoint("let_go", np.array([0.0, 0, 0]), "release"),
-        Waypoint("away", np.array([0.0, 0, -0.15]), "retreat"),
+        # Let go just above the rod: a contact that is wrong by a millimetre or two must not press on it.
+        Waypoint("touch", np.array([0.002, 0, 0]), "contact", 0.03),
+        Waypoint("let_go", np.array([0.002, 0, 0]), "release"),
+        Waypoint("away", np.array([0.002, 0, -0.15]), "retreat"),
     )
     times, contacts = _through(waypoints[:4])
     return Strategy(
@@ -210,8 +211,9 @@ def scooping() -> Strategy:
     target_contact = _target_contact(target_view, radius * normal, normal, radius)
 
     speed = 0.08
-    back = np.array([0.03, 0.0, 0.0])
-    times, slide = _line([back, np.zeros(3), np.array([-SLIDE, 0.0, 0.0])], speed)
+    # The deepest bowls reach round the ball before their bottoms touch it: the start leaves them room.
+    back, near = np.array([0.10, 0.0, 0.0]), np.array([0.06, 0.0, 0.0])
+    times, slide = _line([back, near, np.array([-SLIDE, 0.0, 0.0])], speed)
     # Contact frame of the target: x = +x, z = -y, y = +z of the world.
     arm = TURN_RADIUS - radius
     start = _stack(slide, 0.0)
@@ -226,7 +228,8 @@ def scooping() -> Strategy:
     times = np.concatenate([times, turn_times, turn_times[-1] + lift_times[1:]])
     waypoints = (
         Waypoint("behind", back, "approach", speed),
-        Waypoint("touch", np.zeros(3), "approach", speed),
+        Waypoint("near", near, "approach", speed),
+        Waypoint("touch", np.zeros(3), "contact", speed),
         Waypoint("at_arc", np.array([-SLIDE, 0.0, 0.0]), "contact", speed),
         Waypoint("scooped", turn[-1][:3, 3], "goal", speed),
         Waypoint("lifted", end[-1][:3, 3], "goal", speed),

@@ -69,7 +69,7 @@ def _handle(form: str, low: float, high: float, reach: float, start_x: float, lo
 
 
 def mug(seed: int = 0, **given: float | str) -> Shape:
-    """A mug; regions ``handle`` (inner upper arc of the handle's loop, normals down and inward), ``handle_loop`` and ``rim``."""
+    """A mug; regions ``handle`` (upper outer stretch of the handle's inner side, normals down and towards the body), ``handle_loop`` and ``rim``."""
     d = Draw("mug", seed, given)
     profile, form = d.choice("profile", PROFILES), d.choice("handle", HANDLES)
     radius, height = d.real("radius", 0.034, 0.044), d.real("height", 0.075, 0.115)
@@ -109,7 +109,10 @@ def mug(seed: int = 0, **given: float | str) -> Shape:
         inward = -inward
     inner = path + inward * thick / 2
     free = inner[:, 0] > outer(np.clip(inner[:, 2], 0, height)) + 0.0005
-    upper = free & (inward[:, 2] < -0.5) & (inner[:, 2] > (z_low + z_high) / 2)
+    # A mug on a peg turns until the contact's normal points to its centre of mass, down and towards the body: the upper
+    # outer stretch of the loop, with room for a peg before the body.
+    room = inner[:, 0] > outer(np.clip(inner[:, 2], 0, height)) + 0.008
+    upper = free & room & (inward @ transforms.unit([-1.0, 0, -1.0]) > 0.6) & (inner[:, 2] > (z_low + z_high) / 2)
     regions = {
         "handle": Region(inner[upper], inward[upper], _curve_radius(inner[upper]), True),
         "handle_loop": Region(inner[free], inward[free], min(reach, (z_high - z_low) / 2), True),
@@ -137,7 +140,7 @@ def _bowl_regions(half: float, depth: float, power: float, centre: Array) -> dic
 def spoon(seed: int = 0, **given: float | str) -> Shape:
     """A spoon of 2.5 times a table spoon's size; regions ``bowl`` (bottom of the inside) and ``bowl_inside`` (all of the profile but the rim)."""
     d = Draw("spoon", seed, given)
-    a, b = d.real("bowl_half_length", 0.045, 0.070), d.real("bowl_half_width", 0.038, 0.052)
+    a, b = d.real("bowl_half_length", 0.042, 0.062), d.real("bowl_half_width", 0.038, 0.052)
     depth, wall = d.real("depth", 0.018, 0.034), d.real("wall", 0.003, 0.005)
     length, rise = d.real("handle", 0.20, 0.30), d.real("rise", 0.0, 0.03)
     thick, broad = d.real("handle_thickness", 0.009, 0.014), d.real("handle_breadth", 0.016, 0.028)
