@@ -21,7 +21,7 @@ from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals
-from magic_verifier.floating import TARGET, TOOL, FloatingRun, Perturbation, Setup, make_setup, perturbed
+from magic_verifier.floating import TABLE, TARGET, TOOL, FloatingRun, Perturbation, Setup, make_setup, perturbed
 from magic_verifier.goals import Judgement
 from magic_verifier.simulation import Settings
 
@@ -36,8 +36,8 @@ class Limits:
     """What a motion may do apart from its goal.
 
     overlap: depth in metres to which the tool may be in static things before the contact phase, and in a fixed target when
-    it is let go (reconstructions are that uncertain, and a touch is an overlap of about nothing); press: the same for
-    static things after that, where the tool may well slide along them; nudge (m): how far the target may be pushed
+    it is let go (reconstructions are that uncertain, and a touch is an overlap of about nothing), and in the table at any
+    time; press: the same for other static things after the contact phase has begun, where the tool may well slide along them; nudge (m): how far the target may be pushed
     before the contact phase; slip (m) and slip_angle (rad): how far the
     tool may move in the gripper between lift and release; tracking (rad): how far a joint may lag behind.
     """
@@ -140,12 +140,13 @@ def _refuse_intrusions(strategy: Strategy, run: FloatingRun, limits: Limits) -> 
                 f"{item.depth * 1000:.1f} mm deep",
                 f"up to {limits.overlap * 1000:.1f} mm",
             )
-        if not item.before_contact and item.depth > limits.press:
+        allowed = limits.overlap if item.body == TABLE else limits.press
+        if not item.before_contact and item.depth > allowed:
             raise MagicError(
                 Code.LIMIT_EXCEEDED,
                 f"the tool is pressed into the {item.body} at {item.time:.2f} s",
                 f"{item.depth * 1000:.1f} mm deep",
-                f"up to {limits.press * 1000:.1f} mm",
+                f"up to {allowed * 1000:.1f} mm",
             )
     return {
         "overlap_before_contact": max((i.depth for i in found if i.before_contact), default=0.0),
