@@ -113,3 +113,22 @@ def revolve(profile: NDArray[np.float64], centre: NDArray[np.float64], segments:
     faces.append(np.column_stack([np.full(segments, k * segments), j, i]))
     faces.append(np.column_stack([np.full(segments, k * segments + 1), last + i, last + j]))
     return Mesh(vertices, np.concatenate(faces))
+
+
+def turn_ring(profile: NDArray[np.float64], centre: NDArray[np.float64], segments: int = 48) -> Mesh:
+    """The ring that a closed polyline (K, 2) of (radius, z), radius above 0, sweeps about the upright axis through ``centre`` (2,).
+
+    The line runs counter-clockwise in (radius, z).  Watertight, of genus 1.
+    """
+    profile = np.asarray(profile, float)
+    angle = np.arange(segments) * 2 * np.pi / segments
+    k = len(profile)
+    vertices = np.stack([profile[:, None, 0] * np.cos(angle), profile[:, None, 0] * np.sin(angle), np.repeat(profile[:, 1:2], segments, axis=1)], axis=-1).reshape(-1, 3)
+    vertices[:, :2] += centre
+    i = np.arange(segments)
+    j = (i + 1) % segments
+    faces = []
+    for row in range(k):
+        a, b = row * segments, ((row + 1) % k) * segments
+        faces += [np.column_stack([a + i, a + j, b + j]), np.column_stack([a + i, b + j, b + i])]
+    return Mesh(vertices, np.concatenate(faces))

@@ -30,6 +30,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate
 from magic_perception import clusters, polygons, primitives
 from magic_perception.parameters import Parameters
+from magic_perception.segmentation import open_by_two
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,14 @@ class Sight:
         pixels = self.intrinsics.project(camera)
         u, v = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
         shape = u.shape
-        u, v = u.reshape(len(u), -1), v.reshape(len(v), -1)
+        # OpenCV's remap takes pictures of less than 32768 rows and columns.
+        rows = -(-u.size // 8192)
+        u, v = (np.resize(x, (rows, 8192)) if rows > 1 else x.reshape(1, -1) for x in (u, v))
+        count = int(np.prod(shape))
         field = (self.mask | self.hidden).astype(np.float32)
         inside = cv2.remap(field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
         depth = cv2.remap(self.depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-        return inside.reshape(shape), camera[..., 2].astype(np.float32), depth.reshape(shape)
+        return inside.ravel()[:count].reshape(shape), camera[..., 2].astype(np.float32), depth.ravel()[:count].reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -141,7 +145,7 @@ def _height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> _G
     top = top.reshape(size[1], size[0])
     occupied = np.isfinite(top).astype(np.uint8)
     closed = cv2.morphologyEx(occupied, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
-    closed = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+    closed = open_by_two(closed > 0)
     filled = _nearest(top, occupied > 0)
     filled = cv2.medianBlur(filled, 5)
     return _Grid(low, cell, np.where(closed, filled, np.nan).astype(np.float32))
@@ -157,7 +161,9 @@ def _nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[n
     return table[index]
 
 
-def _carve(sights: list[Sight], columns: list[NDArray[np.float64]], see_through: float | None = None) -> NDArray[np.float32]:
+def _carve(
+    sights: list[Sight], columns: list[NDArray[np.float64]], see_through: float | None = None, weights: list[float] | None = None
+) -> NDArray[np.float32]:
     """Occupancy (rows, columns) 0..1 of cells, given the points (rows, columns, 3) of each cell's column: mean over cameras of the least mask.
 
     With ``see_through`` metres a camera that measured depth farther than that behind a cell saw it empty, and one
@@ -165,7 +171,7 @@ def _carve(sights: list[Sight], columns: list[NDArray[np.float64]], see_through:
     """
     total = np.zeros(columns[0].shape[:2], np.float32)
     weight = np.zeros_like(total)
-    for sight in sights:
+    for sight, trust in zip(sights, weights or [1.0] * len(sights), strict=True):
         least = np.ones_like(total)
         blind = np.zeros(total.shape, bool)
         for points in columns:
@@ -177,7 +183,7 @@ def _carve(sights: list[Sight], columns: list[NDArray[np.float64]], see_through:
                 blind |= behind
                 inside = np.where(behind, 1, inside)
             least = np.minimum(least, inside)
-        share = np.where(blind & (least > 0.5), 0.05, 1.0).astype(np.float32)
+        share = np.where(blind & (least > 0.5), 0.05 * trust, trust).astype(np.float32)
         total += share * least
         weight += share
     return total / np.maximum(weight, 1e-6)
@@ -269,8 +275,11 @@ def _lying(sights: list[Sight], points: NDArray[np.float64], height: float, nois
     grid = _height_map(points, parameters.resolution)
     occupied = np.isfinite(grid.top)
     inner = cv2.erode(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
-    sample = grid.top[inner] if inner.sum() > 30 else grid.top[occupied]
-    low, middle, high = np.percentile(sample, [12, 55, 95])
+    # Heights along the middle lines: the round edge of a wire does not make it a relief.
+    depth = cv2.distanceTransform(np.pad(occupied, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    ridge = occupied & (depth >= 0.85 * cv2.dilate(depth, np.ones((7, 7), np.uint8))) & (depth > 1.2)
+    sample = grid.top[ridge] if ridge.sum() > 30 else grid.top[occupied]
+    low, middle, high = np.percentile(sample, [8, 60, 96])
     flat = high - low < max(0.004, 0.2 * high, 3.0 * noise)
     centres = grid.centres()
     thickness = float(max(middle if flat else high, 0.002))
@@ -413,11 +422,12 @@ def _hull(points: NDArray[np.float64]) -> Mesh | None:
 
 @dataclass(frozen=True)
 class _Body:
-    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not."""
+    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not, or through and through (a band)."""
 
     axis: NDArray[np.float64]
     profile: NDArray[np.float64]
     open: bool
+    through: bool = False
 
     def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.interp(z, self.profile[:, 1], self.profile[:, 0])
@@ -470,6 +480,10 @@ def _round_body(points: NDArray[np.float64], height: float, noise: float, seed: 
         radius = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6))
         residual = np.linalg.norm(sample[:, :2] - axis, axis=1) - radius
         near = np.abs(residual) < width
+    seen = sample[:, :2] - axis
+    widest = max(float(np.ptp(seen @ np.array([np.cos(t), np.sin(t)]))) for t in np.linspace(0, np.pi, 12, endpoint=False))
+    if 2 * float(np.median(radius)) > 1.12 * widest:
+        return None  # a broad face bent a little, not a round body
     share = float(near.mean())
     angles = np.arctan2(*(sample[near, :2] - axis).T[::-1])
     coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
@@ -496,6 +510,11 @@ def _standing_round(sights: list[Sight], points: NDArray[np.float64], height: fl
     body = _round_body(points, height, noise, parameters.seed)
     if body is None:
         return None
+    if height > body.profile[-1, 1] + 0.012:
+        return None
+    spot = np.array([[[*(body.axis + 0.3 * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.002] for t in np.linspace(0, 6, 9)]])
+    if _carve(sights, [spot]).mean() < 0.3:
+        body = _Body(body.axis, body.profile, True, True)  # the table shows in the middle
     top = body.profile[-1, 1]
     away = points[:, :2] - body.axis
     rho = np.linalg.norm(away, axis=1)
@@ -541,11 +560,16 @@ def _turned(body: _Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mes
             hull = _hull(primitives.revolve(simple, body.axis, 32).vertices)
             pieces = [hull] if hull is not None else pieces
         return mesh, pieces
-    floor = min(0.006, 0.2 * profile[-1, 1])
+    floor = 0.0 if body.through else min(0.006, 0.2 * profile[-1, 1])
     inner = np.column_stack([profile[:, 0] - wall, profile[:, 1]])
-    inner = np.vstack([[np.interp(floor, inner[:, 1], inner[:, 0]), floor], inner[inner[:, 1] > floor + 0.001]])
-    mesh = primitives.revolve(np.vstack([profile, inner[::-1]]), body.axis)
-    pieces = [primitives.revolve(np.array([[np.interp(0, simple[:, 1], simple[:, 0]), 0], [np.interp(floor, simple[:, 1], simple[:, 0]), floor]]), body.axis, 24)]
+    pieces: list[Mesh] = []
+    if body.through:
+        mesh = primitives.turn_ring(np.vstack([profile, inner[::-1]]), body.axis)
+    else:
+        inner = np.vstack([[np.interp(floor, inner[:, 1], inner[:, 0]), floor], inner[inner[:, 1] > floor + 0.001]])
+        mesh = primitives.revolve(np.vstack([profile, inner[::-1]]), body.axis)
+        ends = np.array([[np.interp(z, simple[:, 1], simple[:, 0]), z] for z in (0.0, floor)])
+        pieces.append(primitives.revolve(ends, body.axis, 24))
     levels = simple[:, 1].copy()
     levels[0] = floor
     levels = levels[(levels >= floor)]
@@ -596,8 +620,9 @@ def _handle(sights: list[Sight], out: NDArray[np.float64], body: _Body, paramete
     splat[row[good], column[good]] = 1
     near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
     if useful:
-        columns = [plane + n * e_n for n in np.linspace(-thickness / 2, thickness / 2, 3)]
-        field = _carve(useful, columns, see_through=max(0.02, 1.5 * thickness))
+        # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
+        columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
+        field = _carve(useful, columns, max(0.02, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
     else:
         field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
     within = grid_s < body.radius(grid_z)

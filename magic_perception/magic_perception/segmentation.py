@@ -140,6 +140,12 @@ def _frame_on(plane: Plane, world_from_table: NDArray[np.float64]) -> NDArray[np
     return transforms.make(turn[:3, :3] @ world_from_table[:3, :3], origin)
 
 
+def open_by_two(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Morphological opening by 2 x 2 pixels; with OpenCV's own even kernels the mask would move by a pixel."""
+    kernel = np.ones((2, 2), np.uint8)
+    return cv2.dilate(cv2.erode(mask.astype(np.uint8), kernel, anchor=(0, 0)), kernel, anchor=(1, 1)) > 0
+
+
 def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
     """How far each pixel's colour is from the table's around it, in squared standard deviations, and the threshold of notice.
 
@@ -195,16 +201,66 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     touched[np.unique(labels[core])] = True
     touched[0] = False
     result = touched[labels]
-    # Depth is fattened at edges: a border pixel of the table's colour is table, where the thing itself stands out in colour.
-    like = distance < 0.5 * threshold
-    inner = cv2.erode(core.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
+    result = _fill_bowls(result, looked, other, parameters)
+    result = _two_colors(result, looked, table)
+    return open_by_two(result)
+
+
+def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_], parameters: Parameters) -> NDArray[np.bool_]:
+    """Fill holes of a mask that are not the table: of another colour, or a little higher (the floor of a spoon's bowl is a few mm up)."""
+    outside = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
+    cv2.floodFill(outside, None, (0, 0), 2)
+    holes = (outside[1:-1, 1:-1] == 1).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
+    result = mask.copy()
+    for i in range(1, count):
+        x, y, w, h, area = stats[i]
+        window = (slice(y, y + h), slice(x, x + w))
+        part = labels[window] == i
+        heights = looked.raw[window][part]
+        heights = heights[np.isfinite(heights)]
+        if area < 12 or other[window][part].mean() > 0.7:
+            result[window] |= part
+        elif len(heights) > 15:
+            # Standard error of the middle of a hole, for noise that is correlated over some 5 pixels.
+            error = float(np.median(looked.sigma[window][part])) * 3.0 / np.sqrt(len(heights) / 5)
+            if np.median(heights) > max(0.0012, 3 * error):
+                result[window] |= part
+    return result
+
+
+def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], reach: int = 3) -> NDArray[np.bool_]:
+    """Move a mask's edge to where the colour is half way between the thing's and the table's next to it.
+
+    Depth fattens edges by some pixels and a threshold on colour by one; pixels within ``reach`` of the edge are judged
+    anew by the share of the thing's colour in theirs, wherever the two colours differ enough to tell.
+    """
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    small = mask.astype(np.uint8)
+    band = (cv2.dilate(small, kernel) > 0) & ~(cv2.erode(small, kernel) > 0) & looked.inside
+    if not band.any():
+        return mask
+    lab = cv2.cvtColor(looked.frame.color, cv2.COLOR_RGB2LAB).astype(np.float32)
+    inner = (cv2.erode(small, np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
+    # A thread of two pixels has no inside: its own pixels stand for it.
+    thin = mask & (cv2.dilate(inner, np.ones((7, 7), np.uint8)) == 0)
+    inner[thin] = 1.0
+    own, share = masked_mean(lab, inner, 13)
+    ground, ground_share = masked_mean(lab, (table & ~(cv2.dilate(small, np.ones((5, 5), np.uint8)) > 0)).astype(np.float32), 31)
+    difference = own - ground
+    length = np.sum(difference**2, axis=-1)
+    part = np.sum((lab - ground) * difference, axis=-1) / np.maximum(length, 1.0)
+    told = band & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
+    # Grow only into what depth does not contradict, and by what touches the mask.
+    h = looked.heights
+    with np.errstate(invalid="ignore"):
+        possible = ~np.isfinite(h) | (h > -0.006)
+    result = np.where(told, (part > 0.5) & (mask | possible), mask)
     count, labels = cv2.connectedComponents(result.astype(np.uint8), connectivity=8)
-    seen = np.bincount(labels[inner], minlength=count)
-    unlike = np.bincount(labels[inner & other], minlength=count)
-    separable = (seen > 30) & (unlike > 0.9 * seen)
-    edge = result & ~cv2.erode(result.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11))).astype(bool)
-    result &= ~(edge & like & separable[labels])
-    return cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)).astype(bool)
+    touched = np.zeros(count, bool)
+    touched[np.unique(labels[mask & result])] = True
+    touched[0] = False
+    return touched[labels]
 
 
 def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...], margin: float) -> NDArray[np.bool_]:
