@@ -1,0 +1,182 @@
+"""The node answers every goal with a code, runs one simulation at a time and stops when told to."""
+
+import os
+import threading
+import time
+
+os.environ["ROS_DOMAIN_ID"] = "76"
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+import numpy as np
+import pytest
+import scenes
+
+rclpy = pytest.importorskip("rclpy")
+
+from dataclasses import replace
+
+from magic_interfaces.action import VerifyMotion
+from magic_interfaces.msg import SceneObject as SceneObjectMsg
+from rclpy.action import ActionClient
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
+
+from magic_core import conversions as convert
+from magic_core import strategy as strategies
+from magic_core.errors import Code
+from magic_core.mesh import Mesh
+from magic_core.scene import CanonicalView
+from magic_verifier.node import VerifierNode
+
+
+def _save(folder, name, goal):
+    strategy, *_ = scenes.hooking("L")
+    tetrahedron = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    view = CanonicalView(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), 0.01, np.eye(4))
+    strategies.save(replace(strategy, name=name, tool_mesh=tetrahedron, target_mesh=tetrahedron, tool_view=view, target_view=view, goal=goal), folder / name)
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory):
+    """A verifier, an action client and the executor that spins both."""
+    folder = tmp_path_factory.mktemp("strategies")
+    _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
+    _save(folder, "juggling", strategies.Goal("juggle"))
+    rclpy.init()
+    node = VerifierNode(parameter_overrides=[Parameter("strategies", value=str(folder))])
+    peer = rclpy.create_node("peer")
+    client = ActionClient(peer, VerifyMotion, "verify_motion")
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(node)
+    executor.add_node(peer)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    assert client.wait_for_server(timeout_sec=20)
+    yield client
+    executor.shutdown(timeout_sec=5)
+    thread.join(timeout=5)
+    client.destroy()
+    node.destroy_node()
+    peer.destroy_node()
+    rclpy.try_shutdown()
+
+
+def goal_message(name="hooking", kind="L", **fields):
+    _, tool, target, plan = scenes.hooking(kind)
+    head = convert.header("panda_link0")
+    goal = VerifyMotion.Goal(
+        strategy=name,
+        tool=convert.object_to_msg(tool, head),
+        target=convert.object_to_msg(target, head),
+        table=convert.plane_to_msg(scenes.TABLE),
+        plan=convert.plan_to_msg(plan, tool.id),
+    )
+    for key, value in fields.items():
+        setattr(goal, key, value)
+    return goal
+
+
+def wait(future, seconds=30.0):
+    done = threading.Event()
+    future.add_done_callback(lambda _f: done.set())
+    assert done.wait(seconds), f"no answer within {seconds} s"
+    return future.result()
+
+
+def ask(client, goal, feedback=None):
+    handle = wait(client.send_goal_async(goal, feedback_callback=feedback))
+    assert handle.accepted
+    return wait(handle.get_result_async()).result
+
+
+def test_a_good_motion_passes_with_metrics_film_and_feedback(graph):
+    heard = []
+    result = ask(graph, goal_message(want_film=True), lambda message: heard.append(message.feedback.phase))
+    assert result.code == Code.OK, result.message
+    assert result.success
+    metrics = dict(zip(result.metric_names, result.metric_values, strict=True))
+    assert metrics["pulled_distance"] == pytest.approx(0.28, abs=0.01)
+    film = convert.color_from_msg(result.film)
+    assert film.shape[0] > 200
+    assert film.std() > 5
+    assert "goal" in heard
+    assert 0 < result.seconds < 20
+
+
+def test_a_bad_motion_fails_with_its_reason(graph):
+    result = ask(graph, goal_message(kind="bar"))
+    assert not result.success
+    assert result.code in (Code.LOST_CONTACT, Code.DRIFT)
+    assert "mm" in result.message
+
+
+def _without_pieces(goal):
+    goal.tool.pieces = []
+
+
+def _with_nan(goal):
+    goal.tool.mesh.vertices[0].x = float("nan")
+
+
+def _with_bad_pose(goal):
+    goal.target.pose.orientation.w = 7.0
+
+
+def _without_points(goal):
+    goal.plan.tool_trajectory.points = []
+
+
+def _with_unknown_variant(goal):
+    goal.plan.variant = "leg"
+
+
+def _with_empty_object(goal):
+    goal.target = SceneObjectMsg()
+
+
+def _with_equal_ids(goal):
+    goal.target.id = goal.tool.id
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (_without_pieces, Code.BAD_SCENE),
+        (_with_nan, Code.BAD_MESH),
+        (_with_bad_pose, Code.BAD_REQUEST),
+        (_without_points, Code.BAD_MOTION),
+        (_with_unknown_variant, Code.UNKNOWN_VARIANT),
+        (_with_empty_object, Code.BAD_ENCODING),
+        (_with_equal_ids, Code.BAD_REQUEST),
+        (lambda goal: setattr(goal, "strategy", "dancing"), Code.UNKNOWN_STRATEGY),
+        (lambda goal: setattr(goal, "strategy", "juggling"), Code.UNKNOWN_GOAL),
+        (lambda goal: setattr(goal, "repetitions", 10**6), Code.BAD_REQUEST),
+        (lambda goal: setattr(goal, "timeout", -1.0), Code.BAD_REQUEST),
+    ],
+)
+def test_every_bad_request_has_a_code_and_a_message(graph, change, code):
+    goal = goal_message()
+    change(goal)
+    result = ask(graph, goal)
+    assert result.code == code, result.message
+    assert result.message
+    assert not result.success
+
+
+def test_a_timeout_is_kept(graph):
+    started = time.monotonic()
+    result = ask(graph, goal_message(repetitions=1000, timeout=0.5))
+    assert result.code == Code.SIMULATION_TIMEOUT
+    assert time.monotonic() - started < 5
+
+
+def test_a_second_goal_is_refused_and_a_cancel_ends_the_first(graph):
+    running = threading.Event()
+    first = wait(graph.send_goal_async(goal_message(repetitions=1000, timeout=60.0), feedback_callback=lambda _m: running.set()))
+    assert running.wait(20)
+    second = ask(graph, goal_message())
+    assert second.code == Code.BUSY
+    wait(first.cancel_goal_async())
+    result = wait(first.get_result_async(), 10).result
+    assert result.code == Code.CANCELED
+    assert ask(graph, goal_message()).code == Code.OK
