@@ -10,6 +10,7 @@ from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -38,7 +39,7 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except MagicError as error:
+    except (MagicError, ParameterException) as error:
         print(f"{getattr(node_type, '__name__', 'node')} cannot start: {error}", file=sys.stderr)
         status = 1
     finally:
