@@ -295,7 +295,7 @@ def _lying(sights: list[Sight], points: NDArray[np.float64], height: float, nois
         for sight in sights:
             wide = Sight(sight.intrinsics, sight.table_from_camera, cv2.dilate(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, sight.hidden, sight.depth, sight.heights, sight.sigma)
             seen &= wide.sample(columns[0])[0] > 0.3
-        field = polygons.smooth_field(occupied & seen)
+        field = polygons.smooth_field(occupied & seen, 1.8)
     parts = [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > 4e-5]
     if not parts:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
@@ -364,10 +364,10 @@ def _relief(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArra
     return Mesh(vertices, np.concatenate([faces[:, ::-1], faces + n, *polygons._walls(faces, n)]))
 
 
-def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.0015, least: float = 0.006) -> list[Mesh]:
+def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.008) -> list[Mesh]:
     """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide."""
     pieces = []
-    queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.0007), 0.0005)]
+    queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.001), 0.001)]
     while queue:
         cell, depth = queue.pop()
         box = np.array(cell.bounds)
@@ -512,9 +512,11 @@ def _standing_round(sights: list[Sight], points: NDArray[np.float64], height: fl
         return None
     if height > body.profile[-1, 1] + 0.012:
         return None
-    spot = np.array([[[*(body.axis + 0.3 * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.002] for t in np.linspace(0, 6, 9)]])
-    if _carve(sights, [spot]).mean() < 0.3:
-        body = _Body(body.axis, body.profile, True, True)  # the table shows in the middle
+    # Of a band some part of the table inside shows to some camera.
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    spots = np.array([[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)])
+    if max(float(np.mean(_carve([sight], [spots]) < 0.3)) for sight in sights) > 0.12:
+        body = _Body(body.axis, body.profile, True, True)
     top = body.profile[-1, 1]
     away = points[:, :2] - body.axis
     rho = np.linalg.norm(away, axis=1)

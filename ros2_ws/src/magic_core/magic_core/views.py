@@ -15,8 +15,8 @@ from magic_core.rendering import GREY, VIEW_FILL, VIEW_SIZE, Raycaster, canonica
 from magic_core.scene import VIEW_KINDS, CanonicalView
 
 #: Horizontal directions tried for the side view, over half a turn, and the pixels of their silhouettes.
-_DIRECTIONS = 36
-_PROBE = 112
+_DIRECTIONS = 24
+_PROBE = 80
 
 
 def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None = None, size: int = VIEW_SIZE) -> CanonicalView:
@@ -46,7 +46,7 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
     if mesh.extents[2] < 0.3 * width:  # it lies on the table
         return _top(mesh, size, float(np.clip(1.0 - mesh.extents[2] / max(width, 1e-9), 0.5, 1.0)))
     direction, told, confidence = _best_side(mesh)
-    from_above = _tells(_silhouette(Raycaster([mesh]), mesh, np.array([0, 0, -1.0]), np.array([0, 1.0, 0]))[0])
+    from_above = _tells(_silhouettes(Raycaster([mesh]), mesh, np.array([[0, 0, -1.0]]), np.array([0, 1.0, 0]))[0][0])
     if told > 1.2 * from_above and told > 0.03:
         return canonical_view(mesh, direction, (0, 0, 1), "side", size, confidence=confidence)
     return _top(mesh, size, float(np.clip(0.5 + from_above - told, 0.1, 1.0)))
@@ -56,16 +56,21 @@ def _top(mesh: Mesh, size: int, confidence: float) -> CanonicalView:
     return canonical_view(mesh, (0, 0, -1), (0, 1, 0), "top", size, confidence=confidence)
 
 
-def _silhouette(caster: Raycaster, mesh: Mesh, direction: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float]:
-    """The mask (P, P) of a mesh seen along a direction, and its metres per pixel."""
-    y = transforms.unit(-(up - (up @ direction) * direction))
-    rotation = np.column_stack([np.cross(y, direction), y, direction])
-    local = mesh.vertices @ rotation
-    low, high = local.min(axis=0), local.max(axis=0)
-    scale = max(float((high - low)[:2].max()), 1e-6) / (0.9 * _PROBE)
-    view = transforms.make(rotation, rotation @ ((low + high) / 2))
-    _, depth = caster.orthographic(view, (_PROBE, _PROBE), scale, float(high[2] - low[2]) / 2 + 0.01)
-    return np.isfinite(depth), scale
+def _silhouettes(caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """The masks (D, P, P) of a mesh seen along directions (D, 3), and their metres per pixel (D,)."""
+    grid = np.stack(np.meshgrid(np.arange(_PROBE), np.arange(_PROBE)), axis=-1) - (_PROBE - 1) / 2
+    origins, scales = [], []
+    for direction in directions:
+        y = transforms.unit(-(up - (up @ direction) * direction))
+        rotation = np.column_stack([np.cross(y, direction), y, direction])
+        local = mesh.vertices @ rotation
+        low, high = local.min(axis=0), local.max(axis=0)
+        scale = max(float((high - low)[:2].max()), 1e-6) / (0.9 * _PROBE)
+        middle = (low + high) / 2
+        middle[2] = low[2] - 0.01
+        origins.append((np.concatenate([grid * scale, np.zeros((_PROBE, _PROBE, 1))], axis=-1) + middle) @ rotation.T)
+        scales.append(scale)
+    return caster.hits(np.stack(origins), directions[:, None, None, :]), np.array(scales)
 
 
 def holes_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -92,17 +97,14 @@ def _best_side(mesh: Mesh) -> tuple[NDArray[np.float64], float, float]:
     caster = Raycaster([mesh])
     up = np.array([0.0, 0.0, 1.0])
     angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
-    told, widths = [], []
-    for angle in angles:
-        mask, scale = _silhouette(caster, mesh, np.array([np.cos(angle), np.sin(angle), 0.0]), up)
-        told.append(_tells(mask))
-        widths.append(mask.any(axis=0).sum() * scale)
-    told, widths = np.array(told), np.array(widths)
+    directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+    masks, scales = _silhouettes(caster, mesh, directions, up)
+    told = np.array([_tells(mask) for mask in masks])
+    widths = masks.any(axis=1).sum(axis=1) * scales
     # Width decides between directions that tell the same: smoothing makes the middle of a good range win.
     smooth = np.convolve(np.concatenate([told[-2:], told, told[:2]]), [0.1, 0.2, 0.4, 0.2, 0.1], mode="valid")
     best = int(np.argmax(smooth + 0.05 * widths / widths.max()))
-    direction = np.array([np.cos(angles[best]), np.sin(angles[best]), 0.0])
-    mask, _ = _silhouette(caster, mesh, direction, up)
+    direction, mask = directions[best], masks[best]
     # What sticks out is thinner than the body: it lies on the side that is farther from the centroid.
     columns = np.nonzero(mask.any(axis=0))[0]
     centroid = np.nonzero(mask)[1].mean()
