@@ -28,21 +28,26 @@ ARM = "arm"
 FINGERS = "fingers"
 #: The fixed foot of the arm, which may well stand on the table.
 BASE = "base"
+#: Tracking, torque, contacts and grasp are looked at every so many steps.
+WATCH_EVERY = 6
 
 
 @dataclass(frozen=True)
 class ArmOptions:
     """Controller and gripper.
 
-    stiffness Nm/rad and damping Nms/rad of the arm's joint drives; grip_force N of each
+    stiffness Nm/rad and damping Nms/rad of the arm's joint drives, one for each joint (the
+    defaults are those of Franka's joint impedance controller, near critical damping);
+    armature kg m^2 is what the geared motors add to each joint's inertia; grip_force N of each
     finger; finger_stiffness N/m couples the two fingers, which a belt does in the real
     hand; closing_speed m/s of each free finger;
     opening m between the open fingers; quiet s for which the fingers must stand still
     before the arm goes on, closing_time s after which it goes on anyway.
     """
 
-    stiffness: float = 4000.0
-    damping: float = 120.0
+    stiffness: tuple[float, ...] = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
+    damping: tuple[float, ...] = (120.0, 120.0, 100.0, 100.0, 60.0, 40.0, 30.0)
+    armature: float = 0.1
     grip_force: float = 60.0
     finger_stiffness: float = 1e4
     closing_speed: float = 0.1
@@ -50,6 +55,13 @@ class ArmOptions:
     opening: float = 0.08
     quiet: float = 0.1
     closing_time: float = 1.5
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping"):
+            values = tuple(float(v) for v in getattr(self, name))
+            if len(values) != len(ARM_JOINTS) or not all(np.isfinite(v) and v > 0 for v in values):
+                raise MagicError(Code.BAD_REQUEST, f"arm {name}", values, f"{len(ARM_JOINTS)} numbers above 0")
+            object.__setattr__(self, name, values)
 
 
 class ArmRun:
@@ -133,8 +145,11 @@ class ArmRun:
         self._arm_joints = [robot.find_joint_by_name(name) for name in ARM_JOINTS]
         self._finger_joints = [robot.find_joint_by_name(name) for name in FINGER_JOINTS]
         self._effort = np.array([self._panda.joints[name].effort for name in ARM_JOINTS])
-        for joint, effort in zip(self._arm_joints, self._effort, strict=True):
-            joint.set_drive_properties(options.stiffness, options.damping, force_limit=float(effort), mode="force")
+        for joint, effort, stiffness, damping in zip(self._arm_joints, self._effort, options.stiffness, options.damping, strict=True):
+            joint.set_drive_properties(stiffness, damping, force_limit=float(effort), mode="force")
+            joint.set_armature(np.array([options.armature], dtype=np.float32))
+        # Rows of the links that the arm's joints move, in the order in which the engine reports joint forces.
+        self._driven = [[link.name for link in robot.links].index(self._panda.joints[name].child) for name in ARM_JOINTS]
         for joint in self._finger_joints:
             joint.set_drive_properties(options.finger_stiffness, options.grip_force / options.closing_speed, force_limit=200.0, mode="force")
             joint.set_armature(np.array([0.1], dtype=np.float32))
@@ -186,8 +201,8 @@ class ArmRun:
         self.world.step()
         if not waiting:
             self._index += 1
-        if self.world.steps % 4 == 0:
-            self._watch(command, speed, np.asarray(passive, dtype=float).ravel()[:7])
+        if self.world.steps % WATCH_EVERY == 0:
+            self._watch(command)
 
     def _gripper(self) -> bool:
         """Open and close on time; whether the arm has to wait for the fingers."""
@@ -212,7 +227,7 @@ class ArmRun:
             # Both fingers are drawn to their mean less the way that gives the grip force: what moves them
             # together is resisted by that force alone, what moves one against the other by the stiffness.
             q = np.asarray(self._robot.qpos).ravel()[7:]
-            self._finger_target = float(q.mean()) - self.options.grip_force / self.options.finger_stiffness
+            self._finger_target = 0.5 * float(q[0] + q[1]) - self.options.grip_force / self.options.finger_stiffness
         for joint in self._finger_joints:
             joint.set_drive_target(self._finger_target)
 
@@ -222,7 +237,7 @@ class ArmRun:
         self._reference = self._tool_from_tcp()
         planned = np.asarray(self._motion.tool_from_tcp, dtype=float)
         self._metrics["grasp_shift"] = float(np.linalg.norm((transforms.inverse(planned) @ self._reference)[:3, 3]))
-        if not self.world.touches(TOOL, FINGERS, 0.001):
+        if not self.world.touching(TOOL, FINGERS, 0.001):
             raise MagicError(
                 Code.GRASP_SLIPPED,
                 f"the gripper closed on nothing at {self.time:.2f} s",
@@ -233,7 +248,7 @@ class ArmRun:
     def _tool_from_tcp(self) -> NDArray[np.float64]:
         return transforms.inverse(self.world.pose(TOOL)) @ from_pose(self._tcp.entity_pose)
 
-    def _watch(self, command: NDArray[np.float64], speed: NDArray[np.float64], passive: NDArray[np.float64]) -> None:
+    def _watch(self, command: NDArray[np.float64]) -> None:
         q = np.asarray(self._robot.qpos, dtype=float).ravel()[:7]
         qd = np.asarray(self._robot.qvel, dtype=float).ravel()[:7]
         if not (np.all(np.isfinite(q)) and np.all(np.isfinite(qd))):
@@ -248,10 +263,11 @@ class ArmRun:
                 f"{error[worst]:.3f} rad",
                 f"up to {self.limits.tracking:g} rad",
             )
-        # The torque that the drives ask for, averaged over about 0.1 s: a real joint stops when it is exceeded for longer.
-        share = 4 * self.world.timestep / 0.1
-        asked = self.options.stiffness * (command - q) + self.options.damping * (speed - qd) + passive
-        self._torque += min(share, 1.0) * (asked - self._torque)
+        # What each joint transmits about its axis (x of SAPIEN's joint frames), averaged over about 0.1 s: a real arm
+        # stops when the limit is exceeded for longer.
+        share = WATCH_EVERY * self.world.timestep / 0.1
+        transmitted = np.asarray(self._robot.get_link_incoming_joint_forces(), dtype=float)[self._driven, 3]
+        self._torque += min(share, 1.0) * (transmitted - self._torque)
         ratio = np.abs(self._torque) / self._effort
         worst = int(ratio.argmax())
         self._metrics["torque_ratio"] = max(self._metrics["torque_ratio"], float(ratio[worst]))
@@ -270,7 +286,7 @@ class ArmRun:
         for other in (TARGET, *(o.id for o in self.setup.obstacles), TABLE):
             parts = (ARM,) if other == TABLE else (ARM, FINGERS)
             for part in parts:
-                if self.world.touches(part, other, -self.limits.overlap):
+                if self.world.touching(part, other, -self.limits.overlap):
                     raise MagicError(
                         Code.PRE_CONTACT_COLLISION if early else Code.LIMIT_EXCEEDED,
                         f"the {'hand' if part == FINGERS else part} hit the {other} at {self.time:.2f} s ({self.phase})",
@@ -281,7 +297,7 @@ class ArmRun:
             return
         drift = transforms.inverse(self._reference) @ self._tool_from_tcp()
         slip = float(np.linalg.norm(drift[:3, 3]))
-        turn = transforms.rotation_angle(np.eye(4), drift)
+        turn = float(np.arccos(np.clip((np.trace(drift[:3, :3]) - 1) / 2, -1, 1)))
         self._metrics["grasp_slip"] = max(self._metrics["grasp_slip"], slip)
         self._metrics["grasp_turn"] = max(self._metrics["grasp_turn"], turn)
         if slip > self.limits.slip or turn > self.limits.slip_angle:

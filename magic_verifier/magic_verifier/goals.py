@@ -34,6 +34,8 @@ from magic_verifier.floating import TARGET, TOOL, phase_end, phase_start
 
 #: Contact is sought this far apart (m): bodies that press on each other rest at up to the solver's slop.
 TOUCH = 0.001
+#: Contact is looked for every so many steps.
+OBSERVE_EVERY = 6
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ class Hook(GoalTest):
             run.world.set_velocity(TARGET, run.world.velocity(TARGET) + self.rng.normal(0, self._kick) * self.sideways)
 
     def observe(self, run: Any) -> None:
-        if run.world.steps % 4 == 0 and self.goal_start <= run.time <= self.end:
-            self._touching.append((run.time, bool(run.world.touches(TOOL, TARGET, TOUCH))))
+        if run.world.steps % OBSERVE_EVERY == 0 and self.goal_start <= run.time <= self.end:
+            self._touching.append((run.time, run.world.touching(TOOL, TARGET, TOUCH)))
         if self._final is None and run.time >= self.end:
             moved = _middle(run, TARGET) - self.origin
             self._final = (float(moved @ self.pull), float(moved @ self.sideways), float(np.linalg.norm(run.world.velocity(TARGET))))
@@ -162,7 +164,7 @@ class Hang(GoalTest):
     def judge(self, run: Any) -> Judgement:
         height = _height(run, TOOL)
         speed = float(np.linalg.norm(run.world.velocity(TOOL)))
-        touching = bool(run.world.touches(TOOL, TARGET, TOUCH))
+        touching = run.world.touching(TOOL, TARGET, TOUCH)
         metrics = {"tool_height": height, "final_speed": speed, "touching": float(touching)}
         needed, fastest = self.values["height"], self.values["max_speed"]
         state = f"{height * 1000:.0f} mm above the table, moving at {speed:.2f} m/s, {'touching' if touching else 'not touching'} the target"
@@ -188,16 +190,16 @@ class Scoop(GoalTest):
         self._touching: list[bool] = []
 
     def observe(self, run: Any) -> None:
-        if run.world.steps % 4 == 0:
+        if run.world.steps % OBSERVE_EVERY == 0:
             self._highest = max(self._highest, _height(run, TARGET))
-            self._touching.append(bool(run.world.touches(TOOL, TARGET, TOUCH)))
+            self._touching.append(run.world.touching(TOOL, TARGET, TOUCH))
 
     def judge(self, run: Any) -> Judgement:
         height = _height(run, TARGET)
         speed = float(np.linalg.norm(run.world.velocity(TARGET)))
         tool_speed = float(np.linalg.norm(run.world.velocity(TOOL)))
         # The ball rocks a little in the bowl: touched within the last tenth of a second counts.
-        recent = self._touching[-max(1, int(0.1 * run.setup.settings.frequency / 4)) :]
+        recent = self._touching[-max(1, int(0.1 * run.setup.settings.frequency / OBSERVE_EVERY)) :]
         touching = any(recent)
         metrics = {
             "target_height": height,

@@ -59,8 +59,8 @@ class VerifierNode(Node):
             required_rate=parameter(self, "required_rate", 0.5, "Share of perturbed runs that must pass.", low=0.0, high=1.0),
         )
         self._arm = ArmOptions(
-            stiffness=parameter(self, "arm.stiffness", 4000.0, "Joint drive stiffness in Nm/rad.", low=1.0, high=1e6),
-            damping=parameter(self, "arm.damping", 120.0, "Joint drive damping in Nms/rad.", low=0.0, high=1e5),
+            stiffness=tuple(parameter(self, "arm.stiffness", list(ArmOptions.stiffness), "Stiffness of the seven joint drives in Nm/rad.")),
+            damping=tuple(parameter(self, "arm.damping", list(ArmOptions.damping), "Damping of the seven joint drives in Nms/rad.")),
             grip_force=parameter(self, "arm.grip_force", 60.0, "Force in N with which each finger closes.", low=1.0, high=140.0),
             finger_friction=parameter(self, "arm.finger_friction", 1.5, "Friction coefficient of the finger pads.", low=0.0, high=10.0),
         )

@@ -195,6 +195,8 @@ class World:
         self.steps = 0
         self._materials: dict[float, Any] = {}
         self._bodies: dict[str, Any] = {}
+        self._sorted: dict[tuple[str, str], list[Any]] = {}
+        self._sorted_at = -1
         self._names: dict[int, str] = {}  # by the component's address: contacts name their bodies by component
 
     @property
@@ -341,25 +343,36 @@ class World:
     def touches(self, first: str, second: str, within: float = 0.0) -> list[Touch]:
         """Contact points of the last step between two bodies whose separation is at most ``within`` metres."""
         result = []
-        for contact in self.scene.get_contacts():
-            names = [self._names.get(body._physx_pointer) for body in contact.bodies]
-            if names == [first, second]:
-                sign = 1.0
-            elif names == [second, first]:
-                sign = -1.0
-            else:
-                continue
-            for point in contact.points:
-                if point.separation <= within:
-                    result.append(
-                        Touch(
-                            np.asarray(point.position, dtype=float),
-                            sign * np.asarray(point.normal, dtype=float),
-                            float(point.separation),
-                            sign * np.asarray(point.impulse, dtype=float),
+        for sign, pair in ((1.0, (first, second)), (-1.0, (second, first))):
+            for contact in self._contacts().get(pair, ()):
+                for point in contact.points:
+                    if point.separation <= within:
+                        result.append(
+                            Touch(
+                                np.asarray(point.position, dtype=float),
+                                sign * np.asarray(point.normal, dtype=float),
+                                float(point.separation),
+                                sign * np.asarray(point.impulse, dtype=float),
+                            )
                         )
-                    )
         return result
+
+    def touching(self, first: str, second: str, within: float = 0.0) -> bool:
+        """Whether two bodies were within ``within`` metres of each other in the last step."""
+        pairs = ((first, second), (second, first))
+        return any(p.separation <= within for pair in pairs for contact in self._contacts().get(pair, ()) for p in contact.points)
+
+    def _contacts(self) -> dict[tuple[str, str], list[Any]]:
+        """The last step's contacts by the names of their bodies, sorted once a step."""
+        if self._sorted_at != self.steps:
+            self._sorted_at = self.steps
+            self._sorted = {}
+            names = self._names
+            for contact in self.scene.get_contacts():
+                a, b = contact.bodies
+                pair = (names.get(a._physx_pointer, ""), names.get(b._physx_pointer, ""))
+                self._sorted.setdefault(pair, []).append(contact)
+        return self._sorted
 
 
 class Probe:

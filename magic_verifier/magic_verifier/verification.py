@@ -161,7 +161,7 @@ def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
     """
     for name in watched:
         within = 0.0 if name == TARGET else -limits.overlap
-        if not run.world.touches(TOOL, name, within):
+        if not run.world.touching(TOOL, name, within):
             continue
         moved = 0.0
         if name == TARGET:
@@ -221,7 +221,7 @@ def _run_once(
                 run.world.check(names)
                 if progress is not None and step % (CHECK_EVERY * 10) == 0:
                     progress(run.phase, run.time)
-            if step % 4 == 0 and run.time < run.contact_time:
+            if step % 6 == 0 and run.time < run.contact_time:
                 _refuse_early_touch(run, watched, limits)
         run.world.check(names)
         judgement = goal.judge(run)
