@@ -1,0 +1,318 @@
+"""Records the bags of this folder: three scenes and three demonstrations, ray-cast with a model of two D435 cameras.
+
+    python bags/record.py [--out DIR] [--seed N] [NAME ...]
+
+Source ``ros2_ws/env.sh`` first (the message packages are needed).  The same seed
+gives the same bag, byte for byte.  ``README.md`` beside this file says what is in them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from magic_bringup import make_strategies
+from magic_bringup.recording import Recording
+from magic_core import transforms
+from magic_core.camera import Intrinsics
+from magic_core.mesh import Mesh
+from magic_core.scene import SceneObject
+from magic_core.sensor import D435, capture, looking_at, scene_raycaster
+from magic_core.shapes import Shape, make
+from magic_core.shapes.fixtures import demonstrated_pose, fixtures, pose_data
+from magic_core.strategy import Strategy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Start of every bag, seconds since the epoch (2025-01-01 00:00:00 UTC).
+START = 1735689600.0
+#: Frames of a scene, and seconds between them; sampling of the joint states and poses, seconds.
+FRAMES, PERIOD = 3, 0.2
+JOINT_PERIOD, POSE_PERIOD = 0.05, 0.05
+#: The demonstrations are seen with less resolution (a mode of the D435) and more often.
+D435_SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
+DEMONSTRATION_FRAMES = 4
+
+#: Where the cameras stand: left and right in front of the robot, looking back and down at the table.
+CAMERAS = {
+    "left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]),
+    "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04]),
+}
+#: The hanging scene goes further up.
+HIGH_CAMERAS = {
+    "left": looking_at([0.98, 0.42, 0.74], [0.50, 0.0, 0.12]),
+    "right": looking_at([0.98, -0.42, 0.74], [0.50, 0.0, 0.12]),
+}
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One object of a scene and where it is; a known one is announced on /known_objects."""
+
+    name: str
+    shape: Shape
+    world_from_object: Array
+    known: bool = False
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its mesh in the world."""
+        return self.shape.mesh.transformed(self.world_from_object)
+
+    def truth(self) -> dict[str, object]:
+        """How it was made and where it is, for truth.yaml."""
+        return {
+            "name": self.name,
+            "family": self.shape.family,
+            "seed": self.shape.seed,
+            "parameters": dict(self.shape.parameters),
+            "known": self.known,
+            "world_from_object": pose_data(self.world_from_object),
+        }
+
+
+def lying(shape: Shape, x: float, y: float, yaw: float) -> Array:
+    """world_from_object of a shape on the table as its own frame stands."""
+    return transforms.from_rpy(0, 0, yaw, [x, y, -shape.mesh.bounds[0, 2]])
+
+
+def settled(shape: Shape, world_from_object: Array, seconds: float = 3.0) -> Array:
+    """Where an object comes to rest on the table, by physics."""
+    world = _World()
+    world.add("object", shape, world_from_object @ transforms.make(translation=[0, 0, 0.002]), "dynamic", 0.5)
+    for _ in range(int(seconds * _World.FREQUENCY)):
+        world.step()
+    return world.pose("object")
+
+
+class _World:
+    """The little physics that recording needs: a table, fixed, moved and free bodies (SAPIEN, CPU)."""
+
+    FREQUENCY = 240
+
+    def __init__(self) -> None:
+        import sapien
+
+        self._sapien = sapien
+        self._scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+        self._scene.set_timestep(1 / self.FREQUENCY)
+        self._scene.add_ground(0.0, render=False)
+        self._bodies: dict[str, object] = {}
+
+    def _to_pose(self, pose: Array) -> object:
+        return self._sapien.Pose(pose[:3, 3], transforms.quaternion_wxyz(pose))
+
+    def add(self, name: str, shape: Shape, pose: Array, kind: str, friction: float, density: float = 600.0) -> None:
+        """A body of convex pieces; kind is dynamic, kinematic or static."""
+        physx = self._sapien.physx
+        component = physx.PhysxRigidStaticComponent() if kind == "static" else physx.PhysxRigidDynamicComponent()
+        material = physx.PhysxMaterial(friction, friction, 0.0)
+        for piece in shape.pieces:
+            part = physx.PhysxCollisionShapeConvexMesh(piece.vertices.astype(np.float32), np.ones(3), material)
+            part.density = density
+            part.contact_offset = 0.002
+            component.attach(part)
+        if kind == "kinematic":
+            component.kinematic = True
+        entity = self._sapien.Entity()
+        entity.add_component(component)
+        entity.pose = self._to_pose(pose)
+        self._scene.add_entity(entity)
+        self._bodies[name] = (entity, component)
+
+    def move(self, name: str, pose: Array) -> None:
+        """Where a kinematic body shall be after the next step."""
+        self._bodies[name][1].kinematic_target = self._to_pose(pose)
+
+    def let_go(self, name: str) -> None:
+        """From now on the body is free."""
+        self._bodies[name][1].kinematic = False
+
+    def step(self) -> None:
+        """One step of 1/240 s."""
+        self._scene.step()
+
+    def pose(self, name: str) -> Array:
+        """world_from_object (4, 4)."""
+        pose = self._bodies[name][0].pose
+        return transforms.from_quaternion_wxyz(np.asarray(pose.p, float), np.asarray(pose.q, float))
+
+
+# ---------------------------------------------------------------- scenes
+
+
+def hooking_scene(seed: int) -> list[Thing]:
+    """A caliper and a watch on the table, and a cylinder out in front; the watch is too narrow to be of use."""
+    caliper = make("caliper", seed + 4, beam=0.26, opening=0.105, jaw=0.07, width=0.022, thickness=0.018)
+    watch = make("watch", seed + 2, half_length=0.026, half_width=0.025)
+    cylinder = make("cylinder", seed + 9, radius=0.03)
+    return [
+        Thing("caliper", caliper, lying(caliper, 0.44, -0.22, 0.5)),
+        Thing("watch", watch, lying(watch, 0.42, 0.24, 2.4)),
+        Thing("cylinder", cylinder, lying(cylinder, 0.70, 0.0, 0.0)),
+    ]
+
+
+def hanging_scene(seed: int) -> list[Thing]:
+    """A mug on the table, its handle in sight, and the rod."""
+    mug = make("mug", seed + 3, profile="straight", handle="D", radius=0.039, height=0.095, handle_thickness=0.008, handle_breadth=0.013, handle_reach=0.034)
+    rod = make("rod", 0, **make_strategies.ROD)
+    return [Thing("mug", mug, lying(mug, 0.50, -0.30, np.deg2rad(70))), Thing("rod", rod, make_strategies.rod_pose(rod), known=True)]
+
+
+def scooping_scene(seed: int) -> list[Thing]:
+    """A ladle on its back, a ball and the quarter pipe."""
+    ladle = make("ladle", seed + 1, bowl_radius=0.05, aspect=1.0, depth=0.036, handle=0.22, angle=np.deg2rad(14), handle_thickness=0.012, handle_breadth=0.02)
+    radius = 0.035
+    ball = make("sphere", seed + 5, radius=radius)
+    ball_pose = transforms.make(translation=[make_strategies.BALL_X, 0.0, radius])
+    strategy = make_strategies.scooping()
+    arc = fixtures(strategy.environment, ball_pose[:3, 3] + radius * strategy.target_normal)[0]
+    arc_shape = make("quarter_pipe", 0, **make_strategies.ARC)
+    return [
+        Thing("ladle", ladle, settled(ladle, lying(ladle, 0.45, -0.25, np.deg2rad(12)))),
+        Thing("ball", ball, ball_pose),
+        Thing("arc", arc_shape, arc.world_from_object, known=True),
+    ]
+
+
+def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, Array]) -> None:
+    """A scene at rest: static transforms and known objects first, then frames and joint states in the order of time."""
+    caster = scene_raycaster([t.mesh for t in things])
+    frames = [
+        capture([], D435, pose, [seed, index, number], camera=name, stamp=START + 0.1 + index * PERIOD, raycaster=caster)
+        for index in range(FRAMES)
+        for number, (name, pose) in enumerate(cameras.items())
+    ]
+    with Recording(path) as bag:
+        bag.cameras(frames[: len(cameras)], START)
+        known = [t.shape.as_object(t.name, t.world_from_object) for t in things if t.known]
+        if known:
+            bag.known_objects(known, START)
+        events = [(f.stamp, bag.frame, (f,)) for f in frames]
+        events += [(t, bag.joints, (t,)) for t in START + np.arange(0, 0.1 + FRAMES * PERIOD, JOINT_PERIOD)]
+        for _, action, arguments in sorted(events, key=lambda e: e[0]):
+            action(*arguments)
+    _write_truth(path, seed, things)
+
+
+# ---------------------------------------------------------------- demonstrations
+
+
+def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array]) -> None:
+    """The tool in use: its pose and the target's over time, the target moved by physics, seen by both cameras on the way."""
+    made = {key: make(strategy.environment[key]["family"], strategy.environment[key]["seed"], **strategy.environment[key]["parameters"]) for key in ("tool", "target")}
+    tool, target = made["tool"], made["target"]
+    world_from_target = demonstrated_pose(strategy.environment)
+    obstacles = fixtures(strategy.environment, (world_from_target @ strategy.target_contact.object_from_contact)[:3, 3])
+    world_from_tool = world_from_target @ strategy.target_from_tool
+    times = strategy.times
+    settle = 2.0 if strategy.releases else 0.5
+
+    world = _World()
+    friction = strategy.physics.friction
+    world.add("tool", tool, world_from_tool[0], "kinematic", friction, strategy.physics.tool_density)
+    world.add("target", target, world_from_target, "static" if strategy.physics.target_is_fixed else "dynamic", friction, strategy.physics.target_density)
+    shapes: dict[str, Shape] = {}
+    for item in obstacles:
+        entry = next(e for e in strategy.environment["fixtures"] if e["id"] == item.id)
+        shapes[item.id] = make(entry["family"], entry["seed"], **entry["parameters"])
+        world.add(item.id, shapes[item.id], item.world_from_object, "static", friction)
+    duration = times[-1] + settle
+    at = np.arange(0, duration + 1e-9, 1 / _World.FREQUENCY)
+    commanded = transforms.interpolate(times, world_from_tool, at)
+    poses: list[tuple[float, Array, Array]] = [(0.0, world_from_tool[0], world_from_target)]
+    released = False
+    for k, t in enumerate(at[1:], start=1):
+        if strategy.releases and t > times[-1]:
+            if not released:
+                world.let_go("tool")
+                released = True
+        else:
+            world.move("tool", commanded[k])
+        world.step()
+        if k % round(POSE_PERIOD * _World.FREQUENCY) == 0:
+            poses.append((float(t), world.pose("tool"), world.pose("target")))
+
+    with Recording(path) as bag:
+        events: list[tuple[float, object, tuple]] = []
+        first = None
+        for index, k in enumerate(np.linspace(0, len(poses) - 1, DEMONSTRATION_FRAMES).round().astype(int)):
+            t, tool_pose, target_pose = poses[k]
+            meshes = [tool.mesh.transformed(tool_pose), target.mesh.transformed(target_pose), *(i.mesh.transformed(i.world_from_object) for i in obstacles)]
+            caster = scene_raycaster(meshes)
+            frames = [
+                capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=START + 0.1 + t, raycaster=caster)
+                for number, (name, pose) in enumerate(cameras.items())
+            ]
+            first = first or frames
+            events += [(f.stamp, bag.frame, (f,)) for f in frames]
+        for t, tool_pose, target_pose in poses:
+            stamp = START + 0.1 + t
+            events += [
+                (stamp, bag.pose, ("/demonstration/tool_pose", tool_pose, stamp)),
+                (stamp, bag.pose, ("/demonstration/target_pose", target_pose, stamp)),
+                (stamp, bag.joints, (stamp,)),
+            ]
+        bag.cameras(first, START)
+        known: list[SceneObject] = list(obstacles)
+        if strategy.physics.target_is_fixed:
+            known.append(target.as_object("rod", world_from_target))
+        if known:
+            bag.known_objects(known, START)
+        for _, action, arguments in sorted(events, key=lambda e: e[0]):
+            action(*arguments)
+    things = [Thing("tool", tool, poses[0][1]), Thing("target", target, world_from_target, strategy.physics.target_is_fixed)]
+    things += [Thing(item.id, shapes[item.id], item.world_from_object, True) for item in obstacles]
+    _write_truth(path, seed, things)
+
+
+def _write_truth(path: Path, seed: int, things: list[Thing]) -> None:
+    data = {"seed": seed, "objects": [t.truth() for t in things]}
+    (path / "truth.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+SCENES = {"hooking": (hooking_scene, CAMERAS), "hanging": (hanging_scene, HIGH_CAMERAS), "scooping": (scooping_scene, CAMERAS)}
+NAMES = (*SCENES, *(f"{name}_demonstration" for name in SCENES))
+
+
+def record(name: str, out: Path, seed: int = 0) -> Path:
+    """Record one bag of :data:`NAMES` into a folder of its name; an older one is replaced."""
+    path = out / name
+    if path.exists():
+        shutil.rmtree(path)
+    out.mkdir(parents=True, exist_ok=True)
+    if name in SCENES:
+        scene, cameras = SCENES[name]
+        record_scene(path, scene(seed), seed, cameras)
+    else:
+        task = name.removesuffix("_demonstration")
+        record_demonstration(path, make_strategies.STRATEGIES[task](), seed, SCENES[task][1])
+    return path
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Record bags."""
+    parser = argparse.ArgumentParser(description="Record the bags of this folder.")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder that gets one folder for each bag")
+    parser.add_argument("--seed", type=int, default=0, help="seed of objects and sensor noise, from 0 up")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(NAMES)}; all of them by default")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.names if name not in NAMES]
+    if unknown:
+        parser.error(f"unknown bag {unknown[0]!r} (allowed: {', '.join(NAMES)})")
+    for name in options.names or NAMES:
+        path = record(name, options.out, options.seed)
+        size = sum(f.stat().st_size for f in path.iterdir())
+        print(f"recorded {path}: {size / 1e6:.1f} MB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

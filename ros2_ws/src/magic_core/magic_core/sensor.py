@@ -1,0 +1,196 @@
+"""A model of the Intel RealSense D435 looking at meshes: colour and registered depth with the sensor's errors.
+
+What is modelled, and after what:
+
+disparity     Depth comes from active infrared stereo with a baseline b of 50 mm and, at
+              640 x 480 depth, a focal length f of about 380 px (horizontal field of view
+              about 80 degrees; D400 series data sheet, 337029).  z = f b / d, and the
+              disparity d is found in steps of 1/32 px (RealSense D4 ASIC), so that depth
+              comes in steps of z^2 / (32 f b): 0.8 mm at 0.7 m.
+noise         The disparity has a root-mean-square error of about 0.08 px on well-textured
+              surfaces (Intel, "Tuning D435 and D415 for best performance": RMS = z^2 s / (f b)),
+              which depth sees as an error that grows with z^2: about 2 mm at 0.7 m.  It is
+              correlated over the matching window: white noise, smoothed over a few pixels.
+edges         Where depth jumps, the window sees both sides: pixels within a couple of
+              pixels of a jump are lost or land on either side.
+shadow        The left imager is the reference: what it sees but the right one, 50 mm
+              beside it, does not has no depth: a strip along the left sides of near things.
+holes         Surfaces at grazing angles and single pixels here and there have no match.
+range         Nothing nearer than 0.17 m (minimum at this resolution) or farther than 3 m.
+registration  Depth is given in the colour camera's pixels, as ``align_depth`` does; the
+              15 mm between the imagers is left out, both share one centre.
+output        16-bit millimetres, rounded: the driver's 16UC1.
+
+Colour: one distant light and ambient, the table with a mild wood grain, noise with a
+standard deviation of 1.2 of 255.  All is a function of the seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.rendering import Raycaster, shade
+
+#: Intrinsics of a D435's colour camera at 640 x 480.
+D435 = Intrinsics(640, 480, 615.0, 615.0, 320.0, 240.0)
+
+
+@dataclass(frozen=True)
+class DepthModel:
+    """Numbers of the depth sensor; lengths in metres, disparity and focal length in pixels of the depth imager."""
+
+    baseline: float = 0.050
+    focal: float = 380.0
+    subpixel: float = 1 / 32
+    noise: float = 0.08
+    correlation: float = 1.5
+    edge: float = 0.010
+    edge_width: int = 2
+    edge_loss: float = 0.7
+    grazing: float = 0.15
+    dropout: float = 0.002
+    near: float = 0.17
+    far: float = 3.0
+
+    def disparity(self, depth: NDArray) -> NDArray:
+        """Disparity in pixels of a depth in metres."""
+        return self.focal * self.baseline / depth
+
+    def step(self, depth: float) -> float:
+        """Distance in metres between neighbouring depths that the sensor can tell, at a depth."""
+        return depth**2 * self.subpixel / (self.focal * self.baseline)
+
+    def sigma(self, depth: float) -> float:
+        """Standard deviation in metres of the depth noise at a depth."""
+        return depth**2 * self.noise / (self.focal * self.baseline)
+
+
+def table_mesh(low: tuple[float, float] = (-0.6, -1.0), high: tuple[float, float] = (1.4, 1.0), color: tuple[int, int, int] = (186, 152, 112)) -> Mesh:
+    """The table top: the rectangle of the plane z = 0 between two corners (x, y)."""
+    (x0, y0), (x1, y1) = low, high
+    vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]])).painted(color)
+
+
+def looking_at(eye: NDArray | Sequence[float], target: NDArray | Sequence[float]) -> NDArray[np.float64]:
+    """world_from_camera (4, 4) of an optical frame at ``eye`` with its axis through ``target``, horizon level."""
+    eye = np.asarray(eye, dtype=float)
+    z = transforms.unit(np.asarray(target, dtype=float) - eye)
+    x = transforms.unit(np.cross(z, [0, 0, 1.0]))
+    return transforms.make(np.column_stack([x, np.cross(z, x), z]), eye)
+
+
+def degrade(
+    depth: NDArray[np.float32], cosine: NDArray[np.float32], intrinsics: Intrinsics, seed: int | Sequence[int], model: DepthModel | None = None
+) -> NDArray[np.float32]:
+    """What the sensor makes of true depth.
+
+    depth (H, W) metres, NaN where nothing is; cosine (H, W) of the angle between ray and
+    surface normal.  Returns (H, W) float32 metres in whole millimetres, NaN where there is none.
+    """
+    model = model or DepthModel()
+    random = np.random.default_rng(seed)
+    height, width = depth.shape
+    # Every draw is made for every pixel, so that what one pixel gets does not depend on the others.
+    smooth = cv2.GaussianBlur(random.standard_normal((height, width)), (0, 0), model.correlation)
+    # White noise smoothed with a Gaussian of s pixels keeps 1 / (4 pi s^2) of its variance.
+    smooth *= np.sqrt(4 * np.pi) * model.correlation
+    lottery = random.random((height, width))
+    loss = random.random((height, width))
+    shift = random.integers(-1, 2, (2, height, width))
+
+    valid = np.isfinite(depth)
+    true = np.where(valid, depth, 0.0).astype(np.float32)
+    window = np.ones((2 * model.edge_width + 1,) * 2, np.uint8)
+    farthest = cv2.dilate(np.where(valid, depth, model.far).astype(np.float32), window)
+    nearest = cv2.erode(np.where(valid, depth, model.far).astype(np.float32), window)
+    # A slope changes depth too: only what exceeds the slope of a steep plane counts as a jump.
+    footprint = 2 * model.edge_width * true / intrinsics.fx
+    jump = (farthest - nearest) > model.edge + 2.0 * footprint
+    # Near a jump a pixel takes the depth of one of its neighbours.
+    v, u = np.mgrid[0:height, 0:width]
+    strayed = depth[np.clip(v + shift[0] * jump, 0, height - 1), np.clip(u + shift[1] * jump, 0, width - 1)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        disparity = model.disparity(strayed) + model.noise * smooth
+        disparity = np.round(disparity / model.subpixel) * model.subpixel
+        measured = model.focal * model.baseline / disparity
+    lost = ~np.isfinite(strayed) | ~valid
+    lost |= jump & (loss < model.edge_loss)
+    lost |= cosine < model.grazing * (0.7 + 0.6 * lottery)
+    lost |= loss < model.dropout
+    lost |= _shadow(depth, intrinsics, model)
+    measured = np.round(measured * 1000) / 1000
+    lost |= ~(measured >= model.near) | ~(measured <= model.far)
+    measured[lost] = np.nan
+    return measured.astype(np.float32)
+
+
+def _shadow(depth: NDArray[np.float32], intrinsics: Intrinsics, model: DepthModel) -> NDArray[np.bool_]:
+    """Pixels (H, W) that the second imager, ``baseline`` to the right, does not see behind something nearer."""
+    width = depth.shape[1]
+    z = np.where(np.isfinite(depth), depth, model.far)
+    # Column at which the second imager sees each pixel; where a pixel further left already landed right of it, it is hidden.
+    landed = np.arange(width) - intrinsics.fx * model.baseline / z
+    # The nearer a thing, the further left it lands; the scan runs from right to left.
+    reach = np.minimum.accumulate(landed[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(depth.shape, bool)
+    hidden[:, :-1] = landed[:, :-1] > reach[:, 1:] + 0.5
+    return hidden
+
+
+def _wood(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Brightness factors (...,) of a mild grain along world x at points (..., 3) of the table."""
+    x, y = points[..., 0], points[..., 1]
+    bend = 0.012 * np.sin(3 * x + 2 * y) + 0.004 * np.sin(11 * x)
+    return 1 + 0.03 * np.sin(2 * np.pi * (y + bend) / 0.045) + 0.015 * np.sin(2 * np.pi * (y + 1.3 * bend) / 0.013)
+
+
+def capture(
+    meshes: Sequence[Mesh],
+    intrinsics: Intrinsics,
+    world_from_camera: NDArray[np.float64],
+    seed: int | Sequence[int],
+    *,
+    model: DepthModel | None = None,
+    table: Mesh | None = None,
+    camera: str = "camera",
+    stamp: float = 0.0,
+    raycaster: Raycaster | None = None,
+) -> RgbdFrame:
+    """One frame of a D435 that looks at meshes (world coordinates) on the table.
+
+    table: the table's mesh (default :func:`table_mesh`); the same seed gives the same frame.
+    raycaster: reuse one made by :func:`scene_raycaster` of the same meshes, for several frames of one scene.
+    """
+    if np.asarray(world_from_camera).shape != (4, 4) or not np.all(np.isfinite(world_from_camera)):
+        raise MagicError(Code.BAD_REQUEST, "world_from_camera", np.asarray(world_from_camera).shape, "a finite (4, 4) transform")
+    caster = raycaster or scene_raycaster(meshes, table)
+    cast, true = caster.perspective(intrinsics, np.asarray(world_from_camera, dtype=float))
+    rays = intrinsics.unproject(np.ones((intrinsics.height, intrinsics.width)))
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ world_from_camera[:3, :3].T
+    cosine = np.abs(np.einsum("hwi,hwi->hw", rays, cast.normals))
+    keys = [int(k) for k in np.atleast_1d(seed)]
+    depth = degrade(true, cosine, intrinsics, [*keys, 0], model)
+
+    image = shade(cast, light=(-0.3, 0.4, 1.0), ambient=0.5, background=(70, 72, 76)).astype(float)
+    on_table = cast.ids == 0
+    points = rays * np.where(np.isfinite(cast.distance), cast.distance, 0.0)[..., None] + world_from_camera[:3, 3]
+    image *= np.where(on_table, _wood(points), 1.0)[..., None]
+    image = cv2.GaussianBlur(image, (0, 0), 0.6)
+    random = np.random.default_rng([*keys, 1])
+    image += random.normal(0, 1.2, image.shape)
+    return RgbdFrame(np.clip(image, 0, 255).astype(np.uint8), depth, intrinsics, np.asarray(world_from_camera, dtype=float), camera, stamp)
+
+
+def scene_raycaster(meshes: Sequence[Mesh], table: Mesh | None = None) -> Raycaster:
+    """The raycaster of a scene for :func:`capture`: the table first, then the meshes."""
+    return Raycaster([table or table_mesh(), *meshes])
