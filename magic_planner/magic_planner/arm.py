@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_planner import timing
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, convex_shapes, solid_pieces
-from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose
+from magic_planner.collision import Body, convex_shapes, mass_centre, merged, solid_pieces
+from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
 from magic_planner.object_motion import _plane, tool_contact_frame, waypoint_times
 from magic_planner.robot import Robot
 
@@ -43,8 +44,8 @@ class ArmSettings:
 
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
-    grasps: int = 20
-    rounds: int = 4
+    grasps: int = 40
+    rounds: int = 3
     tries: int = 10
     standoff: float = 0.08
     lift: float = 0.06
@@ -82,7 +83,8 @@ class Request:
     poses: Array  # (T, 4, 4)
     keys: NDArray[np.int64]  # (K,) indices into times
     met: float  # seconds at which the tool meets the target
-    shapes: list[Any]
+    shapes: list[Any]  # the tool's pieces
+    rough: list[Any]  # fewer and fuller ones, for the tool in the hand
 
     def place(self, index: int) -> str:
         """A sentence's name for a sample of the task: the waypoint it leads to."""
@@ -179,6 +181,7 @@ class ArmPlanner:
             keys=self._keys(poses),
             met=next((p.start for p in motion.phases if p.name in ("contact", "goal")), float(times[-1])),
             shapes=convex_shapes(solid_pieces(tool)),
+            rough=convex_shapes(_rough(tool, poses[0], (target, *obstacles))),
         )
         self._build_world(request)
         robot.open_to(robot.config.opening)
@@ -241,15 +244,28 @@ class ArmPlanner:
         keys = request.poses[request.keys]
         some = keys[np.unique(np.linspace(0, len(keys) - 1, min(10, len(keys))).astype(int))]
         poses = np.concatenate([request.tool.world_from_object[None], some])
-        grasps = propose(self.robot, request.tool, tool_from_contact, request.plane, poses, replace(self.grasping, density=request.strategy.physics.tool_density), request.seed)
         fixed = request.strategy.physics.target_is_fixed
         target = Body.from_object(request.target)
         others = [Body.from_object(o) for o in request.obstacles]
         met = int(np.searchsorted(request.times, request.met))
         last = len(request.poses) - 1
+        # The force on the contact: what moves the target along the table, or holds the tool up where the target is fixed.
+        loaded, density = (request.tool, request.strategy.physics.tool_density) if fixed else (request.target, 2 * request.strategy.physics.target_density)
+        force = float(np.clip(mass_centre(solid_pieces(loaded))[0] * density * 9.81, 0.5, 30.0))
+        settings = replace(self.grasping, density=request.strategy.physics.tool_density, force=force, standoff=self.settings.standoff)
+        rng = np.random.default_rng(request.seed)
+        clouds = {item.id: transforms.apply(item.world_from_object, surface(solid_pieces(item), 200, rng)[0]) for item in (request.target, *request.obstacles)}
+        static, swept = [], [transforms.apply(transforms.inverse(request.tool.world_from_object), np.concatenate(list(clouds.values())))]
+        for index in np.unique([*np.linspace(0, last, 7).astype(int), min(met, last)]):
+            # Once it is touched the target goes with the tool, unless it is fixed.
+            there = [cloud for name, cloud in clouds.items() if fixed or name != request.target.id or index <= met]
+            if there:
+                final = request.strategy.releases and index == last
+                (swept if final else static).append(transforms.apply(transforms.inverse(request.poses[index]), np.concatenate(there)))
+        swept_points, static_points = np.concatenate(swept), np.concatenate(static) if static else np.zeros((0, 3))
+        grasps = propose(self.robot, request.tool, tool_from_contact, request.plane, poses, settings, request.seed, static_points, swept_points)
         checks = [(request.tool.world_from_object, [target, *others])]
         for index in sorted({0, min(met, last), last}):
-            # Once it is touched the target goes with the tool, unless it is fixed.
             checks.append((request.poses[index], [target, *others] if fixed or index <= met else others))
         free, blocked = collision_free(self.robot, grasps, request.tool, checks, self.settings.grasps * self.settings.rounds, request.budget)
         if not free:
@@ -311,16 +327,16 @@ class ArmPlanner:
         if robot.world.has_object(name):
             robot.world.remove_object(name)
         robot.open_to(grasp.width)
-        robot.attach(name, request.shapes, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
+        robot.attach(name, request.rough, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
         robot.allow(name, "table", request.target.id, *(o.id for o in request.obstacles), allowed=False)
         self._ignore_target(request, False)
 
-    def _lay(self, request: Request, pose: Array) -> None:
+    def _lay(self, request: Request, pose: Array, rough: bool = False) -> None:
         """The world with the tool lying at a pose and the hand open about it; only the fingers may touch it."""
         robot, name = self.robot, request.tool.id
         robot.detach()
         robot.open_to(robot.config.opening)
-        robot.add(name, request.shapes, pose)
+        robot.add(name, request.rough if rough else request.shapes, pose)
         robot.allow(name, *robot.finger_links)
         robot.allow(name, "table", request.target.id, *(o.id for o in request.obstacles))
         self._ignore_target(request, False)
@@ -409,8 +425,11 @@ class ArmPlanner:
     # ------------------------------------------------------------ free motion
 
     def _come(self, request: Request, goal: Array) -> Array:
-        self._lay(request, request.tool.world_from_object)
-        self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
+        for rough in (True, False):
+            self._lay(request, request.tool.world_from_object, rough)
+            self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
+            if not (rough and (self.robot.collides(goal) or self.robot.collides(request.start))):
+                break
         return self._free(request, request.start, goal, "approach")
 
     def _carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
@@ -541,7 +560,8 @@ class ArmPlanner:
                 raise StageError("timing", MagicError(Code.DYNAMIC_LIMIT, f"{robot.chain.names[j]} at {times[i]:.2f} s", f"{values[i, j]:.3f} {unit}", f"up to {limits[j]:.3f} {unit}"))
         some = np.unique(np.linspace(0, len(times) - 1, min(len(times), 60)).astype(int))
         held = (times[some] >= grasp_time) & (times[some] <= (np.inf if release_time is None else release_time))
-        mass, centre = _mass(request.tool, request.strategy.physics.tool_density)
+        volume, centre = mass_centre(solid_pieces(request.tool))
+        mass = volume * request.strategy.physics.tool_density
         for rows, load in ((some[held], mass), (some[~held], 0.0)):
             if not len(rows):
                 continue
@@ -561,14 +581,13 @@ class StageError(Exception):
         self.error = error
 
 
-def _mass(tool: SceneObject, density: float) -> tuple[float, Array]:
-    """Mass in kg and its centre (3,) in the tool frame, from the convex pieces."""
-    volumes, centres = [], []
-    for piece in solid_pieces(tool):
-        solid = piece.convex_hull().to_trimesh()
-        volumes.append(max(float(solid.volume), 1e-12))
-        centres.append(np.asarray(solid.center_mass))
-    return float(np.sum(volumes)) * density, np.average(np.array(centres), axis=0, weights=volumes)
+def _rough(tool: SceneObject, start: Array, around: Sequence[SceneObject]) -> tuple[Mesh, ...]:
+    """The tool in few pieces, as long as these are clear of everything where the task starts and the exact ones are."""
+    exact = solid_pieces(tool)
+    few = merged(exact)
+    body = Body.from_pieces(tool.id, few)
+    body.move(start)
+    return exact if any(body.touches(Body.from_object(item)) for item in around) else few
 
 
 def _alike(a: Array, b: Array) -> bool:

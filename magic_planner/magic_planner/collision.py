@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -15,11 +16,27 @@ from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 
 
+#: Hulls of arrays seen lately: the same pieces are asked for by every stage of every attempt.
+_HULLS: OrderedDict[int, tuple[Any, tuple[NDArray[np.float64], NDArray[np.int32]]]] = OrderedDict()
+_KEPT_HULLS = 4000
+
+
 def hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices (V, 3) and outward faces (F, 3) of the convex hull of points (N, 3).
+    """Vertices (V, 3) and outward faces (F, 3) of the convex hull of points (N, 3); not to be written to.
 
     A set without volume (a sheet, a line) is thickened by 0.1 mm each way first, so that it still has a hull.
     """
+    known = _HULLS.get(id(vertices))
+    if known is not None and known[0] is vertices:
+        return known[1]
+    result = _hull(vertices)
+    _HULLS[id(vertices)] = (vertices, result)
+    while len(_HULLS) > _KEPT_HULLS:
+        _HULLS.popitem(last=False)
+    return result
+
+
+def _hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     points = np.asarray(vertices, dtype=float).reshape(-1, 3)
     if len(points) == 0:
         raise MagicError(Code.BAD_MESH, "convex piece", "no vertices", "at least one vertex")
@@ -56,6 +73,33 @@ def solid_pieces(item: SceneObject) -> tuple[Mesh, ...]:
 def outer_points(item: SceneObject) -> NDArray[np.float64]:
     """Corners (N, 3) of the convex hull of the whole object, object frame: all that its extent in a direction depends on."""
     return hull(np.concatenate([p.vertices for p in solid_pieces(item)]))[0]
+
+
+def mass_centre(pieces: Sequence[Mesh]) -> tuple[float, NDArray[np.float64]]:
+    """Volume in m^3 of convex pieces taken together, and the centre (3,) of their mass."""
+    volumes, centres = np.zeros(len(pieces)), np.zeros((len(pieces), 3))
+    for n, piece in enumerate(pieces):
+        vertices, faces = hull(piece.vertices)
+        corners = vertices[faces] - vertices[0]
+        tetrahedra = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+        volumes[n] = max(float(tetrahedra.sum()), 1e-12)
+        centres[n] = vertices[0] + (tetrahedra[:, None] * corners.sum(axis=1) / 4).sum(axis=0) / volumes[n]
+    return float(volumes.sum()), np.average(centres, axis=0, weights=volumes)
+
+
+def merged(pieces: Sequence[Mesh], count: int = 8) -> tuple[Mesh, ...]:
+    """At most ``count`` convex pieces that hold the given ones: neighbours share a hull.
+
+    A superset of the pieces, for free motion, where what matters is not to come near.
+    """
+    if len(pieces) <= count:
+        return tuple(pieces)
+    from scipy.cluster.vq import kmeans2
+
+    middles = np.array([(p.vertices.min(axis=0) + p.vertices.max(axis=0)) / 2 for p in pieces])
+    labels = kmeans2(middles, count, minit="++", seed=0)[1]
+    groups = [np.concatenate([p.vertices for p, label in zip(pieces, labels, strict=True) if label == k]) for k in np.unique(labels)]
+    return tuple(Mesh(*hull(group)) for group in groups)
 
 
 def fcl_pose(transform: NDArray[np.float64]) -> Any:

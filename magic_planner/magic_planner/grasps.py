@@ -21,19 +21,24 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, hull, solid_pieces
+from magic_planner.collision import Body, hull, mass_centre, solid_pieces
 from magic_planner.robot import Robot
 
 
 @dataclass(frozen=True)
 class GraspSettings:
     """agreement: least cosine between the inward normal at one finger and the outward normal at the other.
-    samples: surface points tried.  angles: approach directions about the closing axis.  clearance: metres kept
+    samples: surface points tried.  pairs: antipodal pairs kept of them.
+    angles: approach directions about the closing axis.  poses: hand poses looked at in one lot.  standoff: metres of straight way to the grasp.
+     clearance: metres kept
     between hand and table.  margin: metres left on each side of the object in the open hand.  away: metres
     around the contact in which no finger is placed.  friction, force, density: of the slip estimate (N, kg/m^3)."""
 
     agreement: float = 0.9
-    samples: int = 160
+    samples: int = 500
+    pairs: int = 300
+    poses: int = 1500
+    standoff: float = 0.08
     angles: int = 16
     clearance: float = 0.0015
     margin: float = 0.003
@@ -52,64 +57,106 @@ class Grasp:
     cost: float
 
 
-def antipodal(
-    pieces: Sequence[Mesh], opening: float, settings: GraspSettings, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces."""
-    hulls = [hull(piece.vertices) for piece in pieces]
-    corners = np.concatenate([vertices[faces] for vertices, faces in hulls])
+def surface(pieces: Sequence[Mesh], count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``count`` points (N, 3) spread evenly over the hulls of pieces and the outward normals (N, 3) there; none where there is no area."""
+    corners = np.concatenate([vertices[faces] for vertices, faces in (hull(piece.vertices) for piece in pieces)])
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(crosses, axis=1)
     good = areas > 1e-14
     corners, crosses, areas = corners[good], crosses[good], areas[good]
     if not len(areas):
-        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        return np.zeros((0, 3)), np.zeros((0, 3))
     # One stratified draw along the cumulated area: even cover, few samples.
-    share = (np.arange(settings.samples) + rng.uniform(size=settings.samples)) / settings.samples
+    share = (np.arange(count) + rng.uniform(size=count)) / count
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), share).clip(0, len(areas) - 1)
-    u, v = rng.uniform(size=(2, settings.samples, 1))
+    u, v = rng.uniform(size=(2, count, 1))
     over = u + v > 1
     u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
     points = corners[face, 0] + u * (corners[face, 1] - corners[face, 0]) + v * (corners[face, 2] - corners[face, 0])
-    normals = crosses[face] / areas[face][:, None]
-    # Where the line enters and leaves each piece; entries and exits are then joined into one stretch of material.
+    return points, crosses[face] / areas[face][:, None]
+
+
+def in_the_way(
+    robot: Robot, frames: NDArray[np.float64], static: NDArray[np.float64], swept: NDArray[np.float64], standoff: float, chunk: int = 256
+) -> NDArray[np.bool_]:
+    """(G,) whether any of the points, all in the tool frame, lies within a box about a link of the open hand.
+
+    static (S, 3): points where the hand must not be; swept (W, 3): points where it must not be on the last
+    ``standoff`` metres before the grasp either.  A quick first test; thin things between the points are left to :func:`collision_free`.
+    """
+    boxes = [(m.vertices.min(axis=0) + 5e-4, m.vertices.max(axis=0) - 5e-4) for m in robot.hand.values()]
+    blocked = np.zeros(len(frames), dtype=bool)
+    for points, sweep in ((static, 0.0), (swept, standoff)):
+        if not len(points):
+            continue
+        lows = np.array([low - [0, 0, sweep] for low, _ in boxes], dtype=np.float32)
+        highs = np.array([high for _, high in boxes], dtype=np.float32)
+        whole_low, whole_high = lows.min(axis=0), highs.max(axis=0)
+        for first in range(0, len(frames), chunk):
+            part = slice(first, first + chunk)
+            rotation = frames[part, :3, :3].astype(np.float32)
+            local = points.astype(np.float32) @ rotation - np.einsum("gji,gj->gi", rotation, frames[part, :3, 3].astype(np.float32))[:, None]
+            near = ((local > whole_low) & (local < whole_high)).all(axis=2)
+            which, index = np.nonzero(near)
+            some = local[which, index]
+            hit = ((some[:, None] > lows) & (some[:, None] < highs)).all(axis=2).any(axis=1)
+            blocked[first + which[hit]] = True
+    return blocked
+
+
+def antipodal(
+    pieces: Sequence[Mesh], opening: float, settings: GraspSettings, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces."""
+    hulls = [hull(piece.vertices) for piece in pieces]
+    points, normals = surface(pieces, settings.samples, rng)
+    if not len(points):
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    width, exit_normal, inside = _through(hulls, points, -normals)
+    faces_back = np.einsum("ij,ij->i", -normals, exit_normal) >= settings.agreement
+    fits = (width > 1e-3) & (width <= opening - 2 * settings.margin)
+    keep = ~inside & faces_back & fits
+    return points[keep] - normals[keep] * width[keep, None] / 2, -normals[keep], width[keep]
+
+
+def _through(
+    hulls: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]], points: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Follow lines (N, 3), (N, 3) from a surface into the union of convex hulls until they leave it.
+
+    Returns the length (N,) in the material, the outward normal (N, 3) of the face they leave by, and whether the start was
+    no surface at all: inside a hull, or where two abut.
+    """
     enters, leaves, faced = [], [], []
     for vertices, faces in hulls:
         a, b, c = (vertices[faces[:, i]] for i in range(3))
         planes = np.cross(b - a, c - a)
         norms = np.linalg.norm(planes, axis=1)
         planes, a = planes[norms > 1e-14] / norms[norms > 1e-14][:, None], a[norms > 1e-14]
-        slope = -normals @ planes.T
+        slope = directions @ planes.T
         gap = np.einsum("ij,ij->i", a, planes)[None] - points @ planes.T
         with np.errstate(divide="ignore", invalid="ignore"):
             along = gap / slope
         out = np.where(slope > 1e-9, along, np.inf)
         into = np.where(slope < -1e-9, along, -np.inf)
         beside = (np.abs(slope) <= 1e-9) & (gap < -1e-9)
-        enter, leave = into.max(axis=1), out.min(axis=1)
-        leave = np.where(beside.any(axis=1), -np.inf, leave)
-        enters.append(enter)
-        leaves.append(leave)
+        enters.append(into.max(axis=1))
+        leaves.append(np.where(beside.any(axis=1), -np.inf, out.min(axis=1)))
         faced.append(planes[out.argmin(axis=1)])
     enter, leave, far = np.array(enters), np.array(leaves), np.array(faced)
     real = leave > enter + 1e-9
-    # A point inside another piece (material just outside it) is no surface.
-    inside = (real & (enter < -1e-4) & (leave > 1e-6)).any(axis=0)
-    width = np.zeros(len(points))
-    exit_normal = -normals.copy()
+    inside = ((leave > enter + 1e-4) & (enter < -3e-4) & (leave > -2e-4)).any(axis=0)
+    length, row = np.zeros(len(points)), np.arange(len(points))
+    normal = directions.copy()
     for _ in range(len(hulls)):
-        grows = real & (enter <= width + 1e-4) & (leave > width + 1e-9)
+        grows = real & (enter <= length + 1e-4) & (leave > length + 1e-9)
         if not grows.any():
             break
         best = np.where(grows, leave, -np.inf).argmax(axis=0)
-        row = np.arange(len(points))
         grown = grows[best, row]
-        width = np.where(grown, leave[best, row], width)
-        exit_normal[grown] = far[best, row][grown]
-    faces_back = np.einsum("ij,ij->i", -normals, exit_normal) >= settings.agreement
-    fits = (width > 5e-4) & (width <= opening - 2 * settings.margin)
-    keep = ~inside & faces_back & fits
-    return points[keep] - normals[keep] * width[keep, None] / 2, -normals[keep], width[keep]
+        length = np.where(grown, leave[best, row], length)
+        normal[grown] = far[best, row][grown]
+    return length, normal, inside
 
 
 def propose(
@@ -120,11 +167,13 @@ def propose(
     poses: NDArray[np.float64],
     settings: GraspSettings,
     seed: int,
+    static: NDArray[np.float64] | None = None,
+    swept: NDArray[np.float64] | None = None,
 ) -> list[Grasp]:
     """Grasps of the tool, best first, whose hand stays above the table at all poses (K, 4, 4) world_from_tool.
 
-    poses[0] is where the tool lies when it is picked up, the others are the task's.
-    Raises NO_GRASP saying at which test the last of them fell.
+    poses[0] is where the tool lies when it is picked up, the others are the task's.  static, swept (N, 3): points of other
+    things as :func:`in_the_way` wants them.  Raises NO_GRASP saying at which test the last of them fell.
     """
     pieces = solid_pieces(tool)
     rng = np.random.default_rng(seed)
@@ -141,6 +190,15 @@ def propose(
     if not away.any():
         raise MagicError(Code.NO_GRASP, f"grasps of {tool.id}", "all at the contact", f"one at least {settings.away} m away from it")
     centres, closing, widths = centres[away], closing[away], widths[away]
+    terms = _Terms(pieces, tool_from_contact, poses, table, robot, settings)
+    first = terms.of_pairs(centres, closing, widths)
+    # Of each neighbourhood and closing direction the best pair, and of those the best.
+    cells: dict[tuple[int, ...], int] = {}
+    for i in np.argsort(first, kind="stable"):
+        axis = closing[i] * (1 if closing[i][np.abs(closing[i]).argmax()] > 0 else -1)
+        cells.setdefault((*np.floor(centres[i] / 0.012).astype(int), *np.round(axis * 2).astype(int)), int(i))
+    few = np.array(list(cells.values())[: settings.pairs])
+    centres, closing, widths, first = centres[few], closing[few], widths[few], first[few]
     frames, pair = _frames(robot, centres, closing, settings)
 
     # The hand above the table: where the tool is picked up it may be drawn back along its own axis, as far as the fingertips still hold.
@@ -162,17 +220,49 @@ def propose(
             raise MagicError(Code.NO_GRASP, f"grasps of {tool.id}", "the hand would go through the table during the task", "a hand above the table on the whole path")
         frames, pair, back = frames[high], pair[high], back[high]
 
-    costs = _costs(frames, pair, back, centres, widths, pieces, tool_from_contact, poses, table, settings)
-    order = np.argsort(costs, kind="stable")
-    # Best of each neighbourhood first: the reach of the arm decides in the end, so the first few should differ.
+    costs = first[pair] + terms.of_approach(frames, back)
+    own = surface(pieces, 400, rng)[0]
+    nothing = np.zeros((0, 3))
+    around = (nothing if static is None else static, nothing if swept is None else swept)
+    ranked, kept, alone = np.argsort(costs, kind="stable"), [], 0
+    for first_of in range(0, len(ranked), settings.poses):
+        lot = ranked[first_of : first_of + settings.poses]
+        lot = lot[~in_the_way(robot, frames[lot], nothing, own, settings.standoff)]
+        alone += len(lot)
+        kept.append(lot[~in_the_way(robot, frames[lot], *around, settings.standoff)])
+        if sum(len(k) for k in kept) >= 100:
+            break
+    keep = np.concatenate(kept)
+    if not len(keep):
+        blocking = f"{tool.id} itself" if not alone else "the target or an obstacle"
+        raise MagicError(Code.NO_GRASP, f"{len(ranked)} grasps of {tool.id}", f"the open hand and {blocking} are in collision for {'all' if not alone else alone} of them", "an open hand clear of everything")
+    frames, pair, costs = frames[keep], pair[keep], costs[keep]
+    order = np.argsort(costs, kind="stable")[:240]
+    costs[order] += 0.6 * (1 - _support(robot, frames[order], widths[pair[order]], pieces))
+    order = order[np.argsort(costs[order], kind="stable")]
+    # The arm's reach decides in the end, so what comes first should differ: each further grasp of a neighbourhood stands back.
     seen: dict[tuple[int, ...], int] = {}
     rank = []
     for i in order:
-        key = (*np.floor(frames[i, :3, 3] / 0.04).astype(int), *np.round(frames[i, :3, :2].ravel() * 1.2).astype(int))
+        key = (*np.floor(frames[i, :3, 3] / 0.03).astype(int), *np.round(frames[i, :3, :2].ravel() * 1.2).astype(int))
         seen[key] = seen.get(key, -1) + 1
         rank.append(seen[key])
-    order = order[np.argsort(np.array(rank), kind="stable")]
+    order = order[np.argsort(costs[order] + 0.2 * np.array(rank), kind="stable")]
     return [Grasp(frames[i], float(widths[pair[i]]), float(costs[i])) for i in order]
+
+
+def _support(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], reach: float = 0.005) -> NDArray[np.float64]:
+    """(G,) share of the finger pads that meets material: four lines beside each grasp's own that find the same width there."""
+    hulls = [hull(piece.vertices) for piece in pieces]
+    closing = frames[:, :3, "xy".index(robot.config.closing_axis)]
+    across, along = frames[:, :3, 1 - "xy".index(robot.config.closing_axis)], frames[:, :3, 2]
+    found = np.zeros(len(frames))
+    for shift in (across, -across, along, -along):
+        start = frames[:, :3, 3] + reach * shift
+        ahead, _, _ = _through(hulls, start, closing)
+        behind, _, _ = _through(hulls, start, -closing)
+        found += (np.abs(ahead - widths / 2) < 0.002) & (np.abs(behind - widths / 2) < 0.002)
+    return found / 4
 
 
 def _frames(
@@ -206,34 +296,47 @@ def _heights(frames: NDArray[np.float64], points: NDArray[np.float64], poses: ND
     return (in_hand @ points.T).min(axis=2) + np.einsum("gj,kj->kg", frames[:, :3, 3], up) + ground[:, None]
 
 
-def _costs(frames, pair, back, centres, widths, pieces, tool_from_contact, poses, table, settings):  # type: ignore[no-untyped-def]
-    """(G,) cost: torque that the fingers must hold by friction, distance from the guidance point, an approach from below, fingers drawn back."""
-    volumes, middles = zip(*[(m.convex_hull().to_trimesh().volume, m.vertices.mean(axis=0)) for m in (Mesh(*hull(p.vertices)) for p in pieces)], strict=True)
-    volumes = np.maximum(np.array(volumes), 1e-12)
-    centre = np.average(np.array(middles), axis=0, weights=volumes)
-    weight = float(volumes.sum()) * settings.density * 9.81
-    contact = tool_from_contact[:3, 3]
-    vertices = np.concatenate([p.vertices for p in pieces])
-    far = vertices[np.linalg.norm(vertices - contact, axis=1).argmax()]
-    guidance = centre + 0.4 * (far - centre)
-    size = max(float(np.ptp(vertices, axis=0).max()), 1e-3)
-    grip = centres[pair]
-    # Torque about the closing axis is held by friction alone; the fingers' width holds the rest.
-    push = np.cross(contact - grip, -tool_from_contact[:3, 0]) * settings.force
-    down = -np.einsum("kji,j->ki", poses[:, :3, :3], table[:3]) * weight
-    closing_axis = frames[:, :3, 1]
-    hang = np.max([np.abs(np.einsum("gi,gi->g", np.cross(centre - grip, d), closing_axis)) for d in down], axis=0)
-    twist = np.abs(np.einsum("gi,gi->g", push, closing_axis)) + hang
-    up = poses[0, :3, :3].T @ table[:3]
-    from_above = -(frames[:, :3, 2] @ up)
-    return (
-        np.linalg.norm(grip - guidance, axis=1) / size
-        + twist / 0.5
-        + 0.25 * np.linalg.norm(push, axis=1) / (settings.force * size)
-        + 0.3 * (1 - from_above)
-        + 20.0 * back
-        + 2.0 * widths[pair]
-    )
+class _Terms:
+    """The terms of a grasp's cost, each about 1 where it begins to matter."""
+
+    def __init__(
+        self,
+        pieces: Sequence[Mesh],
+        tool_from_contact: NDArray[np.float64],
+        poses: NDArray[np.float64],
+        table: NDArray[np.float64],
+        robot: Robot,
+        settings: GraspSettings,
+    ) -> None:
+        volume, self.centre = mass_centre(pieces)
+        self.contact, self.force = tool_from_contact[:3, 3], -tool_from_contact[:3, 0] * settings.force
+        vertices = np.concatenate([p.vertices for p in pieces])
+        far = vertices[np.linalg.norm(vertices - self.contact, axis=1).argmax()]
+        #: Where the hand would rather be: between the middle of the tool and its far end.
+        self.guidance = self.centre + 0.4 * (far - self.centre)
+        self.size = max(float(np.ptp(vertices, axis=0).max()), 1e-3)
+        self.weights = -np.einsum("kji,j->ki", poses[:, :3, :3], table[:3]) * volume * settings.density * 9.81
+        self.up = poses[0, :3, :3].T @ table[:3]
+        self.opening = robot.config.opening
+
+    def of_pairs(self, centres: NDArray[np.float64], closing: NDArray[np.float64], widths: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M,): the torque that the fingers must hold by friction, nearness to the contact, distance from the guidance point, a wide grip."""
+        # Torque about the closing axis is held by friction alone; the fingers' width holds the rest.
+        push = np.cross(self.contact - centres, self.force)
+        hang = np.max([np.abs(np.einsum("gi,gi->g", np.cross(self.centre - centres, w), closing)) for w in self.weights], axis=0)
+        twist = np.abs(np.einsum("gi,gi->g", push, closing)) + hang
+        near = np.maximum(0.0, 1 - np.linalg.norm(centres - self.contact, axis=1) / min(0.10, 0.5 * self.size))
+        return np.asarray(
+            np.linalg.norm(centres - self.guidance, axis=1) / self.size
+            + twist / 0.25
+            + 0.25 * np.linalg.norm(push, axis=1) / max(float(np.linalg.norm(self.force)) * self.size, 1e-9)
+            + 0.8 * near
+            + (widths / self.opening) ** 2
+        )
+
+    def of_approach(self, frames: NDArray[np.float64], back: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(G,): an approach that is not from above, fingers drawn back by ``back`` metres."""
+        return np.asarray(0.3 * (1 + frames[:, :3, 2] @ self.up) + 20.0 * back)
 
 
 def collision_free(
