@@ -132,7 +132,10 @@ class ArmRun:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "arm.urdf"
             path.write_text(text)
-            robot = loader.load(str(path), srdf_file=str(self._panda.urdf.parents[1] / "srdf/panda.srdf"))
+            # The loader heeds only pairs with the reason "Default"; hand and link 7 are adjacent over a link without a body.
+            pairs = (self._panda.urdf.parents[1] / "srdf/panda.srdf").read_text().replace('reason="Adjacent"', 'reason="Default"')
+            (Path(folder) / "arm.srdf").write_text(pairs)
+            robot = loader.load(str(path), srdf_file=str(Path(folder) / "arm.srdf"))
         robot.set_solver_position_iterations(self.setup.settings.position_iterations)
         robot.set_solver_velocity_iterations(self.setup.settings.velocity_iterations)
         options = self.options

@@ -20,8 +20,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
 from magic_verifier.arm_simulation import ArmOptions
 from magic_verifier.floating import Perturbation
-from magic_verifier.simulation import DYNAMIC, Settings, World, usable_pieces
-from magic_verifier.verification import Limits, Verdict, verify
+from magic_verifier.simulation import DYNAMIC, World, usable_pieces
+from magic_verifier.verification import DEFAULTS, Limits, Verdict, verify
 
 #: More repetitions than this in one goal are refused.
 MAX_REPETITIONS = 1000
@@ -41,8 +41,8 @@ class VerifierNode(Node):
         self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
         self._timeout = parameter(self, "timeout", 30.0, "Wall time in s for one goal that names none.", low=0.1, high=3600.0)
         fg = parameter(self, "frequency", 240.0, "Steps per simulated second, floating gripper.", low=60.0, high=2000.0)
-        arm = parameter(self, "arm_frequency", 480.0, "Steps per simulated second, arm.", low=120.0, high=2000.0)
-        self._settings = {"fg": Settings(frequency=fg), "arm": Settings(frequency=arm)}
+        arm = parameter(self, "arm_frequency", 240.0, "Steps per simulated second, arm.", low=120.0, high=2000.0)
+        self._settings = {"fg": replace(DEFAULTS["fg"], frequency=fg), "arm": replace(DEFAULTS["arm"], frequency=arm)}
         self._perturbation = Perturbation(
             position=parameter(self, "noise.position", 0.002, "Standard deviation in m of the target's place in perturbed runs.", low=0.0, high=0.1),
             turn=parameter(self, "noise.turn", 0.03, "Standard deviation in rad of the target's turn in perturbed runs.", low=0.0, high=3.2),
