@@ -24,5 +24,7 @@ else
 fi
 [ "${VIRTUAL_ENV:-}" = "$_magic_ws/.venv" ] || . "$_magic_ws/.venv/bin/activate"
 . "$_magic_ws/install/local_setup.$_magic_shell"
+# Faster discovery (see the file), unless the user has a profile of their own.
+[ -n "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" ] || export FASTRTPS_DEFAULT_PROFILES_FILE=$_magic_ws/fastdds.xml
 [ -z "$_magic_nounset" ] || set -u
 unset _magic_ws _magic_shell _magic_nounset

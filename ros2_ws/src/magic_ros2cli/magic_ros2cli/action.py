@@ -30,7 +30,7 @@ def action_list(arguments: list[str]) -> int:
     parser.add_argument("-c", "--count-actions", action="store_true", help="only display the number of actions discovered")
     parsed = parser.parse_args(arguments)
     with connect.node() as node:
-        found = sorted(connect.settle(lambda: get_action_names_and_types(node)))
+        found = sorted(connect.settle(node, lambda: get_action_names_and_types(node)))
     if parsed.count_actions:
         print(len(found))
     for name, types in [] if parsed.count_actions else found:

@@ -16,7 +16,9 @@ T = TypeVar("T")
 #: How long a named node, topic or service may take to be discovered, s.
 DISCOVERY = 5.0
 #: The graph counts as known when it has not changed for this long, s.
-SETTLED = 0.4
+SETTLED = 0.6
+#: And as empty when no other node has been seen for this long, s.
+EMPTY = 1.5
 
 
 @contextmanager
@@ -34,18 +36,19 @@ def node(**options: Any) -> Iterator[Any]:
         rclpy.try_shutdown()
 
 
-def settle(query: Callable[[], T], shortest: float = 0.6, longest: float = 3.0) -> T:
-    """The answer of a graph query once it has stopped changing."""
+def settle(made: Any, query: Callable[[], T], longest: float = 5.0) -> T:
+    """The answer of a graph query once it, and the list of nodes, have stopped changing."""
     start = changed = time.monotonic()
-    answer = query()
+    state: Any = None
     while True:
-        time.sleep(0.05)
+        before, state = state, (sorted(made.get_node_names_and_namespaces()), query())
         now = time.monotonic()
-        before, answer = answer, query()
-        if answer != before:
+        if state != before:
             changed = now
-        if (now - changed >= SETTLED and now - start >= shortest) or now - start >= longest:
-            return answer
+        others = len(state[0]) > 1
+        if now - changed >= SETTLED and (others or now - start >= EMPTY) or now - start >= longest:
+            return state[1]
+        time.sleep(0.05)
 
 
 def wait_for(condition: Callable[[], T], seconds: float | None = DISCOVERY) -> T:

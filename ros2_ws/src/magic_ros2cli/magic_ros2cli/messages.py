@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import importlib
+import os
 import sys
 from typing import Any
 
@@ -11,6 +12,9 @@ import numpy as np
 import yaml
 
 from magic_ros2cli.errors import CommandError
+
+# The generated setters check types and ranges only where this is set before the first message package is imported.
+os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
 
 #: ``ros2 topic echo`` cuts strings and sequences after so many elements.
 TRUNCATE = 128

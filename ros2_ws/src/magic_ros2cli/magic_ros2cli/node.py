@@ -9,7 +9,7 @@ from magic_ros2cli import connect
 
 def names(node: object, include_hidden: bool = False) -> list[str]:
     """Full names of the nodes in the graph, sorted."""
-    pairs = connect.settle(lambda: sorted(node.get_node_names_and_namespaces()))
+    pairs = connect.settle(node, lambda: sorted(node.get_node_names_and_namespaces()))
     return sorted(f"{space.rstrip('/')}/{name}" for name, space in pairs if include_hidden or not name.startswith("_"))
 
 

@@ -91,7 +91,7 @@ def param_list(arguments: list[str]) -> int:
         if parsed.node_name:
             targets = [connect.absolute(parsed.node_name)]
         else:
-            services = connect.settle(node.get_service_names_and_types)
+            services = connect.settle(node, node.get_service_names_and_types)
             kind = "rcl_interfaces/srv/ListParameters"
             targets = sorted(n.removesuffix("/list_parameters") for n, t in services if kind in t and not connect.hidden(n))
         for target in targets:

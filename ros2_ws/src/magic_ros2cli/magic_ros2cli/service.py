@@ -16,7 +16,7 @@ def service_list(arguments: list[str]) -> int:
     parser.add_argument("--include-hidden-services", action="store_true", help="consider hidden services as well")
     parsed = parser.parse_args(arguments)
     with connect.node() as node:
-        found = connect.settle(node.get_service_names_and_types)
+        found = connect.settle(node, node.get_service_names_and_types)
     found = sorted((n, t) for n, t in found if parsed.include_hidden_services or not connect.hidden(n))
     if parsed.count_services:
         print(len(found))

@@ -26,7 +26,7 @@ def topic_list(arguments: list[str]) -> int:
     parser.add_argument("--include-hidden-topics", action="store_true", help="consider hidden topics as well")
     parsed = parser.parse_args(arguments)
     with connect.node() as node:
-        found = connect.settle(node.get_topic_names_and_types)
+        found = connect.settle(node, node.get_topic_names_and_types)
     found = [(n, t) for n, t in found if parsed.include_hidden_topics or not connect.hidden(n)]
     if parsed.count_topics:
         print(len(found))
@@ -42,15 +42,10 @@ def topic_info(arguments: list[str]) -> int:
     parsed = parser.parse_args(arguments)
     topic = connect.absolute(parsed.topic_name)
     with connect.node() as node:
-        connect.wait_for(lambda: topic in dict(node.get_topic_names_and_types()), 2.0)
-
-        def endpoints() -> list[list[Any]]:
-            return [node.get_publishers_info_by_topic(topic), node.get_subscriptions_info_by_topic(topic)]
-
-        types = dict(connect.settle(node.get_topic_names_and_types)).get(topic)
+        types = dict(connect.settle(node, node.get_topic_names_and_types)).get(topic)
         if not types:
             raise CommandError(f"Unknown topic '{parsed.topic_name}'")
-        publishers, subscriptions = endpoints()
+        publishers, subscriptions = node.get_publishers_info_by_topic(topic), node.get_subscriptions_info_by_topic(topic)
     print(f"Type: {types[0] if len(types) == 1 else types}")
     for what, infos in (("Publisher", publishers), ("Subscription", subscriptions)):
         if parsed.verbose:
@@ -120,7 +115,7 @@ def topic_echo(arguments: list[str]) -> int:
         kind = _type_of(node, topic, parsed.message_type)
         fields = parsed.field.strip(".").split(".") if parsed.field else []
         _select(kind(), fields)
-        node.create_subscription(kind, topic, waiting.append, _matching_qos(node, topic, parsed))
+        node.create_subscription(kind, topic, lambda m: waiting.append(m), _matching_qos(node, topic, parsed))
         deadline = math.inf if parsed.timeout is None else time.monotonic() + parsed.timeout
         while True:
             rclpy.spin_once(node, timeout_sec=0.1)
