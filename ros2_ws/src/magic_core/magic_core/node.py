@@ -36,7 +36,10 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
     try:
         node = node_type()
         executor.add_node(node)
-        executor.spin()
+        # spin() waits in C without a limit, and Python only runs a signal's handler between its own
+        # instructions: a node without timers would never notice.
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0.2)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (MagicError, ParameterException) as error:

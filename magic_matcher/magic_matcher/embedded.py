@@ -1,0 +1,324 @@
+"""Features that ship with the package: the silhouette as seen from a contact.
+
+Every contour point is described in the frame of its own normal and tangent, so that no
+picture is ever rotated; the mirrored reading of the reference gives the reflections.
+
+* ``wide``: occupancy on a log-polar grid around the point, radii relative to the object's size.
+* ``probe``: the same around the centre of the disc that touches the edge there, radii
+  relative to the disc's.  The disc is the target (its radius at p_O), so this is the tool
+  as the target meets it: whether it fits, from where it is embraced, where it could leave.
+* ``bend``: signed curvature at scales relative to the size and to the disc.
+* ``well``: how high the edge rises on either side before it falls below the contact, along
+  the normal: the depth of the hollow in which the disc is held.
+* ``fit``: the largest share of the disc's radius that finds room before the contact.
+* ``mass``, ``far``: where the centroid and the far end lie as seen from the contact.
+* ``depth``: local thickness behind the contact, free way in front of it.
+
+The dissimilarity is a weighted sum of the distances block by block (ring by ring for the
+grids), each divided into "more than the reference" and "less than the reference" where
+one of them may matter and the other not.  The weights are fitted by the training script
+on procedural shapes (``python3 -m magic_matcher.train_embedded``); no block and no weight
+belongs to a task or a category: every expected value is read off the reference contact.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.scene import CanonicalView
+from magic_matcher import curvature
+from magic_matcher.contour import Contour
+from magic_matcher.features import GlobalMatch, Proposal, Reference, rotation_between, suppress
+
+SECTORS = 24
+WIDE_RADII = np.geomspace(0.03, 1.0, 7)
+PROBE_RADII = np.array([0.55, 1.3, 1.8, 2.6, 3.8, 5.6])
+BEND_SIZE = (0.04, 0.09, 0.18)
+BEND_PROBE = (0.8, 1.6)
+#: Without a target its radius is taken to be this share of the tool's size at least and at most.
+PROBE_RANGE = (0.02, 0.15)
+#: Contour points that are described; more do not find better places.
+SAMPLES = 360
+#: Two proposals are the same place if they are nearer than this share of the object's size.
+SUPPRESSION = 0.08
+
+
+@dataclass(frozen=True)
+class Description:
+    """Descriptors of B contour points.
+
+    wide (B, 7, 24), probe (B, 6, 24): occupancy 0..1, sector 0 along the outward normal,
+    turning towards the tangent; scalars (B, S): values that a mirror leaves alone; sided
+    (B, T, 2): pairs (left, right) that it swaps; lateral (B, U): values whose sign it turns.
+    """
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    wide: NDArray[np.float32]
+    probe: NDArray[np.float32]
+    scalars: NDArray[np.float64]
+    sided: NDArray[np.float64]
+    lateral: NDArray[np.float64]
+
+
+SCALARS = (
+    *(f"bend {s} size" for s in BEND_SIZE),
+    *(f"bend {s} probe" for s in BEND_PROBE),
+    "mass along",
+    "mass distance",
+    "far along",
+    "far distance",
+    "thickness",
+    "way, size",
+    "way, probe",
+    "well, shallower, probe",
+    "well, shallower, size",
+    "fit",
+)
+SIDED = ("well, probe", "well, size")
+LATERAL = ("mass across", "far across")
+
+
+def _sample_pyramid(soft: NDArray[np.float32], centres: NDArray[np.float64], normals: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Occupancy (B, R, SECTORS) around centres (B, 2) at radii (R,) px, each ring in a picture blurred to its own coarseness."""
+    angle = np.arctan2(normals[:, 1], normals[:, 0])[:, None] + np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    result = np.empty((len(centres), len(radii), SECTORS), np.float32)
+    for ring, radius in enumerate(radii):
+        sigma = float(np.clip(0.22 * radius, 0.6, 24.0))
+        # Wide blurs are taken from a smaller picture: the blur has removed what that loses.
+        step = int(max(1, 2 ** int(np.log2(max(sigma / 2.0, 1.0)))))
+        picture = cv2.resize(soft, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else soft
+        picture = cv2.GaussianBlur(picture, (0, 0), max(sigma / step, 0.5), borderType=cv2.BORDER_CONSTANT)
+        u = (centres[:, 0:1] + radius * cosine + 0.5) / step - 0.5
+        v = (centres[:, 1:2] + radius * sine + 0.5) / step - 0.5
+        result[:, ring] = cv2.remap(
+            picture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
+    return result
+
+
+def _wells(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depth (B, 2) px of the hollow to the left and right of the contact: the highest rise along
+    the normal on the walk along the edge before it falls below the contact."""
+    result = np.zeros((len(indices), 2))
+    tolerance = 0.015 * contour.size
+    for loop in np.unique(contour.loop[indices]):
+        rows = np.nonzero(contour.loop[indices] == loop)[0]
+        start, length = int(contour.starts[loop]), int(contour.lengths[loop])
+        stride = max(1, length // 360)
+        steps = np.arange(0, length, stride)
+        for side, sign in enumerate((1, -1)):
+            walk = start + (indices[rows, None] - start + sign * steps) % length
+            height = np.einsum("bkc,bc->bk", contour.points[walk] - contour.points[indices[rows]][:, None], normals[rows])
+            fallen = np.logical_or.accumulate(height < -tolerance, axis=1)
+            result[rows, side] = np.maximum(np.where(fallen, 0.0, height).max(axis=1), 0.0)
+    return result
+
+
+def _fit(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.float64], probe: float) -> NDArray[np.float64]:
+    """Share (B,) of the disc's radius that is free before the contact, 0..1.
+
+    The disc need not touch the very point: in a sharp corner its centre stands off by
+    more than its radius, sqrt(2) times in a right angle.
+    """
+    margin = int(np.ceil(2 * probe)) + 2
+    free = (np.pad(contour.soft, margin) <= 0.5).astype(np.uint8)
+    room = cv2.distanceTransform(free, cv2.DIST_L2, 3)
+    best = np.zeros(len(points))
+    for step in (1.0, 1.2, 1.45):
+        at = points + step * probe * normals + margin
+        value = cv2.remap(room, at[None, :, 0].astype(np.float32), at[None, :, 1].astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        best = np.maximum(best, value[0])
+    return np.clip((best + 1.0) / probe, 0.0, 1.0)
+
+
+def describe(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.float64], probe: float) -> Description:
+    """Describe contour points (B,) with their normals (B, 2); ``probe`` is the disc's radius in pixels."""
+    size = contour.size
+    points = contour.points[indices]
+    left = np.column_stack([-normals[:, 1], normals[:, 0]])
+    wide = _sample_pyramid(contour.soft, points, normals, WIDE_RADII * size)
+    around = _sample_pyramid(contour.soft, points + probe * normals, normals, PROBE_RADII * probe)
+    bends = []
+    for scale in (*(s * size for s in BEND_SIZE), *(s * probe for s in BEND_PROBE)):
+        scale = float(np.clip(scale, 4.0, 0.5 * size))
+        bends.append(np.tanh(curvature.curvature_map(contour, indices, scale)[0] * scale))
+    mass = contour.centroid - points
+    spread = contour.points[:: max(1, len(contour.points) // 200)]
+    gaps = np.hypot(*(spread[None] - points[:, None]).transpose(2, 0, 1))
+    far = spread[np.argmax(gaps, axis=1)] - points
+    thickness = curvature.clearance(contour, points, -normals, 0.5 * size, 96)
+    way = curvature.clearance(contour, points, normals, 0.7 * size, 96)
+    wells = _wells(contour, indices, normals)
+    shallow = wells.min(axis=1)
+    scalars = np.column_stack(
+        [
+            *bends,
+            np.sum(mass * normals, axis=1) / size,
+            np.hypot(*mass.T) / size,
+            np.sum(far * normals, axis=1) / size,
+            np.hypot(*far.T) / size,
+            np.log(thickness / size + 0.02),
+            np.log(way / size + 0.02),
+            np.tanh(way / (4 * probe)),
+            np.tanh(shallow / (1.5 * probe)),
+            np.tanh(shallow / (0.15 * size)),
+            _fit(contour, points, normals, probe),
+        ]
+    )
+    sided = np.stack([np.tanh(wells / (1.5 * probe)), np.tanh(wells / (0.15 * size))], axis=1)
+    lateral = np.column_stack([np.sum(mass * left, axis=1), np.sum(far * left, axis=1)]) / size
+    return Description(points, normals, wide, around, scalars, sided, lateral)
+
+
+def _mirror_sectors(grid: NDArray[np.float32]) -> NDArray[np.float32]:
+    return grid[..., (-np.arange(SECTORS)) % SECTORS]
+
+
+def _sides(difference: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(B, S) differences as (B, 2 S): how much more and how much less than the reference."""
+    return np.concatenate([np.maximum(difference, 0), np.maximum(-difference, 0)], axis=1)
+
+
+DISTANCES = (
+    *(f"wide {r:.2f}" for r in WIDE_RADII),
+    *(f"probe {r:.2f} more" for r in PROBE_RADII),
+    *(f"probe {r:.2f} less" for r in PROBE_RADII),
+    *(f"{n} more" for n in SCALARS),
+    *(f"{n} less" for n in SCALARS),
+    *(f"{n}, sides, more" for n in SIDED),
+    *(f"{n}, sides, less" for n in SIDED),
+    *LATERAL,
+)
+
+
+def distances(reference: Description, found: Description, flipped: bool) -> NDArray[np.float64]:
+    """Distances (B, len(DISTANCES)) of described points from the one reference point, mirrored or not."""
+    wide, probe = reference.wide[0], reference.probe[0]
+    sided, lateral = reference.sided[0], reference.lateral[0]
+    if flipped:
+        wide, probe, sided, lateral = _mirror_sectors(wide), _mirror_sectors(probe), sided[:, ::-1], -lateral
+    in_probe = found.probe - probe
+    return np.concatenate(
+        [
+            np.abs(found.wide - wide).mean(axis=2),
+            np.maximum(in_probe, 0).mean(axis=2),
+            np.maximum(-in_probe, 0).mean(axis=2),
+            _sides(found.scalars - reference.scalars[0]),
+            np.maximum(found.sided - sided, 0).sum(axis=2),
+            np.maximum(sided - found.sided, 0).sum(axis=2),
+            np.abs(found.lateral - lateral),
+        ],
+        axis=1,
+    )
+
+
+def default_weights() -> NDArray[np.float64]:
+    """Weights (len(DISTANCES),) by hand, for the training to start from."""
+    weights = {name: 1.0 for name in DISTANCES}
+    for name in DISTANCES:
+        if name.startswith("wide"):
+            weights[name] = 2.0
+        elif name.startswith("probe"):
+            weights[name] = 3.0
+        elif name.startswith("bend"):
+            weights[name] = 0.6
+        elif name.startswith(("thickness", "way")):
+            weights[name] = 0.15
+        elif "well" in name:
+            weights[name] = 0.5 if "less" in name else 0.1
+    return np.array([weights[name] for name in DISTANCES])
+
+
+@lru_cache(maxsize=1)
+def weights() -> NDArray[np.float64]:
+    """The fitted weights that ship with the package."""
+    path = resources.files("magic_matcher").joinpath("embedded_weights.json")
+    if not path.is_file():
+        return default_weights()
+    table = json.loads(path.read_text())["weights"]
+    return np.array([float(table[name]) for name in DISTANCES])
+
+
+def probe_radius(radius: float | None, size: float, fallback: float) -> float:
+    """The disc's radius in pixels: the target's, else ``fallback`` (a share of the size), held within what a grid can show."""
+    value = radius if radius is not None and np.isfinite(radius) else fallback * size
+    return float(np.clip(value, 2.5, 0.3 * size))
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The reference's description, its normal, and the share of its size that stands in for an unknown target radius."""
+
+    description: Description
+    normal: NDArray[np.float64]
+    share: float
+
+
+class EmbeddedFeatures:
+    """Silhouette descriptors in contour frames; needs no weights to download, no GPU, about 20 ms a tool."""
+
+    name = "embedded"
+
+    def __init__(self, weight: NDArray[np.float64] | None = None) -> None:
+        self._weights = weights() if weight is None else np.asarray(weight, dtype=float)
+
+    def key(self) -> str:
+        """Name of this backend and its weights."""
+        return "embedded-" + hashlib.sha256(self._weights.tobytes()).hexdigest()[:16]
+
+    def prepare(self, reference: Reference) -> Prepared:
+        """Describe the reference contact."""
+        size = reference.contour.size
+        share = float(np.clip(min(reference.radius, size) / size, *PROBE_RANGE))
+        index = np.array([reference.contour.nearest(reference.pixel)])
+        probe = probe_radius(reference.target_radius, size, share)
+        return Prepared(describe(reference.contour, index, reference.normal[None], probe), reference.normal, share)
+
+    def dissimilarities(
+        self, prepared: Prepared, contour: Contour, target_radius: float | None
+    ) -> tuple[Description, NDArray[np.float64]]:
+        """Descriptions of the sampled contour points and their distances (2, B, D) to the reference, kept and mirrored."""
+        stride = max(1, len(contour.points) // SAMPLES)
+        indices = np.arange(0, len(contour.points), stride)
+        found = describe(contour, indices, contour.normals[indices], probe_radius(target_radius, contour.size, prepared.share))
+        return found, np.stack([distances(prepared.description, found, flipped) for flipped in (False, True)])
+
+    def propose(
+        self, prepared: Prepared, view: CanonicalView, contour: Contour, target_radius: float | None, count: int, heatmap: bool = False
+    ) -> GlobalMatch:
+        """The ``count`` best contour points, apart from each other; similarity = exp(-weighted distance)."""
+        found, parts = self.dissimilarities(prepared, contour, target_radius)
+        similarity = np.exp(-(parts @ self._weights))
+        flipped = similarity[1] > similarity[0]
+        best = similarity.max(axis=0)
+        chosen = suppress(found.points, best, SUPPRESSION * contour.size, count)
+        proposals = tuple(
+            Proposal(found.points[i], rotation_between(prepared.normal, found.normals[i], bool(flipped[i])), bool(flipped[i]), float(best[i]))
+            for i in chosen
+        )
+        return GlobalMatch(proposals, paint(view.mask, found.points, best) if heatmap else None)
+
+
+def paint(mask: NDArray[np.bool_], points: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """A heat map (H, W) in 0..1 from values at contour points (N, 2), fading with the distance from them; 0 off the mask."""
+    height, width = mask.shape
+    low, high = float(np.min(values)), float(np.max(values))
+    heat = (values - low) / max(high - low, 1e-12)
+    picture = np.zeros((height, width), np.float32)
+    u = np.clip(np.rint(points[:, 0]).astype(int), 0, width - 1)
+    v = np.clip(np.rint(points[:, 1]).astype(int), 0, height - 1)
+    np.maximum.at(picture, (v, u), heat.astype(np.float32))
+    reach = max(3, int(0.02 * max(height, width))) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    picture = cv2.GaussianBlur(cv2.dilate(picture, kernel), (0, 0), reach / 3)
+    return np.where(mask, np.clip(picture, 0, 1), 0).astype(np.float32)

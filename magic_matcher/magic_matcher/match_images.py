@@ -1,0 +1,128 @@
+"""``match_images``: a contact carried from one picture to another, without ROS running.
+
+1. Two pictures on a plain background::
+
+    ros2 run magic_matcher match_images --reference hook.png --reference-point 205 118 --target mug.png --out out
+
+2. With masks, DINOv2 features from a local folder and five candidates::
+
+    ros2 run magic_matcher match_images --reference R.png --reference-point 205 118 --reference-mask RM.png \\
+        --target T.png --target-mask TM.png --features dinov2 --weights ~/dinov2-base --top 5 --out out
+
+``match.json`` holds ``candidates``, best first: pixel, normal, radius and scale in pixels
+of the target picture, concave, rotation (rad), flipped, s_dino, s_curv, score, and
+target_from_reference, the 3x3 that carries pixels of the reference picture onto the
+target's so that the contacts meet (turned, mirrored where flipped, not scaled).
+``match.png`` shows both.  Exit status: 0, or 2 with the code and what was wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from magic_core.contact import ContactCandidate
+from magic_core.errors import MagicError
+from magic_matcher import curvature, drawing, features, images, matching
+from magic_matcher.cache import Cache
+
+
+def _number(value: float) -> float | None:
+    return None if not math.isfinite(value) else float(value)
+
+
+def _planar(reference: features.Reference, candidate: ContactCandidate) -> list[list[float]]:
+    """target_from_reference (3, 3) on pixels."""
+    c, s = math.cos(candidate.rotation), math.sin(candidate.rotation)
+    linear = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if candidate.flipped else 1.0, 1.0])
+    shift = candidate.tool.pixel - linear @ reference.pixel
+    return [[*map(float, linear[0]), float(shift[0])], [*map(float, linear[1]), float(shift[1])], [0.0, 0.0, 1.0]]
+
+
+def record(reference: features.Reference, candidate: ContactCandidate) -> dict[str, Any]:
+    """One candidate as plain data; straight edges have radius ``null``."""
+    return {
+        "pixel": [float(v) for v in candidate.tool.pixel],
+        "normal": [float(v) for v in candidate.tool.normal],
+        "radius": _number(candidate.tool.radius),
+        "concave": candidate.tool.concave,
+        "scale": float(candidate.tool.scale),
+        "rotation": candidate.rotation,
+        "flipped": candidate.flipped,
+        "s_dino": candidate.s_dino,
+        "s_curv": candidate.s_curv,
+        "score": candidate.score,
+        "target_from_reference": _planar(reference, candidate),
+    }
+
+
+def run(given: argparse.Namespace) -> dict[str, Any]:
+    """Do what the command line asks for; returns what ``match.json`` holds."""
+    first = images.view(given.reference, given.reference_mask)
+    second = images.view(given.target, given.target_mask)
+    reference = features.make_reference(first, np.array(given.reference_point, dtype=float))
+    matcher = matching.Matcher(features.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None)
+    contact = matching.to_contact(first, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
+    result = matcher.match_views(reference, contact, [matching.Tool("target", second)], None, given.top, heatmap=True)
+    data = {
+        "reference": {
+            "pixel": [float(v) for v in reference.pixel],
+            "normal": [float(v) for v in reference.normal],
+            "radius": _number(reference.radius),
+            "concave": reference.concave,
+        },
+        "candidates": [record(reference, candidate) for candidate in result.candidates],
+        "features": result.features,
+        "seconds": result.seconds,
+    }
+    out = Path(given.out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "match.json").write_text(json.dumps(data, indent=1) + "\n")
+    shown = [drawing.draw_match(first, contact), drawing.draw_match(second, [c.tool for c in result.candidates], result.heatmap)]
+    picture = drawing.side_by_side(shown, ("reference", f"target, best score {result.candidates[0].score:.3f}"), height=max(384, second.mask.shape[0]))
+    cv2.imwrite(str(out / "match.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    return data
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(prog="match_images", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--reference", required=True, metavar="R.png", help="picture of the reference tool")
+    p.add_argument("--reference-point", required=True, nargs=2, type=float, metavar=("U", "V"), help="its contact point, pixels right and down")
+    p.add_argument("--reference-mask", metavar="M.png", help="its mask, 255 on the tool; without one the background must be plain")
+    p.add_argument("--target", required=True, metavar="T.png", help="picture of the new tool")
+    p.add_argument("--target-mask", metavar="M.png", help="its mask")
+    p.add_argument("--features", default="auto", choices=features.BACKENDS, help="feature backend (default: auto)")
+    p.add_argument("--weights", default="", help="hub name or folder of weights, for dinov2")
+    p.add_argument("--device", default="cpu", help="torch device (default: cpu)")
+    p.add_argument("--top", type=int, default=3, metavar="K", help="how many candidates (default: 3)")
+    p.add_argument("--cache", default="", metavar="DIR", help="keep the prepared reference in this folder")
+    p.add_argument("--out", required=True, metavar="DIR", help="folder for match.json and match.png")
+    return p
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The command; errors are one line on stderr and exit status 2."""
+    given = parser().parse_args(argv)
+    try:
+        data = run(given)
+    except MagicError as error:
+        print(f"match_images: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        print(f"match_images: {error}", file=sys.stderr)
+        sys.exit(2)
+    for k, candidate in enumerate(data["candidates"]):
+        u, v = candidate["pixel"]
+        print(f"{k + 1}: pixel ({u:.1f}, {v:.1f})  score {candidate['score']:.3f}  s_dino {candidate['s_dino']:.3f}  s_curv {candidate['s_curv']:.3f}")
+
+
+if __name__ == "__main__":
+    main()

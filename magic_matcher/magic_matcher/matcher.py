@@ -1,0 +1,180 @@
+"""The matcher node: answers ``match_contact`` from the latest objects or from images in the request."""
+
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
+from magic_interfaces.msg import SceneObjectArray
+from magic_interfaces.srv import MatchContact
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.node import Node
+
+from magic_core import conversions, qos, strategy
+from magic_core import node as nodes
+from magic_core.errors import Code, MagicError
+from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.strategy import Strategy
+from magic_matcher import features, matching
+from magic_matcher.cache import Cache
+from magic_matcher.features import BACKENDS
+
+
+class MatcherNode(Node):
+    """Contacts on new tools by analogy with a demonstration's.
+
+    Service ``match_contact`` (magic_interfaces/MatchContact), subscription ``objects``
+    (magic_interfaces/SceneObjectArray, latched).
+
+    Parameters: ``features`` (auto, embedded, dinov2), ``weights`` (hub name or folder,
+    for dinov2), ``device`` (cpu, cuda), ``top_k``, ``curvature_weight`` (lambda),
+    ``strategies`` (folder; empty: the installed ones), ``cache`` (folder of what is kept
+    of references; empty: the user's cache folder; ``none``: memory only).
+    """
+
+    def __init__(self) -> None:
+        super().__init__("matcher")
+        name = nodes.parameter(self, "features", "auto", "feature backend: auto takes dinov2 where weights are named", choices=BACKENDS, read_only=True)
+        weights = nodes.parameter(self, "weights", "", "hub name or local folder of DINOv2 or DINOv3 weights", read_only=True)
+        device = nodes.parameter(self, "device", "cpu", "torch device of the network", read_only=True)
+        nodes.parameter(self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50)
+        weight = nodes.parameter(self, "curvature_weight", matching.score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True)
+        self._root = nodes.parameter(self, "strategies", "", "folder of strategies; empty: the installed ones", read_only=True)
+        cache = nodes.parameter(self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True)
+        self._matcher = matching.Matcher(features.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
+        self._scene: Scene | None = None
+        self._strategies: dict[str, tuple[int, Strategy]] = {}
+        self._lock = threading.Lock()
+        # Requests run side by side; the objects come in beside them.
+        self.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=MutuallyExclusiveCallbackGroup())
+        self._warm_up()
+        self.create_service(MatchContact, "match_contact", self._on_match, callback_group=ReentrantCallbackGroup())
+        self.get_logger().info(f"ready: features {self._matcher.backend.name}; waiting for objects on {self.resolve_topic_name('objects')} (requests with images need none)")
+
+    def _warm_up(self) -> None:
+        """Prepare the installed strategies' references, so that the first request is as quick as the rest."""
+        try:
+            root = Path(self._root) if self._root else strategy.installed_folder()
+        except LookupError:
+            self.get_logger().warning("no strategies: magic_bringup is not installed; requests must name the path of a strategy folder")
+            return
+        names = sorted(path.parent.name for path in root.glob("*/strategy.yaml"))
+        for name in names:
+            try:
+                self._matcher.prepare(features.from_strategy(self._strategy(name)))
+            except MagicError as error:
+                self.get_logger().warning(f"strategy {name} cannot be matched: {error}")
+        self.get_logger().info(f"strategies in {root}: {', '.join(names) or 'none'}")
+
+    def _strategy(self, name: str) -> Strategy:
+        """The strategy of that name, read again where its file has changed."""
+        if not name:
+            raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, "the name of an installed strategy or the path of a strategy folder")
+        if "/" in name:
+            path = Path(name) / "strategy.yaml"
+        else:
+            try:
+                path = (Path(self._root) if self._root else strategy.installed_folder()) / name / "strategy.yaml"
+            except LookupError as error:
+                raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, "the path of a strategy folder (magic_bringup is not installed)") from error
+        stamp = path.stat().st_mtime_ns if path.is_file() else 0
+        with self._lock:
+            kept = self._strategies.get(name)
+        if kept is not None and kept[0] == stamp:
+            return kept[1]
+        found = strategy.find(name, self._root or None)
+        with self._lock:
+            if len(self._strategies) >= 32:
+                self._strategies.pop(next(iter(self._strategies)))
+            self._strategies[name] = (stamp, found)
+        return found
+
+    def _on_objects(self, msg: SceneObjectArray) -> None:
+        try:
+            scene = conversions.scene_from_msg(msg)
+        except Exception as error:  # a bad message must not end the node
+            self.get_logger().error(f"objects ignored: {nodes.describe(self, error)[1]}")
+            return
+        first = self._scene is None
+        self._scene = scene
+        if first:
+            self.get_logger().info(f"objects: {', '.join(item.id for item in scene.objects) or 'none'}")
+
+    def _on_match(self, request: MatchContact.Request, response: MatchContact.Response) -> MatchContact.Response:
+        try:
+            self._answer(request, response)
+        except Exception as error:  # every failure is answered with a code
+            response.code, response.message = nodes.describe(self, error)
+            response.candidates = []
+            self.get_logger().warning(f"match refused: {response.message}")
+        return response
+
+    def _answer(self, request: MatchContact.Request, response: MatchContact.Response) -> None:
+        found = self._strategy(request.strategy)
+        tools, target, poses = self._parties(request, found)
+        top_k = int(request.top_k) or int(self.get_parameter("top_k").value)
+        result = self._matcher.match(found, tools, target, top_k, request.want_heatmap)
+        response.code, response.message = int(Code.OK), f"{len(result.candidates)} candidates on {len(tools)} tool(s)"
+        response.candidates = [conversions.candidate_to_msg(c, poses.get(c.tool_id)) for c in result.candidates]
+        response.target_id = result.target_id
+        response.features = result.features
+        response.seconds = result.seconds
+        if result.heatmap is not None:
+            response.heatmap = conversions.image_to_msg(result.heatmap, "32FC1")
+
+    def _parties(
+        self, request: MatchContact.Request, found: Strategy
+    ) -> tuple[list[SceneObject] | list[matching.Tool], SceneObject | CanonicalView | None, dict[str, np.ndarray]]:
+        """Tools, target and the tools' poses that a request means."""
+        has_target_view = _has_image(request.target_view)
+        views = [_view(view, f"tool_views[{k}]") for k, view in enumerate(request.tool_views)]
+        if request.tool_ids and views:
+            raise MagicError(Code.BAD_REQUEST, "tool_ids and tool_views", "both given", "one of the two")
+        if request.target_id and has_target_view:
+            raise MagicError(Code.BAD_REQUEST, "target_id and target_view", "both given", "one of the two")
+        target: SceneObject | CanonicalView | None = _view(request.target_view, "target_view") if has_target_view else None
+        if views:
+            if target is None and request.target_id:
+                target = self._objects().find(request.target_id)
+            return [matching.Tool(f"view_{k}", view) for k, view in enumerate(views)], target, {}
+        scene = self._objects()
+        if has_target_view:
+            items = [scene.find(name) for name in request.tool_ids] or [item for item in scene.objects if item.source != "known"]
+            tools: list[SceneObject] = items
+        else:
+            tools, target = matching.select(scene, found, list(request.tool_ids), request.target_id)
+        return tools, target, {item.id: item.world_from_object for item in tools}
+
+    def _objects(self) -> Scene:
+        if self._scene is None:
+            raise MagicError(
+                Code.UNKNOWN_OBJECT, "objects", "none received yet", f"a SceneObjectArray on {self.resolve_topic_name('objects')}, or images in the request"
+            )
+        return self._scene
+
+
+def _has_image(view: CanonicalViewMsg) -> bool:
+    return view.image.width > 0 or view.image.height > 0 or len(view.image.data) > 0
+
+
+def _view(msg: CanonicalViewMsg, what: str) -> CanonicalView:
+    """A view of a request; an unset scale (0) means one metre a pixel, as nothing better is known."""
+    if msg.metres_per_pixel == 0.0 or math.isnan(msg.metres_per_pixel):
+        msg.metres_per_pixel = 1.0
+    try:
+        return conversions.view_from_msg(msg)
+    except MagicError as error:
+        code = Code.BAD_REQUEST_IMAGE if 100 <= error.code < 200 else error.code
+        raise MagicError(code, f"{what}: {error.message}") from error
+
+
+def main() -> None:
+    """Run the matcher until it is told to stop."""
+    nodes.run(MatcherNode)
+
+
+if __name__ == "__main__":
+    main()

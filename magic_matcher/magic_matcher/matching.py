@@ -1,0 +1,336 @@
+"""From one demonstration's contact to ranked contacts on new tools (paper, section III).
+
+:class:`Matcher` joins the stages: the backend proposes places (global), curvature
+refines each (local), the score ranks them, for one tool or for several, with the
+contact on the target that each would meet.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.contact import Contact, ContactCandidate, contact_frame, turned_over
+from magic_core.errors import Code, MagicError
+from magic_core.rendering import canonical_view
+from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.strategy import Strategy
+from magic_matcher import contour as contours
+from magic_matcher import curvature, features, score
+from magic_matcher.contour import Contour
+from magic_matcher.features import Features, GlobalMatch, Proposal, Reference
+
+#: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them.
+OVERSAMPLING = 2
+#: Two candidates nearer than this share of the tool's size are the same place.
+SAME_PLACE = 0.06
+
+
+@dataclass(frozen=True)
+class MatchResult:
+    """candidates best first (of all tools together); heatmap (H, W) float32 0..1 over the view
+    of the best candidate's tool, ``None`` unless asked for; views: the view that was matched,
+    for each tool id; target_id: '' where the target came as a view or there was none."""
+
+    candidates: tuple[ContactCandidate, ...]
+    heatmap: NDArray[np.float32] | None
+    views: dict[str, CanonicalView]
+    target_id: str
+    features: str
+    seconds: float
+    target_view: CanonicalView | None = None
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A tool to consider: its id and the view in which contacts are matched."""
+
+    id: str
+    view: CanonicalView
+
+
+@dataclass(frozen=True)
+class Target:
+    """The object to act on: its id, the view along the strategy's direction and p_O on it."""
+
+    id: str
+    view: CanonicalView
+    contact: Contact
+
+
+# ---------------------------------------------------------------- views
+
+
+def tool_view(item: SceneObject, kind: str) -> CanonicalView:
+    """The view of an object that a strategy matches in: the published one, or drawn again from the mesh where the kind differs."""
+    if item.view.kind == kind:
+        return item.view
+    from magic_core.views import find_view
+
+    return find_view(item.mesh, item.pieces, kind)
+
+
+def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
+    """The target as seen along the strategy's direction, world up (world x where it looks down) at the top of the picture."""
+    object_from_world = transforms.inverse(item.world_from_object)
+    direction = strategy.target_view_direction
+    up = np.array([0.0, 0.0, 1.0]) if abs(direction[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    rotation = object_from_world[:3, :3]
+    return canonical_view(item.mesh, rotation @ direction, rotation @ up, strategy.view)
+
+
+# ---------------------------------------------------------------- contacts
+
+
+def to_contact(view: CanonicalView, found: curvature.Estimate) -> Contact:
+    """A Contact (metres) from an estimate (pixels of the view)."""
+    scale = view.metres_per_pixel
+    normal = found.normal / np.linalg.norm(found.normal)
+    return Contact(found.point, normal, found.radius * scale, found.concave, found.scale * scale, contact_frame(view, found.point, normal))
+
+
+def support_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
+    """Index of the contour point farthest along a picture direction (2,); in the middle of a flat side."""
+    outer = np.nonzero(contour.loop == 0)[0]
+    height = contour.points @ direction
+    top = float(height[outer].max())
+    level = outer[height[outer] >= top - tolerance]
+    across = contour.points[level] @ np.array([-direction[1], direction[0]])
+    middle = 0.5 * (float(across.min()) + float(across.max()))
+    return int(level[np.argmin(np.abs(across - middle))])
+
+
+def target_contact(strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64]) -> Contact:
+    """p_O': where the target's silhouette reaches farthest along the strategy's target normal, with the curvature there."""
+    normal = world_from_object[:3, :3].T @ strategy.target_normal
+    picture = normal @ view.object_from_view[:3, :2]
+    if np.linalg.norm(picture) < 0.1:
+        raise MagicError(Code.BAD_STRATEGY, "target normal", strategy.target_normal.round(3).tolist(), "a direction that is seen in the target's view")
+    direction = picture / np.linalg.norm(picture)
+    contour = contours.extract(view.mask)
+    found = curvature.estimate(contour, support_point(contour, direction))
+    contact = to_contact(view, found)
+    # The normal asked for is the one acted along; the picture's own differs from it by raster noise only.
+    if float(contact.normal @ direction) > np.cos(np.deg2rad(20)):
+        contact = Contact(contact.pixel, direction, contact.radius, contact.concave, contact.scale, contact_frame(view, contact.pixel, direction))
+    return contact
+
+
+def likeness(reference: CanonicalView, view: CanonicalView) -> float:
+    """How alike two silhouettes are, 0..1: overlap of the outlines at equal size, best of four turns, times the ratio of their sizes."""
+    import cv2
+
+    def crop(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        v, u = np.nonzero(mask)
+        if len(v) == 0:
+            raise MagicError(Code.EMPTY_MASK, "pixels of the view that are on the object", 0, "at least 16")
+        side = max(int(np.ptp(v)), int(np.ptp(u))) + 1
+        square = np.zeros((side, side), np.uint8)
+        top, left = (side - int(np.ptp(v)) - 1) // 2, (side - int(np.ptp(u)) - 1) // 2
+        part = mask[v.min() : v.max() + 1, u.min() : u.max() + 1]
+        square[top : top + part.shape[0], left : left + part.shape[1]] = part
+        return cv2.resize(square, (64, 64), interpolation=cv2.INTER_AREA) > 0
+
+    def extent(item: CanonicalView) -> float:
+        return float(np.sqrt(item.mask.sum())) * item.metres_per_pixel
+
+    a, b = crop(reference.mask), crop(view.mask)
+    overlap = max(float((a & t).sum() / (a | t).sum()) for t in (np.rot90(b, k) for k in range(4)))
+    sizes = sorted((extent(reference), extent(view)))
+    return overlap * (sizes[0] / max(sizes[1], 1e-12))
+
+
+def choose_target(strategy: Strategy, objects: Sequence[SceneObject]) -> SceneObject:
+    """The object that looks most like the demonstration's target, seen as the target is, in shape and size."""
+    if not objects:
+        raise MagicError(Code.UNKNOWN_OBJECT, "objects to choose the target from", 0, "at least one")
+    return max(objects, key=lambda item: likeness(strategy.target_view, target_view(item, strategy)))
+
+
+# ---------------------------------------------------------------- the matcher
+
+
+@dataclass
+class Matcher:
+    """Both stages with one backend.
+
+    weight is lambda; two_step=False leaves out the second curvature estimate and the
+    convexity search (the paper's ablation).  What the backend prepared of a reference is
+    kept, in memory and, with ``cache`` (a :class:`magic_matcher.cache.Cache`), on disk.
+    """
+
+    backend: Features
+    weight: float = score.LAMBDA
+    two_step: bool = True
+    cache: Any = None
+    _prepared: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def prepare(self, reference: Reference) -> Any:
+        """The backend's view of a reference, computed once."""
+        key = f"{self.backend.key()}-{reference.key()}"
+        if key not in self._prepared:
+            if len(self._prepared) >= 16:  # memory stays flat over any number of different references
+                self._prepared.pop(next(iter(self._prepared)))
+            make = lambda: self.backend.prepare(reference)  # noqa: E731
+            self._prepared[key] = self.cache.get(key, make) if self.cache is not None else make()
+        return self._prepared[key]
+
+    def match(
+        self,
+        strategy: Strategy,
+        tools: Sequence[SceneObject | Tool],
+        target: SceneObject | CanonicalView | None = None,
+        top_k: int = 3,
+        heatmap: bool = False,
+    ) -> MatchResult:
+        """Ranked contacts on the tools: at most ``top_k`` a tool, all tools' together, best first.
+
+        target as a view alone stands in the pose of its view frame's object (the object frame is taken for the world).
+        """
+        start = time.perf_counter()
+        drawn = [item if isinstance(item, Tool) else Tool(item.id, tool_view(item, strategy.view)) for item in tools]
+        met: Target | None = None
+        if isinstance(target, SceneObject):
+            view = target_view(target, strategy)
+            met = Target(target.id, view, target_contact(strategy, view, target.world_from_object))
+        elif target is not None:
+            met = Target("", target, target_contact(strategy, target, np.eye(4)))
+        reference = features.from_strategy(strategy)
+        return self.match_views(reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start)
+
+    def match_views(
+        self,
+        reference: Reference,
+        reference_contact: Contact,
+        tools: Sequence[Tool],
+        target: Target | None,
+        top_k: int = 3,
+        heatmap: bool = False,
+        reference_target_radius: float | None = None,
+        start: float | None = None,
+    ) -> MatchResult:
+        """As :meth:`match`, from a reference and views; reference_target_radius r(p_O) in metres."""
+        start = time.perf_counter() if start is None else start
+        if top_k < 1:
+            raise MagicError(Code.BAD_REQUEST, "top_k", top_k, "1 or more")
+        if not tools:
+            raise MagicError(Code.UNKNOWN_OBJECT, "tools", "none", "at least one object besides the target")
+        prepared = self.prepare(reference)
+        use_target = target is not None and reference_target_radius is not None
+        found: list[tuple[ContactCandidate, NDArray[np.float32] | None]] = []
+        failures: list[MagicError] = []
+        for tool in tools:
+            try:
+                contour = contours.extract(tool.view.mask)
+                radius = target.contact.radius / tool.view.metres_per_pixel if target is not None else None
+                radius = radius if radius is not None and np.isfinite(radius) else None
+                proposals = self.backend.propose(prepared, tool.view, contour, radius, OVERSAMPLING * top_k, heatmap)
+                reference_scale = reference_target_radius if use_target else reference.contour.size * reference.view.metres_per_pixel
+                scale = target.contact.radius if use_target else contour.size * tool.view.metres_per_pixel
+                ratio = reference.radius * reference.view.metres_per_pixel / reference_scale
+                ranked = self._refine(reference, reference_contact, ratio, scale, tool, contour, proposals, target, top_k)
+                found.extend((candidate, proposals.heatmap) for candidate in ranked)
+            except MagicError as error:
+                failures.append(error)
+        if not found:
+            if len(failures) == 1:
+                raise failures[0]
+            raise MagicError(Code.NO_MATCH, "tools without a usable contact", "; ".join(f.message for f in failures), "a tool with an edge to follow")
+        found.sort(key=lambda pair: -pair[0].score)
+        return MatchResult(
+            candidates=tuple(candidate for candidate, _ in found),
+            heatmap=found[0][1],
+            views={tool.id: tool.view for tool in tools},
+            target_id=target.id if target is not None else "",
+            features=self.backend.name,
+            seconds=time.perf_counter() - start,
+            target_view=target.view if target is not None else None,
+        )
+
+    def _refine(
+        self,
+        reference: Reference,
+        reference_contact: Contact,
+        ratio: float,
+        scale: float,
+        tool: Tool,
+        contour: Contour,
+        proposals: GlobalMatch,
+        target: Target | None,
+        top_k: int,
+    ) -> list[ContactCandidate]:
+        """The local stage on each proposal, the score, and the best ``top_k`` different places."""
+        candidates: list[ContactCandidate] = []
+        for proposal in proposals.proposals:
+            try:
+                local = curvature.estimate(contour, contour.nearest(proposal.pixel), reference.concave, two_step=self.two_step)
+            except MagicError:
+                continue
+            contact = to_contact(tool.view, local)
+            s_curv = score.curvature_score(ratio, contact.radius / scale, contact.concave == reference.concave)
+            frame = turned_over(contact.object_from_contact) if proposal.flipped else contact.object_from_contact
+            candidates.append(
+                ContactCandidate(
+                    tool_id=tool.id,
+                    tool=contact,
+                    target=target.contact if target is not None else None,
+                    rotation=features.rotation_between(reference.normal, contact.normal, proposal.flipped),
+                    flipped=proposal.flipped,
+                    s_dino=proposal.similarity,
+                    s_curv=s_curv,
+                    score=score.combine(proposal.similarity, s_curv, self.weight),
+                    tool_from_reference=frame @ transforms.inverse(reference_contact.object_from_contact),
+                )
+            )
+        if not candidates:
+            raise MagicError(Code.NO_MATCH, f"usable contacts on {tool.id or 'the tool'}", 0, "a tool with an edge of at least 5 points to fit")
+        points = np.array([c.tool.pixel for c in candidates])
+        order = features.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, top_k)
+        return [candidates[i] for i in order]
+
+
+def match(
+    strategy: Strategy,
+    tools: Sequence[SceneObject | Tool],
+    target: SceneObject | CanonicalView | None,
+    backend: Features,
+    top_k: int = 3,
+    heatmap: bool = False,
+) -> MatchResult:
+    """One match without keeping anything; see :meth:`Matcher.match`."""
+    return Matcher(backend).match(strategy, tools, target, top_k, heatmap)
+
+
+def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id: str) -> tuple[list[SceneObject], SceneObject]:
+    """The tools and the target that a request names, or that are meant by naming none.
+
+    No tool: every object that was seen by the cameras, but the target; where there is
+    none of them, every other object.  No target: the one most like the demonstration's
+    among the objects not named as tools.
+    """
+    named = [scene.find(name) for name in tool_ids]
+    if target_id:
+        target = scene.find(target_id)
+    else:
+        rest = [item for item in scene.objects if item.id not in set(tool_ids)]
+        if not rest:
+            raise MagicError(Code.UNKNOWN_OBJECT, "objects left to be the target", 0, "name a target_id, or have one more object on the table")
+        target = choose_target(strategy, rest)
+    if target.id in set(tool_ids):
+        raise MagicError(Code.BAD_REQUEST, "target_id", target.id, "an object that is not one of tool_ids")
+    if named:
+        return named, target
+    others = [item for item in scene.objects if item.id != target.id]
+    tools = [item for item in others if item.source != "known"] or others
+    if not tools:
+        raise MagicError(Code.UNKNOWN_OBJECT, "objects to use as the tool", 0, f"at least one besides the target {target.id}")
+    return tools, target
+
+
+__all__ = ["MatchResult", "Matcher", "Proposal", "Target", "Tool", "choose_target", "likeness", "match", "select", "support_point", "target_contact", "target_view", "tool_view"]
