@@ -1,0 +1,176 @@
+"""The ``planner`` node: the action ``plan_motion``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from magic_interfaces.action import PlanMotion
+from numpy.typing import NDArray
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from magic_core import conversions as convert
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_core.motion import VARIANTS, MotionPlan
+from magic_core.node import describe, parameter, run
+from magic_planner.budget import Budget
+from magic_planner.object_motion import plan_tool_motion
+
+
+class PlannerNode(Node):
+    """Turns a contact into a motion of the tool and, for the arm variant, of the arm.
+
+    Action server: ``plan_motion`` (magic_interfaces/action/PlanMotion).  The goal
+    carries everything; the node keeps no state between goals.  One goal at a time: a
+    goal during another one is answered BUSY at once.  Cancelling takes effect inside
+    the stages, within one search for a free path (half a second) at the latest.
+
+    Parameters: see ``config/planner.param.yaml``.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("planner", **kwargs)
+        self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
+        self._timeout = parameter(self, "timeout", 10.0, "Wall time in s for one goal that names none.", low=0.05, high=3600.0)
+        self._busy = threading.Lock()
+        self._arm = self._load_arm() if parameter(self, "arm", True, "Load the arm; without it only the variant fg is served.") else None
+        self._server = ActionServer(
+            self,
+            PlanMotion,
+            "plan_motion",
+            self._execute,
+            goal_callback=lambda _goal: GoalResponse.ACCEPT,
+            cancel_callback=lambda _handle: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
+        self.get_logger().info("ready: waiting for goals of plan_motion")
+
+    def destroy_node(self) -> None:
+        """Take the action server down with the node."""
+        self._server.destroy()
+        super().destroy_node()
+
+    def _load_arm(self) -> Any:
+        """Declare the arm's parameters and load it, so that the first goal does not pay for it; raises BAD_REQUEST."""
+        from magic_planner.arm import ArmPlanner, ArmSettings
+        from magic_planner.grasps import GraspSettings
+        from magic_planner.robot import PANDA_ACCELERATION, PANDA_HOME, Robot, RobotConfig
+
+        started = time.monotonic()
+        config = RobotConfig(
+            urdf=parameter(self, "robot.urdf", "", "URDF of arm and gripper; empty: the Panda of example-robot-data."),
+            srdf=parameter(self, "robot.srdf", "", "SRDF with the pairs of links that may touch."),
+            package_root=parameter(self, "robot.package_root", "", "Folder that package:// stands for; empty: found from the URDF's place."),
+            move_group=parameter(self, "robot.move_group", "panda_hand_tcp", "Link between the fingertips, z out of the hand."),
+            closing_axis=parameter(self, "robot.closing_axis", "y", "Axis of that link along which the fingers close.", choices=("x", "y")),
+            opening=parameter(self, "robot.opening", 0.08, "Metres between the open fingers.", low=0.005, high=1.0),
+            home=tuple(parameter(self, "robot.home", list(PANDA_HOME), "Home configuration, rad.")),
+            acceleration=tuple(parameter(self, "robot.acceleration", list(PANDA_ACCELERATION), "Acceleration limits, rad/s^2, one a joint or one for all.")),
+            velocity_scale=parameter(self, "robot.velocity_scale", 0.3, "Share of the velocity limits that is used.", low=0.01, high=1.0),
+            acceleration_scale=parameter(self, "robot.acceleration_scale", 0.2, "Share of the acceleration limits that is used.", low=0.01, high=1.0),
+        )
+        grasping = GraspSettings(
+            agreement=parameter(self, "grasp.agreement", 0.9, "Least cosine between the normals at the two fingers.", low=0.0, high=1.0),
+            samples=parameter(self, "grasp.samples", 500, "Surface points tried for a grasp.", low=10, high=20000),
+            clearance=parameter(self, "grasp.clearance", 0.0015, "Metres between hand and table.", low=0.0, high=0.1),
+            away=parameter(self, "grasp.away", 0.035, "Metres around the contact in which no finger is placed.", low=0.0, high=1.0),
+        )
+        settings = ArmSettings(
+            standoff=parameter(self, "standoff", 0.08, "Metres of straight way to the grasp.", low=0.01, high=0.5),
+            lift=parameter(self, "lift", 0.06, "Metres straight up after the grasp.", low=0.005, high=0.5),
+            retreat=parameter(self, "retreat", 0.08, "Metres straight away after a release.", low=0.01, high=0.5),
+            dwell=parameter(self, "dwell", 0.5, "Seconds for the fingers to close or open.", low=0.0, high=10.0),
+            time_step=parameter(self, "time_step", 0.02, "Seconds between the points of the trajectory.", low=0.002, high=0.2),
+        )
+        planner = ArmPlanner(Robot(config), settings, grasping)
+        planner.warm_up()
+        self.get_logger().info(f"arm {config.urdf or 'panda'} ready after {time.monotonic() - started:.2f} s")
+        return planner
+
+    def _execute(self, handle: Any) -> PlanMotion.Result:
+        started = time.monotonic()
+        result = PlanMotion.Result()
+        if not self._busy.acquire(blocking=False):
+            result.code, result.message = int(Code.BUSY), "another motion is being planned; send the goal again when it has ended"
+            handle.abort()
+            return result
+        try:
+            plan = self._plan(handle)
+            result.plan = convert.plan_to_msg(plan, handle.request.tool.id)
+            end = (plan.arm_motion or plan.tool_motion).times[-1]
+            result.code, result.message = int(Code.OK), f"a motion of {end:.1f} s in {len(plan.tool_motion.phases)} phases"
+        except Exception as error:  # no handler lets an exception out
+            result.code, result.message = describe(self, error)
+        finally:
+            self._busy.release()
+        result.seconds = time.monotonic() - started
+        self.get_logger().info(f"{handle.request.strategy} {handle.request.variant} {handle.request.tool.id}: {Code(result.code).name}: {result.message} ({result.seconds:.2f} s)")
+        if result.code == Code.OK:
+            handle.succeed()
+        elif result.code == Code.CANCELED and handle.is_cancel_requested:
+            handle.canceled()
+        else:
+            handle.abort()
+        return result
+
+    def _plan(self, handle: Any) -> MotionPlan:
+        goal = handle.request
+        if goal.variant not in VARIANTS:
+            raise MagicError(Code.UNKNOWN_VARIANT, "variant", goal.variant, VARIANTS)
+        if not (np.isfinite(goal.timeout) and goal.timeout >= 0):
+            raise MagicError(Code.BAD_REQUEST, "timeout", goal.timeout, "0 or a number of seconds above it")
+        budget = Budget(goal.timeout or self._timeout, lambda: bool(handle.is_cancel_requested))
+
+        def feedback(stage: str, message: str) -> None:
+            handle.publish_feedback(PlanMotion.Feedback(stage=stage, message=message))
+
+        feedback("motion", f"moving {goal.tool.id} by strategy {goal.strategy}")
+        strategy = strategies.find(goal.strategy, self._strategies or None)
+        tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
+        ids = [tool.id, target.id, *(o.id for o in obstacles)]
+        if len(set(ids)) != len(ids) or "" in ids:
+            raise MagicError(Code.BAD_REQUEST, "object ids", ", ".join(repr(i) for i in ids), "ids that are not empty and differ")
+        candidate = convert.candidate_from_msg(goal.candidate)
+        table = convert.plane_from_msg(goal.table)
+        reflection = goal.reflection or "keep"
+        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles)
+        budget.check("motion")
+        if goal.variant == "fg":
+            if goal.attempt:
+                raise MagicError(Code.BAD_REQUEST, "attempt", goal.attempt, "0: the floating gripper has one motion for each candidate and reflection")
+            return MotionPlan("fg", motion)
+        if self._arm is None:
+            raise MagicError(Code.UNKNOWN_VARIANT, "variant", goal.variant, "fg, as this planner was started without an arm")
+        start = self._start(goal.start)
+        return self._arm.plan(
+            strategy, tool, target, candidate, reflection, motion, table, obstacles, start, int(goal.attempt), int(goal.seed), budget, feedback
+        )
+
+    def _start(self, state: JointState) -> NDArray[np.float64] | None:
+        """Joint positions of the arm out of a JointState (in any order, fingers and others left out); None where it is empty."""
+        if not state.name and not state.position:
+            return None
+        if len(state.name) != len(state.position):
+            raise MagicError(Code.BAD_REQUEST, "start: names and positions", f"{len(state.name)} and {len(state.position)}", "as many positions as names")
+        found = dict(zip(state.name, state.position, strict=True))
+        names = self._arm.robot.chain.names
+        missing = [name for name in names if name not in found]
+        if missing:
+            raise MagicError(Code.BAD_REQUEST, "start: joints", f"without {', '.join(missing)}", names)
+        return np.array([found[name] for name in names], dtype=float)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run magic_planner planner``."""
+    run(PlannerNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""Whole arm motions: they do what the tool's motion asks, within the limits, the same each time, or say why not."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+import scenes
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.strategy import Waypoint
+from magic_planner.budget import Budget
+from magic_planner.object_motion import plan_tool_motion
+
+
+def problem(at=(0.6, 0.0), **changes):
+    tool, tool_contact = scenes.hook()
+    target, target_contact = scenes.standing_cylinder(at=at)
+    strategy = scenes.pulling(**changes)
+    candidate = scenes.candidate(tool, tool_contact, target_contact)
+    return strategy, tool, target, candidate, "keep", plan_tool_motion(strategy, tool, target, candidate)
+
+
+@pytest.fixture(scope="module")
+def solved(arm):
+    given = problem()
+    return given, arm.plan(*given)
+
+
+def span(plan, name):
+    return next(p for p in plan.arm_motion.phases if p.name == name)
+
+
+def test_the_hand_carries_the_tool_along_the_asked_path(arm, solved):
+    (_, tool, _, _, _, motion), plan = solved
+    times, held = plan.arm_motion.times, plan.arm_motion.times >= plan.arm_motion.grasp_time
+    tips = arm.robot.chain.forward(plan.arm_motion.positions)
+    expected = plan.tool_motion.world_from_tool @ plan.arm_motion.tool_from_tcp
+    assert np.linalg.norm(tips[held, :3, 3] - expected[held, :3, 3], axis=1).max() < 1e-3
+    # ... which is the tool's own motion: each pose of the task lies on it.
+    began = span(plan, "approach").start
+    task = times >= began + 1e-9
+    asked = motion.world_from_tool
+    for pose in plan.tool_motion.world_from_tool[task][::5]:
+        gap = np.linalg.norm(asked[:, :3, 3] - pose[:3, 3], axis=1)
+        near = asked[int(gap.argmin())]
+        assert gap.min() < 0.0035  # half a step between samples, and a millimetre
+        assert transforms.rotation_angle(near, pose) < np.deg2rad(0.5)
+    np.testing.assert_allclose(plan.tool_motion.world_from_tool[task][0], asked[0], atol=1e-3)
+    np.testing.assert_allclose(plan.tool_motion.world_from_tool[-1], asked[-1], atol=1e-3)
+    np.testing.assert_array_equal(plan.tool_motion.world_from_tool[0], tool.world_from_object)
+
+
+def test_the_contact_is_reached_at_the_end_of_its_phase(solved):
+    (_, _, target, candidate, _, _), plan = solved
+    when = span(plan, "contact").end
+    pose = transforms.interpolate(plan.tool_motion.times, plan.tool_motion.world_from_tool, [when])[0]
+    tool_contact = pose @ candidate.tool.object_from_contact
+    target_contact = target.world_from_object @ candidate.target.object_from_contact
+    assert np.linalg.norm(tool_contact[:3, 3] - target_contact[:3, 3]) < 1e-3
+
+
+def test_limits_are_kept_and_derivatives_are_derivatives(arm, solved):
+    _, plan = solved
+    motion, robot = plan.arm_motion, arm.robot
+    assert np.all(motion.positions >= robot.chain.lower) and np.all(motion.positions <= robot.chain.upper)
+    assert np.all(np.abs(motion.velocities) <= robot.velocity_limits * 1.001)
+    assert np.all(np.abs(motion.accelerations) <= robot.chain.velocity * 0 + np.array(robot.config.acceleration))
+    assert np.all(np.diff(motion.times) > 0)
+    middle = 0.5 * (motion.velocities[1:] + motion.velocities[:-1]) * np.diff(motion.times)[:, None]
+    assert np.abs(np.diff(motion.positions, axis=0) - middle).max() < 2e-3
+    np.testing.assert_allclose(motion.velocities[[0, -1]], 0, atol=1e-9)
+    np.testing.assert_allclose(motion.positions[0], robot.home, atol=1e-9)
+    assert motion.joint_names == tuple(f"panda_joint{i}" for i in range(1, 8))
+
+
+def test_phases_cover_the_motion_and_the_gripper_closes_on_the_tool(solved):
+    _, plan = solved
+    motion = plan.arm_motion
+    assert [p.name for p in motion.phases] == ["grasp", "transfer", "approach", "contact", "goal"]
+    assert motion.phases[0].start == 0 and motion.phases[-1].end == pytest.approx(motion.times[-1], abs=1e-6)
+    assert motion.grasp_width == pytest.approx(0.02, abs=1e-3)
+    assert motion.phases[0].end - motion.grasp_time == pytest.approx(0.5)
+    assert motion.release_time is None
+    still = (motion.times > motion.grasp_time) & (motion.times < motion.phases[0].end)
+    assert np.abs(motion.velocities[still]).max() == 0
+
+
+def test_no_pose_of_the_plan_is_in_collision(arm, solved):
+    (_, tool, target, _, _, _), plan = solved
+    robot, motion = arm.robot, plan.arm_motion
+    robot.clear()
+    robot.add_table(np.array([0, 0, 1.0, 0]))
+    from magic_planner.collision import convex_shapes
+
+    robot.add(target.id, convex_shapes(target.pieces), target.world_from_object)
+    robot.open_to(motion.grasp_width)
+    robot.attach(tool.id, convex_shapes(tool.pieces), transforms.inverse(motion.tool_from_tcp), tuple(robot.hand))
+    lifted = (motion.times > span(plan, "transfer").start + 1.0) & (motion.times < span(plan, "approach").end)
+    assert lifted.sum() > 20
+    assert not any(robot.collides(q) for q in motion.positions[lifted][::3])
+
+
+def test_the_same_seed_gives_the_same_plan(arm, solved):
+    given, plan = solved
+    again = arm.plan(*given)
+    np.testing.assert_array_equal(plan.arm_motion.positions, again.arm_motion.positions)
+    np.testing.assert_array_equal(plan.arm_motion.times, again.arm_motion.times)
+
+
+def test_another_attempt_is_another_grasp(arm, solved):
+    given, plan = solved
+    other = arm.plan(*given, attempt=1)
+    a, b = plan.arm_motion.tool_from_tcp, other.arm_motion.tool_from_tcp
+    assert np.linalg.norm(a[:3, 3] - b[:3, 3]) > 0.014 or transforms.rotation_angle(a, b) > np.deg2rad(19)
+
+
+def test_a_releasing_strategy_lets_go_and_backs_off(arm):
+    strategy = scenes.pulling()
+    waypoints = (*strategy.waypoints[:3], Waypoint("let go", np.zeros(3), "release"))
+    given = problem(waypoints=waypoints, releases=True)
+    plan = arm.plan(*given)
+    motion = plan.arm_motion
+    assert [p.name for p in motion.phases][-2:] == ["release", "retreat"]
+    assert motion.release_time == pytest.approx(span(plan, "release").start)
+    after = plan.tool_motion.times > motion.release_time
+    np.testing.assert_allclose(plan.tool_motion.world_from_tool[after], np.repeat(plan.tool_motion.world_from_tool[-1:], after.sum(), axis=0))
+    tips = arm.robot.chain.forward(motion.positions[[np.searchsorted(motion.times, motion.release_time), -1]])
+    assert np.linalg.norm(tips[1, :3, 3] - tips[0, :3, 3]) == pytest.approx(0.08, abs=2e-3)
+
+
+def test_out_of_reach_names_the_waypoint(arm):
+    with pytest.raises(MagicError, match="waypoint 'above'") as raised:
+        arm.plan(*problem(at=(1.6, 0.0)))
+    assert raised.value.code == Code.NO_IK
+    strategy = scenes.pulling()
+    far = (*strategy.waypoints[:3], Waypoint("far", np.array([0.9, 0, 0]), "goal", 0.1))
+    with pytest.raises(MagicError, match="waypoint 'far'") as raised:
+        arm.plan(*problem(waypoints=far))
+    assert raised.value.code in (Code.NO_IK, Code.JOINT_LIMIT)
+
+
+def test_a_tool_out_of_reach_is_said(arm):
+    strategy, tool, target, candidate, keep, motion = problem()
+    away = dataclasses.replace(tool, world_from_object=transforms.make(translation=[-1.5, 0, 0.01]))
+    with pytest.raises(MagicError, match="where it lies") as raised:
+        arm.plan(strategy, away, target, candidate, keep, motion)
+    assert raised.value.code == Code.NO_IK
+
+
+def test_a_start_in_collision_names_the_pair(arm):
+    block = scenes.item("block", [scenes.box([0.1, 0.1, 0.1])], transforms.make(translation=[0.3, 0, 0.5]))
+    with pytest.raises(MagicError, match="panda_.* and block|block and panda_") as raised:
+        arm.plan(*problem(), obstacles=[block])
+    assert raised.value.code == Code.START_IN_COLLISION
+
+
+def test_a_start_beyond_the_limits_names_the_joint(arm):
+    start = arm.robot.home.copy()
+    start[3] = 0.5
+    with pytest.raises(MagicError, match="panda_joint4") as raised:
+        arm.plan(*problem(), start=start)
+    assert raised.value.code == Code.JOINT_LIMIT
+    with pytest.raises(MagicError) as raised:
+        arm.plan(*problem(), start=np.zeros(3))
+    assert raised.value.code == Code.BAD_REQUEST
+
+
+def test_an_obstacle_is_gone_around(arm):
+    wall = scenes.item("wall", [scenes.box([0.15, 0.02, 0.25])], transforms.make(translation=[0.45, 0.14, 0.125]))
+    plan = arm.plan(*problem(), obstacles=[wall])
+    assert plan.arm_motion.times[-1] > 5
+
+
+def test_a_cage_about_the_target_is_a_collision_and_not_a_hang(arm):
+    lid = scenes.item("lid", [scenes.box([0.5, 0.5, 0.02])], transforms.make(translation=[0.55, 0, 0.11]))
+    started = time.monotonic()
+    with pytest.raises(MagicError) as raised:
+        arm.plan(*problem(), obstacles=[lid], budget=Budget(6.0))
+    assert raised.value.code in (Code.NO_GRASP, Code.PATH_IN_COLLISION, Code.NO_PATH, Code.NO_IK, Code.JOINT_LIMIT, Code.PLANNING_TIMEOUT)
+    assert time.monotonic() - started < 8
+
+
+def test_cancel_and_deadline_stop_inside_the_stages(arm):
+    asked = []
+
+    def cancelled():
+        asked.append(1)
+        return len(asked) > 3
+
+    with pytest.raises(MagicError) as raised:
+        arm.plan(*problem(), budget=Budget(10.0, cancelled))
+    assert raised.value.code == Code.CANCELED
+    with pytest.raises(MagicError, match="stage") as raised:
+        arm.plan(*problem(), budget=Budget(0.02))
+    assert raised.value.code == Code.PLANNING_TIMEOUT
+
+
+def test_feedback_names_the_stages(arm):
+    stages = []
+    arm.plan(*problem(), feedback=lambda stage, message: stages.append(stage))
+    assert stages[0] == "grasp" and set(stages) >= {"grasp", "task", "lift", "transfer", "approach", "timing"}

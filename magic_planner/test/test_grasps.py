@@ -1,0 +1,107 @@
+"""Antipodal grasps: what they are on bodies whose answers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_planner.budget import Budget
+from magic_planner.collision import Body, hull, mass_centre, merged
+from magic_planner.grasps import GraspSettings, antipodal, collision_free, in_the_way, propose
+
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+
+
+def pairs(pieces, **changes):
+    return antipodal(pieces, 0.08, GraspSettings(**changes), np.random.default_rng(0))
+
+
+def test_a_box_is_gripped_across_its_narrow_sides():
+    centres, closing, widths = pairs([scenes.box([0.2, 0.03, 0.05])])
+    assert len(widths)
+    assert set(np.round(widths, 6)) == {0.03, 0.05}  # 0.2 m does not fit into the hand
+    across = np.isclose(widths, 0.03)
+    np.testing.assert_allclose(np.abs(closing[across]), np.tile([0, 1.0, 0], (across.sum(), 1)), atol=1e-9)
+    np.testing.assert_allclose(centres[across, 1], 0, atol=1e-9)
+
+
+def test_a_cylinder_is_gripped_through_its_axis():
+    centres, closing, widths = pairs([scenes.cylinder(0.02, 0.15)])
+    assert len(widths) > 100
+    np.testing.assert_allclose(widths, 0.04, atol=5e-4)
+    assert np.abs(closing[:, 2]).max() < 1e-6
+    assert np.linalg.norm(centres[:, :2], axis=1).max() < 0.0045  # of 32 facets, each 3.9 mm wide
+
+
+def test_pieces_that_abut_are_one_body():
+    halves = [scenes.box([0.1, 0.03, 0.03], [0.05, 0, 0]), scenes.box([0.1, 0.03, 0.03], [-0.05, 0, 0])]
+    _, closing, widths = pairs(halves)
+    np.testing.assert_allclose(widths, 0.03, atol=1e-9)
+    assert np.abs(closing[:, 0]).max() < 1e-6  # nothing grips the faces between them
+    stacked = [scenes.box([0.2, 0.03, 0.02], [0, 0, 0.01]), scenes.box([0.2, 0.03, 0.02], [0, 0, -0.01])]
+    assert set(np.round(pairs(stacked)[2], 6)) == {0.03, 0.04}
+
+
+def test_slanted_faces_count_only_as_far_as_the_normals_agree():
+    wedge = scenes.box([0.1, 0.04, 0.04])
+    vertices = wedge.vertices.copy()
+    vertices[:, 1] *= np.where(vertices[:, 2] > 0, 0.2, 1.0)  # sides 21.8 degrees from the upright
+    wedge = type(wedge)(vertices, wedge.faces)
+    sides = [np.abs(c[:, 1]).max() > 0.9 if len(c) else False for c in (pairs([wedge], agreement=a)[1] for a in (0.95, 0.7))]
+    assert sides == [False, True]
+
+
+def test_the_mass_of_pieces_and_their_merging():
+    pieces = [scenes.box([0.1, 0.1, 0.1], [0.05 + 0.1 * k, 0, 0]) for k in range(12)]
+    volume, centre = mass_centre(pieces)
+    assert volume == pytest.approx(0.012)
+    np.testing.assert_allclose(centre, [0.6, 0, 0], atol=1e-9)
+    few = merged(pieces, 4)
+    assert len(few) <= 4
+    assert sum(mass_centre([p])[0] for p in few) == pytest.approx(0.012)
+    vertices, faces = hull(pieces[0].vertices)
+    corners = vertices[faces]
+    assert np.all(np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1) - [0.05, 0, 0]) > 0)
+
+
+def test_a_hand_stays_above_the_table_and_out_of_the_tool(arm):
+    tool, tool_contact = scenes.hook(thickness=0.01)
+    poses = np.stack([tool.world_from_object, transforms.make(translation=[0.5, 0, 0.1]) @ tool.world_from_object])
+    grasps = propose(arm.robot, tool, tool_contact.object_from_contact, TABLE, poses, GraspSettings(), 0)
+    assert grasps
+    corners = np.concatenate([m.vertices for m in arm.robot.hand.values()])
+    for grasp in grasps:
+        low = transforms.apply(tool.world_from_object @ grasp.tool_from_tcp, corners)[:, 2].min()
+        assert low > 0.0014
+        assert np.linalg.norm(grasp.tool_from_tcp[:3, 3] - tool_contact.object_from_contact[:3, 3]) > 0.025
+    free, _ = collision_free(arm.robot, grasps, tool, [], 20, Budget())
+    hand, held = arm.robot.hand_body(), Body.from_pieces("tool", tool.pieces)
+    assert free
+    for grasp in free:
+        hand.move(grasp.tool_from_tcp)
+        assert not hand.touches(held)
+
+
+def test_points_in_the_hand_are_found_and_points_between_the_fingers_are_not(arm):
+    frames = np.eye(4)[None]
+    nothing = np.zeros((0, 3))
+    assert not in_the_way(arm.robot, frames, np.array([[0.0, 0, 0]]), nothing, 0.08)[0]
+    assert in_the_way(arm.robot, frames, np.array([[0.0, 0.05, 0]]), nothing, 0.08)[0]
+    behind = np.array([[0.0, 0, -0.18]])  # where the hand was on its way
+    assert not in_the_way(arm.robot, frames, behind, nothing, 0.08)[0]
+    assert in_the_way(arm.robot, frames, nothing, behind, 0.08)[0]
+
+
+def test_what_does_not_fit_is_said(arm):
+    _, tool_contact = scenes.hook()
+    brick = scenes.item("brick", [scenes.box([0.2, 0.2, 0.2])], transforms.make(translation=[0.5, 0, 0.1]))
+    with pytest.raises(MagicError, match="0.074 m apart") as raised:
+        propose(arm.robot, brick, tool_contact.object_from_contact, TABLE, brick.world_from_object[None], GraspSettings(), 0)
+    assert raised.value.code == Code.NO_GRASP
+    sheet = scenes.item("sheet", [scenes.box([0.2, 0.1, 0.002])], transforms.make(translation=[0.5, 0, 0.001]))
+    with pytest.raises(MagicError) as raised:
+        propose(arm.robot, sheet, tool_contact.object_from_contact, TABLE, sheet.world_from_object[None], GraspSettings(), 0)
+    assert raised.value.code == Code.NO_GRASP
