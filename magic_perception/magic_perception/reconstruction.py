@@ -54,20 +54,24 @@ class Sight:
         """(3,): where the camera is."""
         return self.table_from_camera[:3, 3]
 
-    def sample(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """At points (..., 3): the mask (0..1, interpolated; 1 where hidden or outside of the picture), the points' and the measured depth."""
+    def sample(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+        """At points (..., 3): the mask (0..1, interpolated; 1 where blind), where the picture tells nothing (hidden or
+        outside of it), the points' depth and the measured depth."""
         camera = transforms.apply(transforms.inverse(self.table_from_camera), points)
-        pixels = self.intrinsics.project(camera)
+        pixels = np.nan_to_num(self.intrinsics.project(camera), nan=-1e4)
         u, v = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
         shape = u.shape
         # OpenCV's remap takes pictures of less than 32768 rows and columns.
         rows = -(-u.size // 8192)
         u, v = (np.resize(x, (rows, 8192)) if rows > 1 else x.reshape(1, -1) for x in (u, v))
         count = int(np.prod(shape))
-        field = (self.mask | self.hidden).astype(np.float32)
-        inside = cv2.remap(field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
-        depth = cv2.remap(self.depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-        return inside.ravel()[:count].reshape(shape), camera[..., 2].astype(np.float32), depth.ravel()[:count].reshape(shape)
+
+        def at(field: NDArray, how: int, beyond: float) -> NDArray:
+            return cv2.remap(field, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond).ravel()[:count].reshape(shape)
+
+        blind = at(self.hidden.astype(np.uint8), cv2.INTER_NEAREST, 1.0) > 0
+        inside = np.where(blind, np.float32(1), at(self.mask.astype(np.float32), cv2.INTER_LINEAR, 1.0))
+        return inside, blind, camera[..., 2].astype(np.float32), at(self.depth, cv2.INTER_NEAREST, float("nan"))
 
 
 @dataclass(frozen=True)
@@ -175,7 +179,8 @@ def _carve(
         least = np.ones_like(total)
         blind = np.zeros(total.shape, bool)
         for points in columns:
-            inside, z, measured = sight.sample(points)
+            inside, unseen, z, measured = sight.sample(points)
+            blind |= unseen
             if see_through is not None:
                 with np.errstate(invalid="ignore"):
                     inside = np.where(measured > z + see_through, 0, inside)
@@ -196,7 +201,9 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     """The solid of one thing from all cameras that saw it.  Raises ``RECONSTRUCTION_FAILED`` where there is too little."""
     clouds = [surface(sight) for sight in sights]
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
-    points = points[points[:, 2] > -0.01]
+    eyes = np.repeat([sight.eye for sight in sights], [len(c) for c in clouds], axis=0)
+    keep = points[:, 2] > -0.01
+    points, eyes = points[keep], eyes[keep]
     if len(points) < 50:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "points of one object", len(points), "at least 50")
     points[:, 2] = np.maximum(points[:, 2], 0)
@@ -211,7 +218,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
     length = float(np.max(np.ptp(spread @ axes.T, axis=0)))
     if height > 0.04 and height > 0.45 * length:
-        found = _standing_round(sights, points, height, noise, parameters)
+        found = _standing_round(sights, points, eyes, height, noise, parameters)
         return found if found is not None else _layers(sights, points, height, parameters)
     return _lying(sights, points, height, noise, parameters)
 
@@ -433,16 +440,17 @@ class _Body:
         return np.interp(z, self.profile[:, 1], self.profile[:, 0])
 
 
-def _round_body(points: NDArray[np.float64], height: float, noise: float, seed: int) -> _Body | None:
+def _round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, seed: int) -> _Body | None:
     """The body of revolution on which most of the side points lie, or ``None``.
 
     x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in a parabola q, so that conical and bulged bodies fit at once.
     """
-    sample = points[(points[:, 2] > 0.08 * height) & (points[:, 2] < 0.94 * height)]
-    if len(sample) < 150:
+    index = np.nonzero((points[:, 2] > 0.08 * height) & (points[:, 2] < 0.94 * height))[0]
+    if len(index) < 150:
         return None
     rng = np.random.default_rng(seed)
-    sample = sample[rng.permutation(len(sample))[:4000]]
+    index = index[rng.permutation(len(index))[:5000]]
+    sample, eye = points[index], eyes[index]
     band = max(0.003, 2 * noise)
     best, support = None, 0
     slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
@@ -466,6 +474,10 @@ def _round_body(points: NDArray[np.float64], height: float, noise: float, seed: 
     if best is None:
         return None
     origin = best[0]
+    # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
+    outer = np.sum((eye[:, :2] - sample[:, :2]) * (sample[:, :2] - origin), axis=1) > 0
+    inner_share = float(np.mean(~outer))
+    sample = sample[outer]
     near = np.abs(np.linalg.norm(sample[:, :2] - origin, axis=1) - best[1]) < max(0.008, 0.15 * best[1])
     axis, model = origin, None
     for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
@@ -488,7 +500,7 @@ def _round_body(points: NDArray[np.float64], height: float, noise: float, seed: 
     angles = np.arctan2(*(sample[near, :2] - axis).T[::-1])
     coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
     # What reaches beyond the body must be little: a box's corner reaches 0.4 r beyond its inscribed circle.
-    if share < 0.5 or coverage < 0.28:
+    if share < 0.5 or coverage < 0.28 or inner_share > 0.7:
         return None
     top = float(np.percentile(sample[near, 2], 99))
     around = points[np.abs(np.linalg.norm(points[:, :2] - axis, axis=1) - float(np.median(radius))) < 0.012]
@@ -506,8 +518,8 @@ def _round_body(points: NDArray[np.float64], height: float, noise: float, seed: 
     return _Body(axis, np.column_stack([radii, levels]), bool(hollow))
 
 
-def _standing_round(sights: list[Sight], points: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction | None:
-    body = _round_body(points, height, noise, parameters.seed)
+def _standing_round(sights: list[Sight], points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction | None:
+    body = _round_body(points, eyes, height, noise, parameters.seed)
     if body is None:
         return None
     if height > body.profile[-1, 1] + 0.012:
@@ -667,9 +679,9 @@ def _layers(sights: list[Sight], points: NDArray[np.float64], height: float, par
     mirrored = np.column_stack([2 * middle - points[:, :2], points[:, 2]])
     inside = np.ones(len(mirrored), bool)
     for sight in sights:
-        shown, z, measured = sight.sample(mirrored[:, None, :])
+        shown, _, z, measured = sight.sample(mirrored)
         with np.errstate(invalid="ignore"):
-            inside &= ~((shown[:, 0] < 0.3) | (measured[:, 0] > z[:, 0] + 0.015))
+            inside &= ~((shown < 0.3) | (measured > z + 0.015))
     if inside.mean() > 0.8:
         everything = np.concatenate([points, mirrored[inside]])
         confidence = 0.7

@@ -1,0 +1,135 @@
+"""Objects from one colour and one depth image, without ROS: ``ros2 run magic_perception perceive_images --help``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_perception.parameters import METHODS, Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.segmentation import SEGMENTERS, make_segmenter
+from magic_perception.table import camera_over_table
+
+
+def read_frame(color: Path, depth: Path, intrinsics: str, unit: str) -> tuple[NDArray[np.uint8], NDArray[np.float32], Intrinsics]:
+    """Colour (H, W, 3) RGB, depth (H, W) metres with NaN, intrinsics ``fx,fy,cx,cy``.
+
+    A 16-bit depth image is in ``unit`` (mm or m per 1); a float one (TIFF, EXR, npy) in the same unit.
+    """
+    image = cv2.imread(str(color), cv2.IMREAD_COLOR)
+    if image is None:
+        raise MagicError(Code.BAD_IMAGE, "colour image", str(color), "a readable PNG or JPEG file")
+    raw = np.load(depth) if depth.suffix == ".npy" and depth.is_file() else cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)
+    if raw is None:
+        raise MagicError(Code.BAD_IMAGE, "depth image", str(depth), "a readable 16-bit PNG, TIFF or npy file")
+    if raw.ndim != 2 or raw.dtype == np.uint8:
+        raise MagicError(Code.BAD_ENCODING, "depth image", f"{raw.shape} {raw.dtype}", "one channel of 16 bits or floats")
+    metres = raw.astype(np.float32) * (0.001 if unit == "mm" else 1.0)
+    metres[~np.isfinite(metres) | (metres <= 0)] = np.nan
+    try:
+        fx, fy, cx, cy = (float(x) for x in intrinsics.split(","))
+    except ValueError:
+        raise MagicError(Code.BAD_INTRINSICS, "--intrinsics", intrinsics, "fx,fy,cx,cy: four numbers in pixels") from None
+    return np.ascontiguousarray(image[..., ::-1]), metres, Intrinsics(image.shape[1], image.shape[0], fx, fy, cx, cy)
+
+
+def write(scene_dir: Path, frame: RgbdFrame, scene, report: Report, seconds: float) -> None:
+    """labels.png, objects.json, and object_N.ply and object_N_view.png for each object."""
+    scene_dir.mkdir(parents=True, exist_ok=True)
+    labels = np.zeros(frame.depth.shape, np.uint16)
+    items = []
+    for number, item in enumerate((o for o in scene.objects if o.source == "camera"), 1):
+        if item.mask is not None:
+            labels[item.mask] = number
+        mesh_file, view_file = f"{item.id}.ply", f"{item.id}_view.png"
+        item.mesh.save(scene_dir / mesh_file)
+        cv2.imwrite(str(scene_dir / view_file), item.view.image[..., ::-1])
+        items.append(
+            {
+                "id": item.id,
+                "label": number,
+                "pixels": int(item.mask.sum()) if item.mask is not None else 0,
+                "box": {"size": item.box_extents.tolist(), "world_from_box": item.world_from_box.tolist()},
+                "world_from_object": item.world_from_object.tolist(),
+                "camera_from_object": (np.linalg.inv(frame.world_from_camera) @ item.world_from_object).tolist(),
+                "mesh": mesh_file,
+                "pieces": len(item.pieces),
+                "shape": report.shapes.get(item.id, ""),
+                "view": {"file": view_file, "kind": item.view.kind, "metres_per_pixel": item.view.metres_per_pixel, "confidence": item.view.confidence},
+                "confidence": item.confidence,
+            }
+        )
+    cv2.imwrite(str(scene_dir / "labels.png"), labels if labels.max() > 255 else labels.astype(np.uint8))
+    content = {
+        "objects": items,
+        "table": scene.table.tolist(),
+        "world_from_camera": frame.world_from_camera.tolist(),
+        "notes": report.notes,
+        "seconds": {**report.seconds, "total": seconds},
+    }
+    (scene_dir / "objects.json").write_text(json.dumps(content, indent=1))
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point; exit status 1 with one line on stderr where the input cannot be used."""
+    parser = argparse.ArgumentParser(description="Objects from one colour and one depth image that is registered to it.")
+    parser.add_argument("--color", required=True, type=Path, help="colour image (PNG, JPEG)")
+    parser.add_argument("--depth", required=True, type=Path, help="depth image of the same size (16-bit PNG, TIFF, npy)")
+    parser.add_argument("--intrinsics", required=True, help="fx,fy,cx,cy in pixels")
+    parser.add_argument("--depth-unit", choices=("mm", "m"), default="mm", help="what 1 in the depth image is (default mm)")
+    parser.add_argument("--segmenter", choices=SEGMENTERS, default="depth")
+    parser.add_argument("--weights", default="", help="weights of the segmenter: a hub name or a local folder")
+    parser.add_argument("--device", default="cpu", help="torch device of the segmenter")
+    parser.add_argument("--method", choices=METHODS, default="completed", help="reconstruction")
+    parser.add_argument("--max-distance", type=float, default=1.3, help="how far from below the camera objects are looked for, m (default 1.3)")
+    parser.add_argument("--camera-pose", help="world_from_camera as x,y,z,qx,qy,qz,qw (world z up); without, the table that is seen is the plane z = 0")
+    parser.add_argument("--no-split", action="store_true", help="leave touching objects together")
+    parser.add_argument("--out", required=True, type=Path, help="folder for the results")
+    given = parser.parse_args(args)
+    try:
+        start = time.perf_counter()
+        color, depth, intrinsics = read_frame(given.color, given.depth, given.intrinsics, given.depth_unit)
+        if depth.shape != color.shape[:2]:
+            raise MagicError(Code.BAD_IMAGE, "size of the depth image", depth.shape, f"{color.shape[:2]}, that of the colour image")
+        if given.camera_pose:
+            from magic_core import transforms
+
+            try:
+                numbers = [float(x) for x in given.camera_pose.split(",")]
+                pose = transforms.from_quaternion(numbers[:3], numbers[3:])
+            except ValueError:
+                raise MagicError(Code.NO_TRANSFORM, "--camera-pose", given.camera_pose, "x,y,z,qx,qy,qz,qw") from None
+        else:
+            pose = camera_over_table(intrinsics.unproject(depth)[::3, ::3])
+        frame = RgbdFrame(color, depth, intrinsics, pose, "camera")
+        reach = given.max_distance
+        parameters = Parameters(
+            region_low=(-reach, -reach, -0.05) if not given.camera_pose else (-np.inf, -np.inf, -0.05),
+            region_high=(reach, reach, 0.6) if not given.camera_pose else (np.inf, np.inf, 0.6),
+            method=given.method,
+            split=not given.no_split,
+        )
+        report = Report()
+        scene = perceive([frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report)
+        write(given.out, frame, scene, report, time.perf_counter() - start)
+    except MagicError as error:
+        print(f"perceive_images: {error}", file=sys.stderr)
+        sys.exit(1)
+    for item in scene.objects:
+        size = " x ".join(f"{1000 * x:.0f}" for x in item.box_extents)
+        print(f"{item.id}: {size} mm, {report.pixels.get(item.id, 0)} pixels, {report.shapes.get(item.id, '')}, view {item.view.kind}, confidence {item.confidence:.2f}")
+    print(f"{len(scene.objects)} objects in {given.out}")
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,455 @@
+"""Perception's core against analytic truths and ray-cast scenes."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scenes
+import trimesh
+from shapely.geometry import Point, Polygon
+
+from magic_core import shapes, transforms
+from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_perception import clusters, polygons, primitives
+from magic_perception.averaging import average
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.reconstruction import as_in_paper
+from magic_perception.registration import register_depth
+from magic_perception.segmentation import make_segmenter
+from magic_perception.stream import Stream
+from magic_perception.table import camera_over_table, fit_plane
+from magic_perception.tf import TransformBuffer
+from magic_perception.tracking import Tracker
+
+
+def tight(mesh: Mesh) -> trimesh.Trimesh:
+    solid = mesh.to_trimesh()
+    solid.merge_vertices()
+    assert solid.is_watertight and solid.volume > 0
+    return solid
+
+
+def check_object(item, least_share=0.9):
+    """Closed, and its convex pieces fill it."""
+    solid = tight(item.mesh)
+    total = 0.0
+    for piece in item.pieces:
+        part = tight(piece)
+        assert part.volume <= part.convex_hull.volume * 1.001 and part.volume >= part.convex_hull.volume * 0.999
+        total += part.volume
+    assert total > least_share * solid.volume
+    return solid
+
+
+# ---------------------------------------------------------------- table
+
+
+@pytest.mark.parametrize("tilt", [0.0, 4.0, 11.0])
+def test_plane_of_a_known_tilt(tilt):
+    rng = np.random.default_rng(1)
+    normal = transforms.from_rpy(np.radians(tilt), 0, 0)[:3, 2]
+    xy = rng.uniform(-0.5, 0.5, (5000, 2))
+    z = (0.03 - xy @ normal[:2]) / normal[2] + rng.normal(0, 0.002, 5000)
+    things = rng.uniform([-0.2, -0.2, 0.1], [0.2, 0.2, 0.4], (2500, 3))
+    plane = fit_plane(np.concatenate([np.column_stack([xy, z]), things]), (0, 0, 1))
+    assert np.degrees(np.arccos(plane.normal @ normal)) < 0.1
+    assert plane.coefficients[3] == pytest.approx(-0.03, abs=3e-4)
+
+
+def test_no_table_is_said():
+    with pytest.raises(MagicError) as error:
+        fit_plane(np.zeros((10, 3)))
+    assert error.value.code is Code.NO_TABLE
+    wall = np.random.default_rng(0).uniform([0, -1, -1], [0.001, 1, 1], (1000, 3))
+    with pytest.raises(MagicError) as error:
+        fit_plane(wall, (0, 0, 1))
+    assert error.value.code is Code.NO_TABLE
+
+
+def test_camera_pose_from_the_table():
+    frame, _ = scenes.capture([], noise=0.0)
+    found = camera_over_table(frame.intrinsics.unproject(frame.depth))
+    true = frame.world_from_camera
+    assert found[2, 3] == pytest.approx(true[2, 3], abs=1e-3)
+    assert np.degrees(np.arccos(found[2, :3] @ true[2, :3])) < 0.1
+    np.testing.assert_allclose(found[:2, 3], 0, atol=1e-9)
+
+
+# ---------------------------------------------------------------- polygons
+
+
+RING = Point(0, 0).buffer(0.04).difference(Point(0, 0).buffer(0.03))
+L = Polygon([(0, 0), (0.2, 0), (0.2, 0.02), (0.02, 0.02), (0.02, 0.08), (0, 0.08)])
+
+
+@pytest.mark.parametrize("polygon", [RING, L, Polygon([(0, 0), (1, 0), (1, 1), (0, 1)])])
+def test_convex_parts_tile_the_polygon(polygon):
+    parts = polygons.convex_parts(polygon)
+    assert sum(polygons.area_of(p) for p in parts) == pytest.approx(polygon.area, rel=1e-6)
+    for ring in parts:
+        assert Polygon(ring).convex_hull.area == pytest.approx(Polygon(ring).area)
+    for a, b in itertools.combinations(parts, 2):
+        assert Polygon(a).intersection(Polygon(b)).area < 1e-9
+    height = 0.012
+    volume = sum(tight(polygons.prism(p, 0, height)).volume for p in parts)
+    assert volume == pytest.approx(polygon.area * height, rel=1e-6)
+    assert tight(polygons.extrude(polygon, 0, height)).volume == pytest.approx(polygon.area * height, rel=1e-6)
+
+
+def test_an_l_needs_two_parts():
+    assert len(polygons.convex_parts(L)) == 2
+
+
+def test_tolerance_saves_parts():
+    assert len(polygons.convex_parts(RING, 0.0005)) < len(polygons.convex_parts(RING))
+
+
+def test_extruded_ring_keeps_its_hole():
+    assert tight(polygons.extrude(RING, 0, 0.01)).euler_number == 0  # genus 1
+
+
+def test_outline_is_finer_than_the_grid():
+    y, x = np.mgrid[-50:51, -50:51] * 0.001
+    field = np.clip((0.0307 - np.hypot(x, y)) / 0.001 + 0.5, 0, 1)
+    (disc,) = polygons.outline(field, np.array([-0.05, -0.05]), 0.001, simplify=0.0)
+    assert disc.area == pytest.approx(np.pi * 0.0307**2, rel=0.003)
+    assert disc.centroid.distance(Point(0, 0)) < 1e-4
+
+
+def test_alpha_shape_of_a_ring_of_points():
+    rng = np.random.default_rng(0)
+    angle, radius = rng.uniform(0, 2 * np.pi, 3000), rng.uniform(0.03, 0.04, 3000)
+    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    (small, *_), (large, *_) = polygons.alpha_shape(points, 0.006), polygons.alpha_shape(points, 1.0)
+    assert any(Polygon(hole).area > 0.8 * np.pi * 0.03**2 for hole in small.interiors) and not large.interiors
+    assert small.area == pytest.approx(RING.area, rel=0.08)
+    solid = as_in_paper(np.column_stack([points, rng.uniform(0, 0.02, 3000)]))
+    tight(solid.mesh)
+
+
+# ---------------------------------------------------------------- clusters, primitives
+
+
+def test_clusters_are_counted():
+    rng = np.random.default_rng(0)
+    blobs = [rng.normal(c, 0.004, (400, 3)) for c in ((0, 0, 0), (0.1, 0, 0), (0, 0.1, 0.05))]
+    cloud = np.concatenate([*blobs, blobs[0] + 0.001, rng.uniform(-0.5, 0.5, (20, 3))])
+    labels = clusters.cluster(cloud, 0.012, 4, 0.004)
+    sizes = np.bincount(labels[labels >= 0])
+    assert np.sum(sizes > 300) == 3
+    keep = clusters.largest(cloud, 0.012, 4, 0.004)
+    np.testing.assert_allclose(cloud[keep].mean(axis=0), 0, atol=0.002)
+
+
+def test_sphere_from_a_cap():
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(4000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cap = normals[normals @ [0.6, 0, 0.8] > 0.2] * 0.025 + [0.4, 0.1, 0.025] + rng.normal(0, 0.0008, (1, 3))
+    ball = primitives.fit_sphere(cap)
+    assert ball.radius == pytest.approx(0.025, abs=2e-4) and ball.residual < 1e-3
+
+
+def test_cylinder_from_one_side_and_its_top():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-1.2, 1.2, 2000)
+    side = np.column_stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), rng.uniform(0, 0.04, 2000)])
+    disc = rng.uniform(-0.02, 0.02, (3000, 2))
+    disc = disc[np.linalg.norm(disc, axis=1) < 0.02]
+    points = np.concatenate([side, np.column_stack([disc, np.full(len(disc), 0.04)])]) + [0.3, 0.2, 0] + rng.normal(0, 0.0005, (2000 + len(disc), 3))
+    tin = primitives.fit_cylinder(points)
+    assert tin.radius == pytest.approx(0.02, abs=5e-4) and tin.height == pytest.approx(0.04, abs=5e-4)
+    np.testing.assert_allclose(tin.centre, [0.3, 0.2], atol=5e-4)
+
+
+# ---------------------------------------------------------------- whole scenes
+
+
+@pytest.fixture(scope="module")
+def hooking():
+    truth = [shapes.make("l_hook", 1), shapes.make("cylinder", 1), shapes.make("scissors", 1)]
+    meshes = [scenes.placed(truth[0].mesh, 0.5, -0.1, 0.4), scenes.placed(truth[1].mesh, 0.62, 0.12), scenes.placed(truth[2].mesh, 0.6, -0.27, 0.2)]
+    captured = [scenes.capture(meshes, name, seed) for seed, name in enumerate(("left", "right"))]
+    report = Report()
+    scene = perceive([c[0] for c in captured], report=report)
+    return meshes, captured, scene, report
+
+
+def nearest(scene, mesh):
+    return min(scene.objects, key=lambda o: np.linalg.norm(o.world_from_object[:3, 3] - mesh.bounds.mean(axis=0)))
+
+
+def test_lying_tools(hooking):
+    meshes, captured, scene, report = hooking
+    assert len(scene.objects) == 3
+    for label, mesh in enumerate(meshes):
+        item = nearest(scene, mesh)
+        solid = check_object(item)
+        # Bodies agree with the truth: volumes, places, and the masks' overlap.
+        true = mesh.to_trimesh()
+        assert solid.volume == pytest.approx(true.volume, rel=0.3)
+        assert abs(item.box_extents[2] - mesh.extents[2]) < 0.003
+        truth = captured[[c[0].camera for c in captured].index(item.camera)][1] == label
+        assert (truth & item.mask).sum() / (truth | item.mask).sum() > 0.85
+        assert item.mesh.colors is not None and len(item.points) == len(item.colors) > 100
+    hook, tin, scissors = (nearest(scene, m) for m in meshes)
+    assert report.shapes[tin.id] == "cylinder"
+    assert tin.box_extents[2] == pytest.approx(meshes[1].extents[2], abs=0.002)
+    assert tin.box_extents[0] == pytest.approx(meshes[1].extents[0], abs=0.002)
+    assert hook.box_extents[2] == pytest.approx(meshes[0].extents[2], abs=0.002)
+    assert hook.view.kind == "top"
+    # Both eyes of the scissors are open: genus 2.
+    assert tight(scissors.mesh).euler_number == -2
+
+
+def test_mug_keeps_its_handle_open():
+    mug = shapes.make("mug", 3)
+    mesh = scenes.placed(mug.mesh, 0.5, 0.1, 2.5)
+    scene = perceive([scenes.capture([mesh], name, seed)[0] for seed, name in enumerate(("left", "right"))])
+    (item,) = scene.objects
+    assert check_object(item).euler_number == 0
+    assert item.view.kind == "side" and item.view.confidence > 0.9
+    np.testing.assert_allclose(np.sort(item.box_extents), np.sort(mug.mesh.extents), atol=0.008)
+
+
+def test_bowl_of_a_ladle_stays_hollow():
+    from magic_core.views import find_view
+
+    ladle = shapes.make("ladle", 2)
+    scene = perceive([scenes.capture([scenes.placed(ladle.mesh, 0.5, 0.0, 1.4)], name, seed)[0] for seed, name in enumerate(("left", "right"))])
+    item = scene.objects[0]
+    solid = tight(item.mesh)
+    assert solid.volume < 0.5 * solid.convex_hull.volume
+    section = find_view(item.mesh, item.pieces, "section")
+    # Seen in the cut, a column of the picture through the bowl's floor has no material at the rim's height.
+    assert section.mask.sum() < 0.5 * cv2_hull_area(section.mask)
+    # The pieces leave the bowl empty too.
+    assert sum(p.to_trimesh().volume for p in item.pieces) < 1.5 * solid.volume
+
+
+def cv2_hull_area(mask):
+    import cv2
+
+    points = np.argwhere(mask)[:, ::-1].astype(np.int32)
+    return cv2.contourArea(cv2.convexHull(points))
+
+
+def test_ball():
+    ball = shapes.make("sphere", 1)
+    mesh = scenes.placed(ball.mesh, 0.5, 0.0)
+    (item,) = perceive([scenes.capture([mesh])[0]]).objects
+    assert item.box_extents[0] == pytest.approx(mesh.extents[0], abs=0.002)
+    np.testing.assert_allclose(item.world_from_object[:3, 3], mesh.bounds.mean(axis=0), atol=0.003)
+
+
+def test_known_objects_are_left_out(hooking):
+    meshes, captured, scene, _ = hooking
+    tin = nearest(scene, meshes[1])
+    from dataclasses import replace
+
+    post = replace(tin, id="post", source="known")
+    again = perceive([c[0] for c in captured], (post,))
+    assert len(again.objects) == 3 and again.find("post") is post
+    assert sum(np.linalg.norm(o.world_from_object[:3, 3] - tin.world_from_object[:3, 3]) < 0.03 for o in again.objects) == 1
+
+
+def test_region_of_interest(hooking):
+    _, captured, _, _ = hooking
+    scene = perceive([c[0] for c in captured], parameters=Parameters(region_low=(0.0, -0.5, -0.05), region_high=(0.9, -0.02, 0.5)))
+    assert len(scene.objects) == 2
+
+
+def test_same_frames_same_scene(hooking):
+    _, captured, scene, _ = hooking
+    again = perceive([c[0] for c in captured])
+    for a, b in zip(scene.objects, again.objects, strict=True):
+        np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
+
+
+def test_the_papers_method(hooking):
+    _, captured, _, _ = hooking
+    for item in perceive([c[0] for c in captured], parameters=Parameters(method="paper")).objects:
+        tight(item.mesh)
+
+
+def test_empty_table_and_bad_frames():
+    frame, _ = scenes.capture([])
+    assert perceive([frame]).objects == ()
+    with pytest.raises(MagicError) as error:
+        perceive([])
+    assert error.value.code is Code.NO_FRAMES
+    for value in (np.nan, np.inf):
+        with pytest.raises(MagicError) as error:
+            perceive([RgbdFrame(frame.color, np.full_like(frame.depth, value), frame.intrinsics, frame.world_from_camera)])
+        assert error.value.code is Code.NO_DEPTH
+    with pytest.raises(MagicError) as error:
+        RgbdFrame(frame.color, frame.depth[:-1], frame.intrinsics, frame.world_from_camera)
+    assert error.value.code is Code.BAD_IMAGE
+    with pytest.raises(MagicError) as error:
+        make_segmenter("magic")
+    assert error.value.code is Code.UNKNOWN_SEGMENTER and "depth" in error.value.message
+    with pytest.raises(MagicError):
+        Parameters(region_low=(0, 0, 0), region_high=(1, -1, 1))
+
+
+# ---------------------------------------------------------------- time, registration, frames
+
+
+def test_average_takes_noise_out_and_keeps_edges():
+    frames = [scenes.capture([], seed=s)[0] for s in range(5)]
+    clean, _ = scenes.capture([], noise=0.0)
+    mean = average(frames)
+    one = np.nanstd(frames[0].depth - clean.depth)
+    assert np.nanstd(mean.depth - clean.depth) < 0.7 * one
+    near, far = (np.full((4, 4), z, np.float32) for z in (0.5, 0.9))
+    k = Intrinsics(4, 4, 5, 5, 2, 2)
+    color = np.zeros((4, 4, 3), np.uint8)
+    flicker = average([RgbdFrame(color, d, k, np.eye(4)) for d in (near, far, near)])
+    assert np.allclose(flicker.depth, 0.5)
+    gone = average([RgbdFrame(color, d, k, np.eye(4)) for d in (near, near * np.nan, near * np.nan)])
+    assert np.isnan(gone.depth).all()
+
+
+def test_registration_of_a_plane_seen_from_aside():
+    depth_camera, color_camera = Intrinsics(160, 120, 100, 100, 79.5, 59.5), Intrinsics(320, 240, 220, 220, 159.5, 119.5)
+    color_from_depth = transforms.from_rpy(0, 0, 0, [0.015, 0, 0])
+    wall = np.full((120, 160), 1.0, np.float32)
+    wall[40:80, 60:100] = 0.5
+    found = register_depth(wall, depth_camera, color_camera, color_from_depth)
+    # The near square: its corners at depth pixels 59.5..99.5, at 0.5 m, moved by 15 mm.
+    u0, u1 = (((u - 79.5) / 100 * 0.5 + 0.015) / 0.5 * 220 + 159.5 for u in (59.5, 99.5))
+    near = np.argwhere(np.isclose(found, 0.5))
+    assert near[:, 1].min() == pytest.approx(u0, abs=1.0) and near[:, 1].max() == pytest.approx(u1, abs=1.0)
+    # No gaps inside of either surface, though the colour image is finer.
+    assert np.isfinite(found[100:140, int(u0) + 2 : int(u1) - 2]).all()
+    assert np.isfinite(found[20:60, 60:260]).all()
+    with pytest.raises(MagicError):
+        register_depth(wall[:-1], depth_camera, color_camera, color_from_depth)
+
+
+def test_pairs_within_the_tolerance():
+    stream = Stream("left", tolerance=0.02, keep=3)
+    image, depth = np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32)
+    for i in range(4):
+        stream.color(i / 30, image, "c", i)
+        stream.depth(i / 30 + 0.005, depth, "c", i)
+    assert [round(p.stamp * 30) for p in stream.pairs] == [1, 2, 3]
+    stream.color(1.0, image, "c", 5.0)
+    stream.depth(1.1, depth, "c", 5.0)
+    assert len(stream.pairs) == 3 and stream.problems["pairing"].code is Code.STALE_DATA
+    stream.depth(-50.0, depth, "c", 6.0)
+    assert not stream.pairs and stream.problems["stamps"].code is Code.STALE_DATA
+    with pytest.raises(MagicError) as error:
+        stream.frames(np.eye(4))
+    assert error.value.code is Code.NO_CAMERA_INFO
+
+
+def test_transform_buffer():
+    buffer = TransformBuffer()
+    buffer.set("base", "hand", transforms.make(None, [0, 0, 0]), 1.0)
+    buffer.set("base", "hand", transforms.make(None, [0.1, 0, 0]), 2.0)
+    buffer.set("/hand", "camera", transforms.from_rpy(0, 0, np.pi / 2, [0, 0, 0.5]), static=True)
+    np.testing.assert_allclose(buffer.lookup("base", "camera", 1.5)[:3, 3], [0.05, 0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(buffer.lookup("camera", "base", 2.0) @ buffer.lookup("base", "camera", 2.0), np.eye(4), atol=1e-12)
+    for target, source, stamp in (("base", "nowhere", None), ("base", "camera", 9.0)):
+        with pytest.raises(MagicError) as error:
+            buffer.lookup(target, source, stamp)
+        assert error.value.code is Code.NO_TRANSFORM
+
+
+def test_ids_stay(hooking):
+    from dataclasses import replace
+
+    _, _, scene, _ = hooking
+    tracker = Tracker()
+    first = tracker.update(scene)
+    shuffled = replace(scene, objects=scene.objects[::-1])
+    second = tracker.update(shuffled)
+    for a in first.objects:
+        assert second.find(a.id).world_from_object is a.world_from_object
+    moved = replace(scene, objects=(replace(scene.objects[0], world_from_object=transforms.make(None, [5.0, 0, 0])),))
+    assert tracker.update(moved).objects[0].id == "object_4"
+
+
+# ---------------------------------------------------------------- offline
+
+
+def test_perceive_images(tmp_path, hooking):
+    import json
+
+    import cv2
+
+    from magic_perception.perceive_images import main
+
+    frame = hooking[1][0][0]
+    cv2.imwrite(str(tmp_path / "c.png"), frame.color[..., ::-1])
+    cv2.imwrite(str(tmp_path / "d.png"), np.nan_to_num(frame.depth * 1000).round().astype(np.uint16))
+    k = frame.intrinsics
+    words = ["--color", str(tmp_path / "c.png"), "--depth", str(tmp_path / "d.png"), "--intrinsics", f"{k.fx},{k.fy},{k.cx},{k.cy}", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as status:
+        main(words)
+    assert status.value.code == 0
+    content = json.loads((tmp_path / "out" / "objects.json").read_text())
+    labels = cv2.imread(str(tmp_path / "out" / "labels.png"), cv2.IMREAD_UNCHANGED)
+    assert len(content["objects"]) == labels.max() == 3
+    for item in content["objects"]:
+        assert (labels == item["label"]).sum() == item["pixels"]
+        assert trimesh.load(tmp_path / "out" / item["mesh"]).is_watertight
+        assert (tmp_path / "out" / item["view"]["file"]).is_file()
+    with pytest.raises(SystemExit) as status:
+        main([*words[:-3], "1,2,3", *words[-2:]])
+    assert status.value.code == 1
+
+
+# ---------------------------------------------------------------- segment anything
+
+
+def tiny_sam(folder):
+    import torch
+    from transformers import SamConfig, SamMaskDecoderConfig, SamModel, SamPromptEncoderConfig, SamVisionConfig
+
+    torch.manual_seed(0)
+    vision = SamVisionConfig(hidden_size=16, output_channels=16, num_hidden_layers=1, num_attention_heads=2, image_size=64, patch_size=16, mlp_dim=16, window_size=2, global_attn_indexes=[0], num_pos_feats=8)
+    prompt = SamPromptEncoderConfig(hidden_size=16, image_size=64, patch_size=16, mask_input_channels=4)
+    decoder = SamMaskDecoderConfig(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, mlp_dim=16, iou_head_hidden_dim=16)
+    SamModel(SamConfig(vision_config=vision.to_dict(), prompt_encoder_config=prompt.to_dict(), mask_decoder_config=decoder.to_dict())).save_pretrained(folder)
+
+
+def tiny_sam2(folder):
+    import torch
+    from transformers import Sam2Config, Sam2HieraDetConfig, Sam2MaskDecoderConfig, Sam2Model, Sam2PromptEncoderConfig, Sam2VisionConfig
+
+    torch.manual_seed(0)
+    backbone = Sam2HieraDetConfig(
+        hidden_size=12, image_size=[128, 128], window_positional_embedding_background_size=[2, 2], embed_dim_per_stage=[12, 24, 48, 96],
+        blocks_per_stage=[1, 1, 2, 1], num_attention_heads_per_stage=[1, 1, 2, 2], window_size_per_stage=[4, 2, 2, 2], global_attention_blocks=[3],
+    )  # fmt: skip
+    vision = Sam2VisionConfig(backbone_config=backbone.to_dict(), backbone_channel_list=[96, 48, 24, 12], backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]], fpn_hidden_size=16)
+    prompt = Sam2PromptEncoderConfig(hidden_size=16, image_size=128, patch_size=16, mask_input_channels=4)
+    decoder = Sam2MaskDecoderConfig(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, mlp_dim=16, iou_head_hidden_dim=16)
+    Sam2Model(Sam2Config(vision_config=vision.to_dict(), prompt_encoder_config=prompt.to_dict(), mask_decoder_config=decoder.to_dict())).save_pretrained(folder)
+
+
+@pytest.mark.parametrize("name, make", [("sam", tiny_sam), ("sam2", tiny_sam2)])
+def test_sam_loads_and_never_loses_an_object(tmp_path, hooking, name, make):
+    pytest.importorskip("transformers")
+    make(tmp_path)
+    segmenter = make_segmenter(name, str(tmp_path))
+    # Random weights draw nonsense: the depth masks must stand.
+    _, captured, _, _ = hooking
+    scene = perceive([captured[0][0]], segmenter=segmenter)
+    assert len(scene.objects) == 3
+    mask = np.zeros((480, 640), bool)
+    mask[100:200, 300:400] = True
+    ((probability, score),) = segmenter.masks(captured[0][0].color, [mask])
+    assert probability.shape == mask.shape and 0 <= probability.min() <= probability.max() <= 1 and np.isfinite(score)
+
+
+def test_missing_weights_are_named(tmp_path):
+    pytest.importorskip("transformers")
+    with pytest.raises(MagicError) as error:
+        make_segmenter("sam2", str(tmp_path / "nothing"))
+    assert error.value.code is Code.SEGMENTER_WEIGHTS and "nothing" in error.value.message
