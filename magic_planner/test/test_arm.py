@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-import scenes
+import planner_scenes as scenes
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scenes
+import planner_scenes as scenes
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError

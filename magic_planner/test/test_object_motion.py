@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-import scenes
+import planner_scenes as scenes
 from hypothesis import given, settings, strategies as st
 
 from magic_core import transforms
