@@ -250,7 +250,9 @@ def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_
     difference = own - ground
     length = np.sum(difference**2, axis=-1)
     part = np.sum((lab - ground) * difference, axis=-1) / np.maximum(length, 1.0)
-    told = band & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
+    # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
+    rest = np.sum((lab - ground - part[..., None] * difference) ** 2, axis=-1)
+    told = band & ((rest < 9.0**2) | ~mask) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
     # Grow only into what depth does not contradict, and by what touches the mask.
     h = looked.heights
     with np.errstate(invalid="ignore"):
