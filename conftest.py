@@ -1,0 +1,30 @@
+"""For pytest: what lets the tests of several packages run in one process."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+# In importlib mode pytest names a test module after its path, ``magic_planner.test.test_x``, and would make an empty ``magic_planner`` for
+# it that hides the installed package. Importing the packages at the repository's root first prevents that.
+for manifest in sorted(Path(__file__).parent.glob("*/package.xml")):
+    if importlib.util.find_spec(manifest.parent.name) is not None:
+        importlib.import_module(manifest.parent.name)
+
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """Each test folder sees its own helper modules: several have a ``scenes.py``, and Python remembers the first by its bare name."""
+    if not isinstance(collector, pytest.Module):
+        return
+    folder = collector.path.parent
+    for name, module in list(sys.modules.items()):
+        place = Path(getattr(module, "__file__", None) or "/").parent
+        if "." not in name and place.name in ("test", "tests") and place != folder:
+            del sys.modules[name]
+    if str(folder) in sys.path:
+        sys.path.remove(str(folder))
+    sys.path.insert(0, str(folder))
