@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,8 @@ from magic_bringup.graph import Graph, peak_memory
 
 #: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
 START_TIMEOUT = 120.0
-#: How long to wait for objects after the bag has ended, s.
-AFTER_BAG = 3.0
+#: How long to wait for objects beyond the bag's own length, s.  The bag is played in a loop: a camera would go on, too.
+PATIENCE = 8.0
 #: Between the advertisement and the first message of the replay, s, so that the subscriptions have met their publishers.
 PLAYER_DELAY = 0.7
 
@@ -94,20 +95,20 @@ def candidate_summary(report: Any) -> dict[str, Any]:
     }
 
 
-def camera_topics(bag: Path) -> dict[str, str]:
-    """The camera topics of a bag with messages in them: topic -> type.  Raises BAD_BAG for what is no bag or an empty one."""
+def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
+    """The camera topics of a bag with messages in them, and its length in seconds.  Raises BAD_BAG for what is no bag or an empty one."""
     from magic_bringup import bag_file
 
     info = bag_file.info(bag)
     if info.count == 0:
         raise MagicError(Code.BAD_BAG, "the bag is empty", str(bag), "a bag with at least one message")
-    return {t.name: t.type_name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)}
+    return tuple(t.name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)), (info.end - info.start) * 1e-9
 
 
 class Watcher:
     """The demo's own node: hears images and objects as they pass, and runs the action.  Spins in a thread of its own."""
 
-    def __init__(self, topics: dict[str, str], say: Any) -> None:
+    def __init__(self, topics: Sequence[str], say: Any) -> None:
         import rclpy
         from magic_core import qos
         from magic_interfaces.action import RunStrategy
@@ -126,7 +127,6 @@ class Watcher:
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.changed = threading.Condition()
         self.first: dict[str, tuple[float, bytes]] = {}
-        self.topics = topics
         self.scene: Any = None
         self.objects_at: float | None = None
         self.trajectory: Any = None
@@ -249,6 +249,7 @@ class Demo:
         self.options = options
         self.record = Record(empty_summary(options))
         self._begin = time.monotonic()
+        self._length = 0.0
 
     def say(self, line: str) -> None:
         """One line of progress."""
@@ -273,7 +274,7 @@ class Demo:
     def _run(self) -> None:
         options = self.options
         strategies.find(options.strategy)  # a wrong name is told before anything is started
-        topics = camera_topics(options.bag)
+        topics, self._length = look_into(options.bag)
         env = isolated()
         os.environ.update({k: env[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
         parameters: dict[str, dict[str, object]] = {
@@ -317,15 +318,21 @@ class Demo:
         if not self._wait(graph, watcher, up, START_TIMEOUT):
             raise MagicError(Code.SERVER_UNAVAILABLE, f"not up after {START_TIMEOUT:g} s: {', '.join(missing)}")
         self.say(f"replaying {options.bag}")
-        player = graph.start("bag_player", "magic_bringup", "bag_player", str(options.bag), "--delay", str(PLAYER_DELAY))
-        self._wait(graph, watcher, lambda: watcher.objects_at is not None or player.status is not None, 600.0)
-        if player.status is not None and player.status != 0:
+        player = graph.start("bag_player", "magic_bringup", "bag_player", str(options.bag), "--loop", "--delay", str(PLAYER_DELAY))
+
+        def seen() -> bool:
+            return watcher.objects_at is not None or player.status is not None
+
+        self._wait(graph, watcher, seen, PLAYER_DELAY + self._length + PATIENCE)
+        if player.status is not None:
             raise MagicError(Code.BAD_BAG, f"the bag cannot be played: {player.tail(1)}")
-        if watcher.objects_at is None and not self._wait(graph, watcher, lambda: watcher.objects_at is not None, AFTER_BAG):
-            self.say("the bag has ended and no objects have come")
+        if watcher.objects_at is None:
+            self.say(f"no objects within {self._length + PATIENCE:.1f} s")
         else:
             ids = ", ".join(o.id for o in watcher.scene.objects)
             self.say(f"perceive: objects after {watcher.perceive_seconds():.2f} s: {ids}")
+            # What is known by now is enough; the replay would only take time from the stages after it.
+            graph.stop(["bag_player"])
         watcher.forget_cameras()
         pending = watcher.send(options)
         if not self._wait(graph, watcher, lambda: pending.result is not None, options.timeout + 30.0):

@@ -139,7 +139,7 @@ class Graph:
         for name, (package, program) in NODES.items():
             if name in leave_out:
                 continue
-            arguments = [x for k, v in (parameters or {}).get(name, {}).items() for x in ("-p", f"{k}:={v}")]
+            arguments = [x for k, v in (parameters or {}).get(name, {}).items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
             self.start(name, package, program, *(["--ros-args", *arguments] if arguments else []))
 
     def sample(self) -> None:

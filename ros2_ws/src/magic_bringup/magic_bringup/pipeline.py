@@ -106,7 +106,6 @@ class Verdict:
 
     code: Code
     message: str = ""
-    film: Any = None
     simulations: int = 1
 
 
@@ -150,7 +149,6 @@ class Outcome:
     simulations: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     features: str = ""
-    film: Any = None
     heatmap: Any = None
 
 
@@ -254,7 +252,6 @@ class Run:
         self._reports: list[Report] = []
         self._simulations = 0
         self._matches: Matches | None = None
-        self._film: Any = None
 
     def execute(self) -> Outcome:
         """Do the work."""
@@ -273,6 +270,7 @@ class Run:
         self._timed("perceive", lambda left: self._stages.perceive(request, left))
         self._tell("match", 0, "matching contacts")
         matches = self._matches = self._timed("match", lambda left: self._stages.match(request, left))
+        self._tell("match", 0, matches.message or f"{len(matches.candidates)} candidates")
         if not matches.candidates:
             raise MagicError(Code.NO_MATCH, "the matcher found no contact" + (f": {matches.message}" if matches.message else ""))
         agenda = Agenda(matches.candidates, self._reflections, self._settings.attempts if request.variant == "arm" else 1)
@@ -301,8 +299,6 @@ class Run:
         self._simulations += 1
         verdict = self._attempt("verify", trial, lambda left: self._stages.verify(request, matches, trial, planned.plan, left), Verdict)
         self._simulations += max(0, verdict.simulations - 1)
-        if verdict.film is not None:
-            self._film = verdict.film
         if verdict.code != Code.OK:
             return self._drop(Report(trial, "verify", verdict.code, verdict.message, planned.plan)), verdict.code
         self._reports.append(Report(trial, "verify", Code.OK, verdict.message, planned.plan))
@@ -371,6 +367,5 @@ class Run:
             simulations=self._simulations,
             seconds={**self._seconds, "total": self._clock() - self._start},
             features=matches.features if matches else "",
-            film=self._film,
             heatmap=matches.heatmap if matches else None,
         )

@@ -53,7 +53,7 @@ class StrategyServer(Node):
         self._top_k = parameter(self, "top_k", 3, "candidates to try where the goal does not say", low=1, high=50, read_only=True)
         self._attempts = parameter(self, "attempts", 3, "grasps to try for one contact (variant arm)", low=1, high=50, read_only=True)
         self._repetitions = parameter(self, "repetitions", 1, "simulations of one motion; above 1: perturbed ones", low=1, high=1000, read_only=True)
-        self._film = parameter(self, "film", True, "ask the verifier for the film strip", read_only=True)
+        self._film = parameter(self, "film", True, "return the film strip of the last simulation, which is run once more for it", read_only=True)
         self._timeout = parameter(self, "timeout", 120.0, "s for a whole run where the goal does not say", **seconds, read_only=True)
         self._presence = parameter(self, "server_timeout", 5.0, "s to wait for a server that is not there", **seconds, read_only=True)
         self._objects_timeout = parameter(self, "objects_timeout", 10.0, "s to wait for objects", **seconds, read_only=True)
@@ -133,9 +133,9 @@ class StrategyServer(Node):
         self._diagnostics.publish(array)
 
     def complaint(self) -> DiagnosticStatus | None:
-        """Perception's worst recent diagnostic, where it has one."""
+        """Perception's worst recent diagnostic, where it has one; among equals one that says more than that nothing comes."""
         recent = [s for t, s in list(self._complaints.values()) if time.monotonic() - t < 5.0 and s.level != DiagnosticStatus.OK]
-        return max(recent, key=lambda s: s.level) if recent else None
+        return max(recent, key=lambda s: (s.level, complaint_code(s) not in (None, Code.NO_FRAMES, Code.STALE_DATA)), default=None)
 
     # ------------------------------------------------------------ the action
 
@@ -229,13 +229,16 @@ class StrategyServer(Node):
             lambda error: describe(self, error),
         ).execute()
         fill(result, outcome)
+        # First what somebody waits for, then the pictures.
+        if outcome.verified and outcome.code == Code.OK and not token.canceled:
+            self._publish(outcome.plan)
         if stages.scene is not None and stages.matches is not None:
             plan = outcome.plan or next((r.plan for r in reversed(outcome.reports) if r.plan is not None), None)
             self._marker_pub.publish(
                 markers.run_markers(stages.scene, list(stages.matches.candidates), outcome.target_id, outcome.reports, plan)
             )
-        if outcome.verified and outcome.code == Code.OK and not token.canceled:
-            self._publish(outcome.plan)
+        if self._film:
+            result.film = stages.film(outcome.code) or Image()
         ending = f"{goal.strategy} ({goal.variant}) ended with {outcome.code.name}: {outcome.message}"
         if outcome.code == Code.OK:  # rclpy wants one severity for one line of code
             self.get_logger().info(ending)
@@ -264,6 +267,8 @@ class _Stages:
         self._needs_verifier = needs_verifier
         self.scene: SceneObjectArray | None = None
         self.matches: pipeline.Matches | None = None
+        self._last_goal: VerifyMotion.Goal | None = None
+        self._last_code = 0
 
     def perceive(self, request: pipeline.Request, timeout: float) -> None:
         """Take the objects there are, or wait for them; see that every server is there."""
@@ -278,8 +283,10 @@ class _Stages:
             scene = node._scene
             if scene is None:
                 return False
-            # A wrong id is answered at once; too few objects may still become enough.
-            return bool(self._unknown(scene, request)) or len(scene.objects) >= 2
+            # A wrong id is answered at once; too few objects may still become enough: a tool that was seen, and a target.
+            return bool(self._unknown(scene, request)) or (
+                len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
+            )
 
         came = self._token.wait(enough, time.monotonic() + wait)
         scene = node._scene
@@ -304,7 +311,7 @@ class _Stages:
         topic = node._objects_topic
         if scene is not None:
             ids = [o.id for o in scene.objects]
-            code, what = Code.NO_OBJECTS, f"{topic} holds {len(ids)} objects {ids} (allowed: a tool and a target), waited {wait:.1f} s"
+            code, what = Code.NO_OBJECTS, f"{topic} holds {len(ids)} objects {ids} (allowed: a tool that a camera sees, and a target), waited {wait:.1f} s"
         else:
             publishers = node.count_publishers(topic)
             code = Code.NO_OBJECTS if publishers else Code.NO_FRAMES
@@ -326,11 +333,13 @@ class _Stages:
             want_heatmap=True,
         )
         answer = node._matcher.call(message, min(timeout, node._match_timeout), self._token, node._presence)
-        if answer.code != Code.OK:
-            raise MagicError(code_of(answer.code), answer.message)
+        if answer.code != Code.OK or not answer.candidates:
+            raise MagicError(code_of(answer.code or Code.NO_MATCH), answer.message or "no contact was found")
         heatmap = answer.heatmap if len(answer.heatmap.data) else None
         target_id = answer.target_id or request.target_id
-        self.matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, answer.message)
+        scores = ", ".join(f"{c.tool_id} {c.score:.3f}" for c in answer.candidates)
+        message = f"{len(answer.candidates)} candidates for {target_id} ({scores}), {answer.features} features, {answer.seconds:.2f} s"
+        self.matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, message)
         # The matcher keeps its own copy of the objects: what it names must be in ours.
         for what, value in (("target", target_id), *(("tool", c.tool_id) for c in answer.candidates)):
             if value not in [o.id for o in self.scene.objects]:
@@ -377,16 +386,33 @@ class _Stages:
             repetitions=node._repetitions,
             seed=request.seed,
             timeout=timeout,
-            want_film=node._film,
         )
         result = node._verifier.call(goal, timeout, self._token, node._presence, node._grace)
+        self._last_goal, self._last_code = goal, result.code
         code = code_of(result.code)
         if code == Code.OK and not result.success:
             code = Code.GOAL_NOT_REACHED
         values = ", ".join(f"{n} {v:.4g}" for n, v in zip(result.metric_names, result.metric_values))
         message = result.message + (f" [{values}]" if values else "")
-        film = result.film if len(result.film.data) else None
-        return pipeline.Verdict(code, message, film, max(1, node._repetitions))
+        return pipeline.Verdict(code, message, max(1, node._repetitions))
+
+    def film(self, outcome_code: Code) -> Image | None:
+        """The film strip of the last simulation, which is run once more for it: with the same seed it goes the same way.
+
+        Drawing costs more than simulating, and only one of a run's simulations is looked at.
+        """
+        node, goal = self._node, self._last_goal
+        if goal is None or outcome_code in pipeline.FATAL:
+            return None
+        goal.want_film, goal.repetitions = True, 1
+        try:
+            result = node._verifier.call(goal, node._verify_timeout, self._token, node._presence, node._grace)
+        except MagicError as error:
+            node.get_logger().warning(f"no film: {error.message}")
+            return None
+        if result.code != self._last_code and node._repetitions <= 1:
+            node.get_logger().warning(f"the simulation repeated for the film ended with {result.code} instead of {self._last_code}: {result.message}")
+        return result.film if len(result.film.data) else None
 
     def _obstacles(self, trial: pipeline.Trial, matches: pipeline.Matches) -> list[SceneObject]:
         return [o for o in self.scene.objects if o.id not in (trial.candidate.tool_id, matches.target_id)]
@@ -432,7 +458,6 @@ def fill(result: RunStrategy.Result, outcome: pipeline.Outcome) -> None:
     result.simulations = outcome.simulations
     result.times = StageTimes(**{key: float(outcome.seconds.get(key, 0.0)) for key in (*pipeline.STAGES, "total")})
     result.features = outcome.features
-    result.film = outcome.film or Image()
     result.heatmap = outcome.heatmap or Image()
 
 

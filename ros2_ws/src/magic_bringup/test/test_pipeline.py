@@ -39,7 +39,7 @@ class Script:
         self.now += self.cost
         assert plan == ("plan", trial.index, trial.attempt)
         self.calls.append(("verify", trial.index, trial.reflection, trial.attempt))
-        return Verdict(self._verify(trial), "judged", film=f"film {trial.index}")
+        return Verdict(self._verify(trial), "judged")
 
 
 def execute(script, variant="fg", timeout=100.0, reflections=("keep", "turn"), simulatable=True, allow=False, attempts=2, **kwargs):
@@ -56,7 +56,6 @@ def test_stops_at_the_first_success():
     outcome = execute(script)
     assert (outcome.code, outcome.verified, outcome.simulations) == (Code.OK, True, 2)
     assert outcome.plan == ("plan", 1, 0)
-    assert outcome.film == "film 1"
     assert [(r.trial.index, r.stage, r.code) for r in outcome.reports] == [(0, "verify", Code.DRIFT), (1, "verify", Code.OK)]
     assert (outcome.tool_id, outcome.target_id, outcome.features) == ("tool", "target", "script")
 

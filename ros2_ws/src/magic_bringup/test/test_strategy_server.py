@@ -3,6 +3,7 @@
 import threading
 import time
 
+import numpy as np
 import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
@@ -11,7 +12,7 @@ from magic_bringup import fakes
 from magic_bringup.domain import free_domain
 from magic_bringup.remote import Token
 from magic_bringup.strategy_server import StrategyServer, complaint_code
-from magic_core import qos
+from magic_core import conversions, qos
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
@@ -31,8 +32,8 @@ class Bench:
     def __init__(self, folder, services=("match", "plan", "verify"), **parameters):
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=free_domain())  # two benches may be open at once
-        values = {"strategies": str(folder), "server_timeout": 2.0, "objects_timeout": 1.0, "grace": 0.5, **parameters}
-        arguments = ["--ros-args"] + [x for k, v in values.items() for x in ("-p", f"{k}:={v}")]
+        values = {"film": False, "strategies": str(folder), "server_timeout": 2.0, "objects_timeout": 1.0, "grace": 0.5, **parameters}
+        arguments = ["--ros-args"] + [x for k, v in values.items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
         original = Node.__init__
         context = self.context
 
@@ -274,6 +275,28 @@ def test_a_server_that_never_finishes(folder):
         assert "verifier" in result.message
         assert time.monotonic() - begin < 5.0
         assert bench.fakes.canceled_goals == ["verify_motion"]
+    finally:
+        bench.close()
+
+
+def test_the_film_is_made_after_the_trajectory_is_out(folder):
+    bench = Bench(folder, film=True)
+    try:
+        bench.fakes.publish(fakes.scene())
+        published = []
+
+        def verify(goal, canceled):
+            result = fakes.FakeServers.verify(goal, canceled)
+            if goal.want_film:
+                bench.wait(lambda: bench.messages["tool"])
+                published.append(True)
+                result.film = conversions.image_to_msg(np.zeros((4, 8, 3), np.uint8), "rgb8")
+            return result
+
+        bench.fakes.on_verify = verify
+        result, _ = bench.run()
+        assert (result.code, result.simulations, result.film.width) == (0, 1, 8)
+        assert published == [True]
     finally:
         bench.close()
 

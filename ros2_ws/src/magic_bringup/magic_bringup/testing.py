@@ -1,0 +1,188 @@
+"""The whole graph in tests: five real processes in a ROS domain of their own, fed from recorded bags or from changed frames."""
+
+from __future__ import annotations
+
+import copy
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from magic_core import qos
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+
+from magic_bringup import bag_file
+from magic_bringup.bag_player import message_class
+from magic_bringup.demo import Options, Watcher, look_into
+from magic_bringup.domain import isolated
+from magic_bringup.graph import Graph
+
+#: Longest wait for anything in these tests, s; a machine with two busy cores starts the graph in less than half of it.
+DEADLINE = 90.0
+
+
+def until(condition: Callable[[], Any], timeout: float = DEADLINE, what: str = "") -> Any:
+    """The condition's first true value; fails at the deadline."""
+    deadline = time.monotonic() + timeout
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
+        time.sleep(0.02)
+
+
+class Bench:
+    """A graph with a client: the demo's own watcher, and what a test asks for besides."""
+
+    def __init__(self, graph: Graph, watcher: Watcher) -> None:
+        self.graph = graph
+        self.watcher = watcher
+        self.lines: list[str] = []
+
+    def ready(self, wanted: tuple[str, ...] = ()) -> None:
+        """Wait for the nodes (all of them, or the named ones)."""
+
+        def up() -> bool:
+            self.graph.check()
+            missing = self.watcher.ready()
+            return not [n for n in missing if not wanted or n in wanted]
+
+        until(up, what="the graph is up")
+
+    def play(self, bag: Path) -> None:
+        """Replay a bag until objects have been seen."""
+        player = self.graph.start("bag_player", "magic_bringup", "bag_player", str(bag), "--loop", "--delay", "0.7")
+
+        def seen() -> bool:
+            self.graph.check()
+            assert player.status is None, player.tail()
+            return self.watcher.objects_at is not None
+
+        until(seen, what="objects are published")
+        self.graph.stop(["bag_player"])
+
+    def run(self, timeout: float = DEADLINE, **goal: Any) -> Any:
+        """The result of one run of a strategy."""
+        options = Options(**{"strategy": "hooking", "variant": "fg", "bag": Path(), "out": Path(), "timeout": 60.0, **goal})
+        pending = self.watcher.send(options)
+
+        def answered() -> bool:
+            return pending.result is not None
+
+        until(answered, timeout, "the strategy server answers")
+        return pending.result
+
+
+@contextmanager
+def started(logs: Path, bag: Path | None = None, parameters: dict[str, dict[str, object]] | None = None, leave_out: tuple[str, ...] = ()) -> Iterator[Bench]:
+    """A graph in a domain of its own; everything is stopped in the end."""
+    env = isolated()
+    before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
+    os.environ.update({k: env[k] for k in before})
+    lines: list[str] = []
+    try:
+        with Graph(logs, env) as graph:
+            graph.start_nodes(parameters, leave_out)
+            watcher = Watcher(look_into(bag)[0] if bag is not None else (), lines.append)
+            try:
+                bench = Bench(graph, watcher)
+                bench.lines = lines
+                yield bench
+            finally:
+                watcher.close()
+    finally:
+        for key, value in before.items():
+            if value is None:
+                os.environ.pop(key, None)
+            else:
+                os.environ[key] = value
+
+
+def first_messages(bag: Path) -> dict[str, Any]:
+    """The first message of every topic of a bag, decoded."""
+    found: dict[str, Any] = {}
+    with bag_file.open_bag(bag) as reader:
+        count = len({c.topic for c in reader.connections if c.msgcount})
+        for connection, _, data in reader.messages():
+            if connection.topic not in found:
+                found[connection.topic] = deserialize_message(bytes(data), message_class(connection.msgtype))
+            if len(found) == count:
+                break
+    return found
+
+
+class Feed(Node):
+    """Publishes one set of messages again and again at 10 Hz with growing stamps, changed as a test wants.
+
+    ``change(topic, message)`` gets a copy and returns what is to be sent; ``None``: nothing.
+    """
+
+    def __init__(self, messages: dict[str, Any], change: Callable[[str, Any], Any]) -> None:
+        super().__init__("feed")
+        self._out = []
+        for topic, message in messages.items():
+            changed = change(topic, copy.deepcopy(message))
+            if changed is not None:
+                latched = topic in ("/tf_static", "/known_objects")
+                profile = qos.STATIC_TF if latched else qos.RELIABLE
+                self._out.append((topic, changed, self.create_publisher(type(changed), topic, profile), latched))
+        for _, message, publisher, latched in self._out:
+            if latched:
+                publisher.publish(message)
+        self.create_timer(0.1, self._tick)
+
+    def _tick(self) -> None:
+        now = self.get_clock().now().to_msg()
+        for _, message, publisher, latched in self._out:
+            if not latched:
+                if hasattr(message, "header"):
+                    message.header.stamp = now
+                publisher.publish(message)
+
+
+@contextmanager
+def feeding(messages: dict[str, Any], change: Callable[[str, Any], Any] = lambda topic, message: message) -> Iterator[Feed]:
+    """A feed, spun in a thread on the running context."""
+    feed = Feed(messages, change)
+    executor = SingleThreadedExecutor()
+    executor.add_node(feed)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    try:
+        yield feed
+    finally:
+        executor.shutdown(timeout_sec=2.0)
+        feed.destroy_node()
+        thread.join(2.0)
+
+
+def camera_messages(meshes: list[Any], names: tuple[str, ...] = ("left", "right"), seed: int = 0) -> dict[str, Any]:
+    """What D435 cameras that look at meshes (world coordinates) on the table publish: topic -> message."""
+    from geometry_msgs.msg import TransformStamped
+    from magic_core import conversions, sensor
+    from tf2_msgs.msg import TFMessage
+
+    messages: dict[str, Any] = {}
+    static = TFMessage()
+    caster = sensor.scene_raycaster(meshes)
+    for index, name in enumerate(names):
+        pose = sensor.looking_at([0.1, 0.45 if index == 0 else -0.45, 0.65], [0.5, 0.0, 0.0])
+        frame = sensor.capture(meshes, sensor.D435, pose, (seed, index), camera=name, raycaster=caster)
+        head = conversions.header(f"{name}_color_optical_frame")
+        base = f"/camera/{name}"
+        depth = np.nan_to_num(frame.depth * 1000.0).round().astype(np.uint16)
+        messages[f"{base}/color/image_raw"] = conversions.image_to_msg(frame.color, "rgb8", head)
+        messages[f"{base}/color/camera_info"] = conversions.intrinsics_to_msg(frame.intrinsics, head)
+        messages[f"{base}/aligned_depth_to_color/image_raw"] = conversions.image_to_msg(depth, "16UC1", head)
+        messages[f"{base}/aligned_depth_to_color/camera_info"] = conversions.intrinsics_to_msg(frame.intrinsics, head)
+        static.transforms.append(
+            TransformStamped(header=conversions.header("panda_link0"), child_frame_id=head.frame_id, transform=conversions.transform_to_msg(pose))
+        )
+    return {"/tf_static": static, **messages}
