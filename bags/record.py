@@ -161,7 +161,7 @@ def hooking_scene(seed: int) -> list[Thing]:
 
 def hanging_scene(seed: int) -> list[Thing]:
     """A mug on the table, its handle in sight, and the rod."""
-    mug = make("mug", seed + 3, profile="straight", handle="D", radius=0.039, height=0.095, handle_thickness=0.008, handle_breadth=0.013, handle_reach=0.034)
+    mug = make("mug", seed + 3, profile="straight", handle="D", radius=0.039, height=0.095, handle_thickness=0.010, handle_breadth=0.014, handle_reach=0.034)
     rod = make("rod", 0, **make_strategies.ROD)
     return [Thing("mug", mug, lying(mug, 0.50, -0.30, np.deg2rad(70))), Thing("rod", rod, make_strategies.rod_pose(rod), known=True)]
 

@@ -61,13 +61,14 @@ def _line(points: list[NDArray[np.float64]], speed: float) -> tuple[NDArray[np.f
     return np.array(times), np.array(places)
 
 
-def _target_view(shape: Shape, kind: str, direction: NDArray[np.float64]) -> CanonicalView:
+def target_view(shape: Shape, kind: str, direction: NDArray[np.float64]) -> CanonicalView:
     """The view of a target that stands in its object frame: world up is up, world +x where it is seen from above."""
     up = np.array([1.0, 0.0, 0.0]) if abs(direction[2]) > 0.9 else UP
     return section_view(shape.mesh, direction, up) if kind == "section" else canonical_view(shape.mesh, direction, up, kind)
 
 
-def _target_contact(view: CanonicalView, point: NDArray[np.float64], normal: NDArray[np.float64], radius: float) -> Contact:
+def target_contact(view: CanonicalView, point: NDArray[np.float64], normal: NDArray[np.float64], radius: float) -> Contact:
+    """The contact at a point (3,) of a convex outline with an outward normal (3,), object frame, and a radius of curvature."""
     pixel = view.pixels(point)
     picture = transforms.unit(normal @ view.object_from_view[:3, :2])
     return Contact(pixel, picture, radius, False, 3.5 * radius, contact_frame(view, pixel, picture))
@@ -91,8 +92,8 @@ def hooking() -> Strategy:
     tool_view = tool.view("top")
     tool_contact = tool.contact("inner", tool_view)
     direction, normal = -UP, np.array([1.0, 0.0, 0.0])
-    target_view = _target_view(target, "top", direction)
-    target_contact = _target_contact(target_view, 0.025 * normal, normal, 0.025)
+    seen = target_view(target, "top", direction)
+    touched = target_contact(seen, 0.025 * normal, normal, 0.025)
     waypoints = (
         Waypoint("above", np.array([0.03, 0, -0.12]), "approach"),
         Waypoint("behind", np.array([0.03, 0, 0]), "approach"),
@@ -109,12 +110,12 @@ def hooking() -> Strategy:
         mode="plan",
         tool_view=tool_view,
         tool_contact=tool_contact,
-        target_view=target_view,
-        target_contact=target_contact,
+        target_view=seen,
+        target_contact=touched,
         target_normal=normal,
         target_view_direction=direction,
         times=times,
-        target_from_tool=_trajectory(target_contact, contacts, tool_contact),
+        target_from_tool=_trajectory(touched, contacts, tool_contact),
         tool_mesh=tool.mesh,
         target_mesh=target.mesh,
         waypoints=waypoints,
@@ -146,9 +147,9 @@ def hanging() -> Strategy:
     tool_view = tool.view("side")
     tool_contact = tool.contact("hook", tool_view, towards=(0, -1, 0))
     direction, normal = np.array([1.0, 0.0, 0.0]), UP
-    target_view = _target_view(target, "side", direction)
+    seen = target_view(target, "side", direction)
     top = target.mesh.bounds[1, 2]
-    target_contact = _target_contact(target_view, np.array([0.0, 0.0, top]), normal, ROD["radius"])
+    touched = target_contact(seen, np.array([0.0, 0.0, top]), normal, ROD["radius"])
     waypoints = (
         Waypoint("before", np.array([0.012, 0, -0.20]), "approach"),
         Waypoint("over", np.array([0.012, 0, 0]), "approach"),
@@ -165,12 +166,12 @@ def hanging() -> Strategy:
         mode="plan",
         tool_view=tool_view,
         tool_contact=tool_contact,
-        target_view=target_view,
-        target_contact=target_contact,
+        target_view=seen,
+        target_contact=touched,
         target_normal=normal,
         target_view_direction=direction,
         times=times,
-        target_from_tool=_trajectory(target_contact, contacts, tool_contact),
+        target_from_tool=_trajectory(touched, contacts, tool_contact),
         tool_mesh=tool.mesh,
         target_mesh=target.mesh,
         waypoints=waypoints,
@@ -207,8 +208,8 @@ def scooping() -> Strategy:
     tool_view = tool.view("section")
     tool_contact = tool.contact("bowl", tool_view, towards=(0, 0, 1))
     direction, normal = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
-    target_view = _target_view(target, "section", direction)
-    target_contact = _target_contact(target_view, radius * normal, normal, radius)
+    seen = target_view(target, "section", direction)
+    touched = target_contact(seen, radius * normal, normal, radius)
 
     speed = 0.08
     # The deepest bowls reach round the ball before their bottoms touch it: the start leaves them room.
@@ -241,12 +242,12 @@ def scooping() -> Strategy:
         mode="retarget",
         tool_view=tool_view,
         tool_contact=tool_contact,
-        target_view=target_view,
-        target_contact=target_contact,
+        target_view=seen,
+        target_contact=touched,
         target_normal=normal,
         target_view_direction=direction,
         times=times,
-        target_from_tool=_trajectory(target_contact, contacts, tool_contact),
+        target_from_tool=_trajectory(touched, contacts, tool_contact),
         tool_mesh=tool.mesh,
         target_mesh=target.mesh,
         waypoints=waypoints,

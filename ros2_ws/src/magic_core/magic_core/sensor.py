@@ -55,7 +55,7 @@ class DepthModel:
     correlation: float = 1.5
     edge: float = 0.010
     edge_width: int = 2
-    edge_loss: float = 0.7
+    edge_loss: float = 0.5
     grazing: float = 0.15
     dropout: float = 0.002
     near: float = 0.17

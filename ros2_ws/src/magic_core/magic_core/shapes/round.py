@@ -268,7 +268,8 @@ def quarter_pipe(seed: int = 0, **given: float | str) -> Shape:
     # The profile is seen whole from its lower back corner, so a fan from there fills it.
     fan = np.array([(1, k, (k + 1) % n) for k in range(2, n)])
     faces = np.concatenate([fan, fan[:, ::-1] + n, np.column_stack([i, i + n, j + n]), np.column_stack([i, j + n, j])]).astype(np.int32)
-    fine = np.linspace(0, np.pi / 2, 46)
+    # The lowest degrees are thinner than paper: nothing is to be touched there.
+    fine = np.linspace(np.deg2rad(7), np.deg2rad(89), 42)
     surface = np.column_stack([radius * np.sin(fine), 0 * fine, radius * (1 - np.cos(fine))])
     normals = np.column_stack([-np.sin(fine), 0 * fine, np.cos(fine)])
     regions = {"arc": Region(surface, normals, radius, True)}

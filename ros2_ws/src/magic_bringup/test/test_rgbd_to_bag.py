@@ -1,0 +1,150 @@
+"""An image pair becomes a bag: the table is found, the thing lies in reach, and bad input gets a code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from magic_bringup import rgbd_to_bag
+from magic_bringup.bag_file import info as read_info
+from magic_core import strategy as strategies
+from magic_core import transforms
+from magic_core.camera import Intrinsics
+from magic_core.errors import Code, MagicError
+from magic_core.sensor import capture, looking_at
+from magic_core.shapes import make
+
+STRATEGIES = Path(__file__).resolve().parents[1] / "strategies"
+SHARED = Path(__file__).resolve().parents[5] / "shared" / "data" / "rgbd" / "realsense_single"
+CAMERA = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A mug seen by a camera whose pose is not told."""
+    folder = tmp_path_factory.mktemp("rgbd")
+    mug = make("mug", 3)
+    frame = capture([mug.mesh.transformed(transforms.from_rpy(0, 0, 1.0, [3.0, 2.0, mug.mesh.extents[2] / 2]))], CAMERA, looking_at([3.4, 2.2, 0.45], [3, 2, 0.04]), 0, table=_table())
+    cv2.imwrite(str(folder / "c.png"), frame.color[..., ::-1])
+    depth = np.nan_to_num(frame.depth)
+    cv2.imwrite(str(folder / "d.png"), np.round(depth * 1000).astype(np.uint16))
+    np.save(folder / "d.npy", depth)
+    (folder / "k.json").write_text(json.dumps({"fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy}))
+    return {name: folder / name for name in ("c.png", "d.png", "d.npy", "k.json")}
+
+
+def _table() -> object:
+    from magic_core.sensor import table_mesh
+
+    return table_mesh((2.0, 1.0), (4.0, 3.0))
+
+
+def run(files: dict[str, Path], out: Path, *more: str, **instead: str) -> int:
+    named = {"--color": str(files["c.png"]), "--depth": str(files["d.png"]), "--intrinsics": str(files["k.json"]), "--strategy": str(STRATEGIES / "hanging")}
+    named.update({f"--{k.replace('_', '-')}": v for k, v in instead.items()})
+    return rgbd_to_bag.main([*(x for pair in named.items() for x in pair), "--out", str(out), *more])
+
+
+def test_the_mug_stands_upright_in_reach_beside_the_rod(files: dict[str, Path], tmp_path: Path) -> None:
+    color = rgbd_to_bag.read_color(files["c.png"])
+    depth = rgbd_to_bag.read_depth(files["d.png"])
+    strategy = strategies.load(STRATEGIES / "hanging")
+    frame = rgbd_to_bag.convert(color, depth, CAMERA, tmp_path / "bag", strategy=strategy)
+    points = transforms.apply(frame.world_from_camera, CAMERA.unproject(frame.depth)).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    assert np.median(points[:, 2]) == pytest.approx(0, abs=0.002)
+    mug = points[points[:, 2] > 0.015]
+    assert mug[:, 2].max() == pytest.approx(make("mug", 3).mesh.extents[2], abs=0.006)
+    middle = (mug.min(axis=0) + mug.max(axis=0)) / 2
+    np.testing.assert_allclose(middle[:2], rgbd_to_bag.PLACES[0], atol=0.02)
+    (rod,) = rgbd_to_bag.strategy_fixtures(strategy)
+    corners = transforms.apply(rod.world_from_object, rod.mesh.vertices)
+    assert np.linalg.norm(mug[:, None, :2] - corners[None, ::10, :2], axis=2).min() > 0.1
+    topics = {t.name: t.count for t in read_info(tmp_path / "bag").topics}
+    assert topics["/known_objects"] == topics["/tf_static"] == 1 and topics["/camera/left/color/image_raw"] == rgbd_to_bag.REPEATS
+
+
+def test_given_poses_are_kept(files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pose = ["0.9", "0", "0.5", "0.653281", "0.653281", "-0.270598", "-0.270598"]
+    assert run(files, tmp_path / "bag", "--camera-pose", *pose, "--rod", "0.5", "0.1", "0.19", "0", "0", "0", "1", depth=str(files["d.npy"])) == 0
+    assert "camera at 0.9000 0.0000 0.5000" in capsys.readouterr().out
+
+
+def test_without_a_strategy_nothing_is_known(files: dict[str, Path], tmp_path: Path) -> None:
+    assert run(files, tmp_path / "bag", strategy="none") == 0
+    assert "/known_objects" not in {t.name for t in read_info(tmp_path / "bag").topics}
+    assert run(files, tmp_path / "bag", strategy="none") == 1  # it is there already
+    assert run(files, tmp_path / "bag", "--force", strategy="none") == 0
+
+
+@pytest.mark.parametrize(
+    ("instead", "code"),
+    [
+        ({"color": "missing.png"}, Code.BAD_IMAGE),
+        ({"depth": "missing.png"}, Code.BAD_IMAGE),
+        ({"depth": "c.png"}, Code.BAD_ENCODING),
+        ({"depth_unit": "m"}, Code.NO_DEPTH),
+        ({"intrinsics": "1,2,3"}, Code.BAD_INTRINSICS),
+        ({"intrinsics": "0,300,212,120"}, Code.BAD_INTRINSICS),
+        ({"intrinsics": "none.json"}, Code.BAD_INTRINSICS),
+        ({"strategy": "no/such"}, Code.UNKNOWN_STRATEGY),
+    ],
+)
+def test_bad_input_gets_a_code(files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], instead: dict[str, str], code: Code) -> None:
+    instead = {k: str(files[v]) if v in files else v for k, v in instead.items()}
+    assert run(files, tmp_path / "bag", **instead) == 1
+    assert f"[{int(code)} {code.name}]" in capsys.readouterr().err
+    assert not (tmp_path / "bag").exists()
+
+
+def test_bad_depth_and_sizes_get_a_code(files: dict[str, Path], tmp_path: Path) -> None:
+    color = rgbd_to_bag.read_color(files["c.png"])
+    strategy = strategies.load(STRATEGIES / "hanging")
+    flat = capture([], CAMERA, looking_at([0.9, 0.2, 0.5], [0.5, 0, 0]), 0).depth
+    for depth, code in (
+        (np.full((240, 424), np.nan, np.float32), None),
+        (flat, Code.NO_OBJECTS),
+        (flat[:100], Code.BAD_IMAGE),
+    ):
+        with pytest.raises(MagicError) as caught:
+            rgbd_to_bag.convert(color, depth, CAMERA, tmp_path / "bag", strategy=strategy)
+        assert caught.value.code in ((code,) if code else (Code.NO_TABLE, Code.NO_DEPTH, Code.NO_OBJECTS))
+    np.save(tmp_path / "nan.npy", np.full((240, 424), np.nan))
+    with pytest.raises(MagicError) as caught:
+        rgbd_to_bag.read_depth(tmp_path / "nan.npy")
+    assert caught.value.code == Code.NO_DEPTH
+
+
+def test_intrinsics_are_read_in_every_common_form(tmp_path: Path) -> None:
+    expected = Intrinsics(640, 480, 600.0, 601.0, 320.0, 240.0)
+    rows = [[600.0, 0, 320.0], [0, 601.0, 240.0], [0, 0, 1.0]]
+    columns = [600.0, 0, 0, 0, 601.0, 0, 320.0, 240.0, 1.0]
+    plain = {"fx": 600.0, "fy": 601.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+    for data in (plain, {"K": rows}, {"intrinsic_matrix": columns, "width": 640, "height": 480}, {"mug": plain, "can": {**plain, "fx": 1.0}}):
+        path = tmp_path / "k.json"
+        path.write_text(json.dumps(data))
+        assert rgbd_to_bag.read_intrinsics(str(path), 640, 480, "mug_color.png") == expected
+    assert rgbd_to_bag.read_intrinsics(f"{path}:can", 640, 480).fx == 1.0
+    assert rgbd_to_bag.read_intrinsics("600,601,320,240", 640, 480) == expected
+    with pytest.raises(MagicError, match="mug"):
+        rgbd_to_bag.read_intrinsics(str(path), 640, 480, "spoon.png")
+    path.write_text(json.dumps(plain))
+    with pytest.raises(MagicError, match="320 x 240"):
+        rgbd_to_bag.read_intrinsics(str(path), 320, 240)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="shared/data is not here")
+def test_the_red_mug_of_a_real_capture(tmp_path: Path) -> None:
+    color = rgbd_to_bag.read_color(SHARED / "red_mug_color.png")
+    depth = rgbd_to_bag.read_depth(SHARED / "red_mug_depth_mm.png")
+    intrinsics = rgbd_to_bag.read_intrinsics(str(SHARED / "intrinsics.json"), 640, 480, "red_mug_color.png")
+    frame = rgbd_to_bag.convert(color, depth, intrinsics, tmp_path / "bag", strategy=strategies.load(STRATEGIES / "hanging"))
+    points = transforms.apply(frame.world_from_camera, intrinsics.unproject(frame.depth)).reshape(-1, 3)
+    reds = (color[..., 0] > 120) & (color[..., 1] < 60)
+    mug = points[reds.ravel() & np.isfinite(points).all(axis=1)]
+    mug = mug[mug[:, 2] > 0.01]
+    assert 0.08 < np.percentile(mug[:, 2], 99) < 0.115
+    assert np.linalg.norm(np.median(mug[:, :2], axis=0) - rgbd_to_bag.PLACES[0]) < 0.06
