@@ -309,12 +309,19 @@ def _lying(sights: list[Sight], points: NDArray[np.float64], height: float, nois
     parts = [p for p in parts if p.area > 0.08 * parts[0].area]
     if flat:
         return _extruded(parts, thickness, "flat", 0.9)
-    top = cv2.GaussianBlur(_nearest(grid.top, occupied), (0, 0), 1.2)
+    # Smooth over 3 mm, over the thing's own cells only.
+    weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
+    smooth = cv2.GaussianBlur(np.where(occupied, grid.top, 0).astype(np.float32), (0, 0), 2.0) / np.maximum(weight, 1e-6)
+    top = _nearest(smooth.astype(np.float32), occupied)
     depression = _filled(np.where(occupied, top, 0)) - top
     hollow = (depression > max(0.004, 3 * noise)) & inner
     if hollow.sum() * grid.cell**2 > 1.5e-4:
         spread = int(np.ceil(parameters.wall / grid.cell / 2))
-        bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - parameters.wall
+        # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
+        reach = 2 * int(0.012 / grid.cell) + 1
+        width = 2 * grid.cell * cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+        thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
+        bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
         bottom = np.clip(bottom, 0, top - 0.001)
         shape = "shell"
     else:

@@ -24,7 +24,7 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
 
     kind ``top``: from above, the object's x to the right.  ``side``: along the horizontal direction in which the
     silhouette shows a hole best, else the one that is least convex (a handle), else the widest; up is +z, and what
-    sticks out lies to the right.  ``section``: the upright cut through the long horizontal axis, filled; the wider
+    sticks out lies to the right.  ``section``: the upright cut through the long horizontal axis of its plan, filled; the wider
     end (the bowl) lies to the right.  ``None`` decides: ``side`` for what stands and shows a hole or a handle from the
     side but not from above, else ``top``.  ``pieces`` are used for the cut where the mesh is not watertight.
 
@@ -116,23 +116,37 @@ def _best_side(mesh: Mesh) -> tuple[NDArray[np.float64], float, float]:
 
 
 def long_axis(mesh: Mesh) -> NDArray[np.float64]:
-    """(3,): unit horizontal direction of the long side of the smallest upright box around a mesh."""
-    (_, _), (w, h), angle = cv2.minAreaRect(((mesh.vertices[:, :2] - mesh.vertices[:, :2].mean(axis=0)) * 1000).astype(np.float32))
-    angle = np.radians(angle if w >= h else angle + 90)
-    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
-    return axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
+    """(3,): unit horizontal direction of the long principal axis of a mesh's area as seen from above.
+
+    For a thing with an upright plane of symmetry along it (a spoon) the plane contains this axis, which does not hold
+    for the side of the smallest box.
+    """
+    return _plan(mesh)[0]
+
+
+def _plan(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The long axis (3,) and the centroid (3,) of a mesh's area as seen from above."""
+    corners = mesh.vertices[mesh.faces]
+    u, v = corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]
+    # A closed mesh is seen from below and from above: the area counts twice, which does not matter here.
+    area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) + 1e-12
+    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
+    # Second moments of triangles are exact with the three edge midpoints.
+    middles = ((corners + np.roll(corners, 1, axis=1)) / 2 - centroid)[..., :2]
+    moments = np.einsum("n,nki,nkj->ij", area, middles, middles)
+    x, y = np.linalg.eigh(moments)[1][:, 1]
+    axis = np.array([x, y, 0.0])
+    return (axis if axis[np.argmax(np.abs(axis))] > 0 else -axis), centroid
 
 
 def _section(mesh: Mesh, pieces: Sequence[Mesh] | None, size: int) -> CanonicalView:
     import shapely
 
-    axis = long_axis(mesh)
+    axis, centre = _plan(mesh)
     side = np.array([-axis[1], axis[0], 0.0])
-    low, high = mesh.bounds
-    centre = (low + high) / 2
     lateral = (mesh.vertices - centre) @ side
     along = (mesh.vertices - centre) @ axis
-    middle = centre + side * (lateral.min() + lateral.max()) / 2
+    middle = centre
     # The wider end, where the bowl is, goes to the right.
     half = (along.min() + along.max()) / 2
     if np.ptp(lateral[along < half], axis=0) > np.ptp(lateral[along >= half], axis=0):
@@ -141,7 +155,7 @@ def _section(mesh: Mesh, pieces: Sequence[Mesh] | None, size: int) -> CanonicalV
     if shape.is_empty and pieces:
         shape = shapely.union_all([_cut(piece, middle, axis, side) for piece in pieces])
     if shape.is_empty:
-        raise MagicError(Code.BAD_MESH, "section along the long axis", "empty", "a mesh that the upright plane through its box's centre cuts")
+        raise MagicError(Code.BAD_MESH, "section along the long axis", "empty", "a mesh that the upright plane through its middle cuts")
     # The picture: x along the axis, y down, z = x cross y.
     x, y = axis, np.array([0.0, 0.0, -1.0])
     x0, z0, x1, z1 = shape.bounds
