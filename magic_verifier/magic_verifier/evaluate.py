@@ -1,0 +1,481 @@
+"""Success rates of a task over a set of objects: ``ros2 run magic_verifier evaluate``.
+
+A case is one tool with one target (with tool selection: one target with all tools).
+It is matched, planned and verified as the graph does it, candidate by candidate,
+until one passes.  Cases run in parallel by joblib; each is stored as soon as it is
+done, so that an interrupted evaluation goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import strategy as strategies
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.scene import SceneObject
+from magic_core.strategy import Strategy
+
+TASKS = ("scooping", "hanging", "hooking")
+VARIANTS = ("fg", "arm", "fg_no_selection")
+METHODS = ("magic",)
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+#: Tools of each task: family and seeds; none of them is the tool of a demonstration.
+SPOONS = (("spoon", 11), ("spoon", 12), ("ladle", 11), ("ladle", 12), ("measuring_cup", 11), ("measuring_cup", 12))
+HOOKS = (("scissors", 1), ("hanger", 1), ("caliper", 1), ("watch", 1))
+BALLS = (0.015, 0.035, 0.045)
+CYLINDERS = (0.015, 0.020, 0.025, 0.030, 0.035)
+MUGS = 134
+#: Where tools lie when the arm takes them, and how long planning may take (s) and how many grasps are tried.
+TOOL_PLACE = (0.45, -0.32)
+PLANNING_TIME = 10.0
+ARM_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class Case:
+    """One problem: names of tools (several: the tool is to be chosen) and of the target."""
+
+    name: str
+    tools: tuple[str, ...]
+    target: str
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an evaluation is run with."""
+
+    task: str
+    variant: str
+    method: str
+    features: str
+    weights: str
+    objects: str
+    targets: str
+    seed: int
+    top_k: int
+    noise: float | None
+    strategies: str
+
+
+# ---------------------------------------------------------------- objects
+
+
+def tool_names(options: Options) -> list[str]:
+    """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``."""
+    if options.objects:
+        return _meshes(options.objects)
+    if options.task == "scooping":
+        return [f"{family}:{seed}" for family, seed in SPOONS]
+    if options.task == "hanging":
+        return [f"mug:{index}" for index in range(MUGS)]
+    return [f"{family}:{seed}" for family, seed in HOOKS]
+
+
+def target_names(options: Options) -> list[str]:
+    """Names of the targets: ``family:number``, ``demonstration``, or the paths of meshes under ``targets``."""
+    if options.targets:
+        return _meshes(options.targets)
+    if options.task == "scooping":
+        return [f"sphere:{radius:g}" for radius in BALLS]
+    return ["demonstration"] if options.task == "hanging" else [f"cylinder:{radius:g}" for radius in CYLINDERS]
+
+
+def _meshes(folder: str) -> list[str]:
+    root = Path(folder)
+    found = sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in (".obj", ".ply", ".stl", ".off"))
+    if not found:
+        raise MagicError(Code.BAD_REQUEST, "folder of meshes", folder, "a folder with obj, ply, stl or off files")
+    return found
+
+
+def cases(options: Options) -> list[Case]:
+    """All cases of an evaluation, in their order."""
+    tools, targets = tool_names(options), target_names(options)
+    if options.task == "hooking" and options.variant == "fg":
+        return [Case(_short(target), tuple(tools), target) for target in targets]
+    return [Case(_short(tool) + ("" if len(targets) == 1 else " " + _short(target)), (tool,), target) for tool in tools for target in targets]
+
+
+def _short(name: str) -> str:
+    return Path(name).stem if "/" in name else name
+
+
+def tool_object(name: str, index: int, kind: str) -> SceneObject:
+    """The tool as an object that lies or stands on the table."""
+    mesh, pieces, shape = _load(name)
+    low, _ = mesh.bounds
+    pose = transforms.make(translation=[*TOOL_PLACE, 0.0005 - float(low[2])])
+    object_id = f"tool_{index + 1}"
+    if shape is not None:
+        return shape.as_object(object_id, pose, kind)
+    from magic_core.views import find_view
+
+    return SceneObject(object_id, mesh, pieces, pose, find_view(mesh, pieces, kind), source="known")
+
+
+def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneObject, ...]]:
+    """The target at the place of the demonstration's, on the table, and the fixtures around it."""
+    from magic_core.shapes import make
+    from magic_core.shapes.fixtures import demonstrated_pose, fixtures
+
+    environment = strategy.environment
+    pose = demonstrated_pose(environment)
+    if name == "demonstration":
+        entry = environment["target"]
+        target = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("target", pose)
+    else:
+        mesh, pieces, shape = _load(name)
+        pose = transforms.make(translation=[*pose[:2, 3], -float(mesh.bounds[0][2])])
+        if shape is not None:
+            target = shape.as_object("target", pose)
+        else:
+            from magic_core.views import find_view
+
+            target = SceneObject("target", mesh, pieces, pose, find_view(mesh, pieces, "top"), source="known")
+    corners = transforms.apply(pose, target.mesh.vertices)
+    # The contact point is where the silhouette reaches farthest along the target's normal.
+    reach = corners @ strategy.target_normal
+    contact = corners[reach > reach.max() - 1e-4].mean(axis=0)
+    return target, tuple(fixtures(environment, contact))
+
+
+@lru_cache(maxsize=256)
+def _load(name: str) -> tuple[Any, Any, Any]:
+    from magic_core import shapes
+
+    if "/" in name:
+        from magic_core.mesh import load
+        from magic_verifier.decomposition import convex_pieces
+
+        mesh = load(name)
+        return mesh, convex_pieces(mesh), None
+    family, number = name.split(":")
+    if family == "mug":
+        shape = _mugs()[int(number)]
+    elif family in ("sphere", "cylinder"):
+        size = {"radius": float(number)}
+        if family == "cylinder":
+            size["half_height"] = float(number)
+        shape = shapes.make(family, 0, **size)
+    else:
+        shape = shapes.make(family, int(number))
+    return shape.mesh, shape.pieces, shape
+
+
+@lru_cache(maxsize=1)
+def _mugs() -> list[Any]:
+    from magic_core.shapes import mug_set
+
+    return mug_set(MUGS)
+
+
+# ---------------------------------------------------------------- one case
+
+
+@lru_cache(maxsize=4)
+def _strategy(options: Options) -> Strategy:
+    strategy = strategies.find(options.task, options.strategies or None)
+    if options.noise is not None and strategy.goal.test == "hook":
+        strategy = replace(strategy, goal=replace(strategy.goal, values={**strategy.goal.values, "noise": options.noise}))
+    return strategy
+
+
+@lru_cache(maxsize=4)
+def _matcher(features: str, weights: str) -> Any:
+    from magic_matcher.features import load
+    from magic_matcher.matching import Matcher
+
+    return Matcher(load(features, weights))
+
+
+@lru_cache(maxsize=1)
+def _arm_planner() -> Any:
+    from magic_planner.arm import ArmPlanner
+    from magic_planner.robot import Robot
+
+    planner = ArmPlanner(Robot())
+    planner.warm_up()
+    return planner
+
+
+def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str, Any]:
+    """Match, plan and verify one case; the answer is plain data for ``results.json``."""
+    import torch
+
+    torch.set_num_threads(1)
+    seconds = {"match": 0.0, "plan": 0.0, "verify": 0.0}
+    tried: list[dict[str, Any]] = []
+    answer: dict[str, Any] = {"object": case.name, "success": False, "reason": "", "candidates": tried, "simulations": 0, "seconds": seconds}
+    try:
+        strategy = _strategy(options)
+        tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
+        target, obstacles = scene_for(strategy, case.target)
+        matcher = _matcher(options.features, options.weights)
+        matcher.prepare(_reference(strategy))
+        started = time.perf_counter()
+        found = matcher.match(strategy, tools, target, options.top_k)
+        seconds["match"] = time.perf_counter() - started
+        answer["features"] = found.features
+        by_id = {tool.id: (tool, name) for tool, name in zip(tools, case.tools, strict=True)}
+        last = None
+        for candidate in found.candidates:
+            tool, name = by_id[candidate.tool_id]
+            for reflection in strategy.reflections if candidate.flipped else ("keep",):
+                entry, last, solved = _try(options, strategy, candidate, reflection, tool, target, obstacles, seconds, answer)
+                tried.append({"tool": _short(name), "score": float(candidate.score), "reflection": reflection, **entry})
+                if solved:
+                    answer["success"] = True
+                    break
+            if answer["success"]:
+                break
+        if not tried:
+            answer["reason"] = "NO_MATCH"
+        else:
+            # The reason of a failure is that of the best-scored candidate.
+            answer["reason"] = "OK" if answer["success"] else tried[0]["code"]
+        if film is not None and last is not None:
+            _draw(film, last, target, obstacles)
+    except MagicError as error:
+        answer["reason"] = error.code.name
+        tried.append({"code": error.code.name, "message": error.message})
+    seconds["total"] = sum(seconds.values())
+    return answer
+
+
+def _reference(strategy: Strategy) -> Any:
+    from magic_matcher.features import from_strategy
+
+    return from_strategy(strategy)
+
+
+def _try(
+    options: Options,
+    strategy: Strategy,
+    candidate: Any,
+    reflection: str,
+    tool: SceneObject,
+    target: SceneObject,
+    obstacles: tuple[SceneObject, ...],
+    seconds: dict[str, float],
+    answer: dict[str, Any],
+) -> tuple[dict[str, Any], Any, bool]:
+    from magic_core.motion import MotionPlan
+    from magic_planner.object_motion import plan_tool_motion
+    from magic_verifier.verification import verify
+
+    entry: dict[str, Any] = {"code": "", "message": ""}
+    last = None
+    for attempt in range(ARM_ATTEMPTS if options.variant == "arm" else 1):
+        started = time.perf_counter()
+        try:
+            motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles)
+            if options.variant == "arm":
+                from magic_planner.budget import Budget
+
+                plan = _arm_planner().plan(
+                    strategy, tool, target, candidate, reflection, motion, TABLE, obstacles, attempt=attempt, seed=options.seed, budget=Budget(PLANNING_TIME)
+                )
+            else:
+                plan = MotionPlan("fg", motion)
+        except MagicError as error:
+            return {"code": error.code.name, "message": error.message, "stage": "plan"}, last, False
+        finally:
+            seconds["plan"] += time.perf_counter() - started
+        verdict = verify(
+            strategy, tool, target, obstacles, TABLE, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0
+        )
+        seconds["verify"] += verdict.seconds
+        answer["simulations"] += 1
+        entry = {
+            "code": verdict.code.name,
+            "message": verdict.message,
+            "stage": "verify",
+            "metrics": {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)},
+        }
+        last = (verdict, tool)
+        if verdict.success:
+            return entry, last, True
+    return entry, last, False
+
+
+def _draw(path: Path, last: Any, target: SceneObject, obstacles: tuple[SceneObject, ...]) -> None:
+    """Three moments of the last simulation, for the contact sheet."""
+    import cv2
+
+    from magic_verifier.film import film_strip
+
+    verdict, tool = last
+    if verdict.recording is None:
+        return
+    strip = film_strip(verdict.recording, tool, target, obstacles, TABLE, frames=3, columns=3, size=(220, 165))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), strip[:, :, ::-1])
+
+
+# ---------------------------------------------------------------- the whole
+
+
+def wilson(successes: int, count: int, z: float = 1.959964) -> tuple[float, float]:
+    """The 95 % Wilson score interval of a success rate."""
+    if count == 0:
+        return 0.0, 1.0
+    share = successes / count
+    centre = share + z * z / (2 * count)
+    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    scale = 1 + z * z / count
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
+
+
+def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
+    """Success rate with its interval, reasons and mean times."""
+    good = sum(bool(c["success"]) for c in done)
+    low, high = wilson(good, len(done))
+    stages = ("match", "plan", "verify", "total")
+    return {
+        "task": options.task,
+        "variant": options.variant,
+        "method": options.method,
+        "features": options.features,
+        "cases": len(done),
+        "successes": good,
+        "success_rate": good / len(done) if done else 0.0,
+        "interval_95": [low, high],
+        "reasons": dict(Counter(c["reason"] for c in done if not c["success"])),
+        "simulations": sum(c["simulations"] for c in done),
+        "mean_seconds": {s: float(np.mean([c["seconds"].get(s, 0.0) for c in done])) if done else 0.0 for s in stages},
+    }
+
+
+def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path: Path, columns: int = 4, most: int = 80) -> None:
+    """One picture of the cases that passed, or of those that failed, each with its name and reason."""
+    import cv2
+
+    tiles = []
+    for case in [c for c in done if bool(c["success"]) is success][:most]:
+        picture = cv2.imread(str(folder / f"{_key(case['object'])}.png"))
+        if picture is None:
+            continue
+        label = np.full((22, picture.shape[1], 3), 255, np.uint8)
+        cv2.putText(label, f"{case['object']}: {case['reason']}"[:90], (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
+        tiles.append(np.concatenate([label, picture]))
+    if not tiles:
+        path.unlink(missing_ok=True)
+        return
+    height, width = (max(t.shape[i] for t in tiles) for i in (0, 1))
+    sheet: NDArray[np.uint8] = np.full((height * math.ceil(len(tiles) / columns), width * min(columns, len(tiles)), 3), 255, np.uint8)
+    for index, tile in enumerate(tiles):
+        v, u = height * (index // columns), width * (index % columns)
+        sheet[v : v + tile.shape[0], u : u + tile.shape[1]] = tile
+    cv2.imwrite(str(path), sheet)
+
+
+def _key(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "._-" else "_" for c in name)
+
+
+def _stored(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def _work(options: Options, case: Case, folder: Path, films: bool) -> dict[str, Any]:
+    started = time.perf_counter()
+    key = _key(case.name)
+    result = run_case(options, case, folder / "films" / f"{key}.png" if films else None)
+    result["wall"] = time.perf_counter() - started
+    path = folder / "cases" / f"{key}.json"
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(result))
+    temporary.replace(path)
+    return result
+
+
+def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: bool = True, log: Any = print) -> dict[str, Any]:
+    """Run all cases that are not stored yet and write ``results.json``, ``summary.txt`` and the contact sheets."""
+    from joblib import Parallel, delayed
+
+    todo = cases(options)[: limit or None]
+    (out / "cases").mkdir(parents=True, exist_ok=True)
+    # What is stored belongs to these options only.
+    mark = hashlib.sha256(json.dumps(vars(options), sort_keys=True).encode()).hexdigest()[:16]
+    if (out / "options").exists() and (out / "options").read_text() != mark:
+        raise MagicError(Code.BAD_REQUEST, "output folder", str(out), "an empty folder, or one of an evaluation with the same options")
+    (out / "options").write_text(mark)
+    known = {case.name: stored for case in todo if (stored := _stored(out / "cases" / f"{_key(case.name)}.json")) is not None}
+    waiting = [case for case in todo if case.name not in known]
+    if known:
+        log(f"{len(known)} of {len(todo)} cases are done already")
+    parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
+    for count, result in enumerate(parallel(delayed(_work)(options, case, out, films) for case in waiting), len(known) + 1):
+        known[result["object"]] = result
+        good = sum(bool(c["success"]) for c in known.values())
+        log(f"[{count}/{len(todo)}] {result['object']}: {result['reason']} ({result['seconds']['total']:.2f} s), {good} of {count} so far")
+    done = [known[case.name] for case in todo]
+    summary = summarise(options, done)
+    (out / "results.json").write_text(json.dumps({"cases": done, "summary": summary}, indent=1))
+    low, high = summary["interval_95"]
+    times = summary["mean_seconds"]
+    text = (
+        f"{options.task} {options.variant} {options.method} ({options.features}): {summary['successes']} of {summary['cases']} = "
+        f"{100 * summary['success_rate']:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)\n"
+        f"mean seconds: match {times['match']:.3f}, plan {times['plan']:.3f}, verify {times['verify']:.3f}, total {times['total']:.3f}; "
+        f"{summary['simulations']} simulations\nreasons: {summary['reasons']}\n"
+    )
+    (out / "summary.txt").write_text(text)
+    if films:
+        contact_sheet(out / "films", done, True, out / "successes.png")
+        contact_sheet(out / "films", done, False, out / "failures.png")
+    log(text)
+    return summary
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of ``ros2 run magic_verifier evaluate``."""
+    parser = argparse.ArgumentParser(prog="evaluate", description="Success rate of a task over a set of objects, in simulation.")
+    parser.add_argument("--task", required=True, choices=TASKS)
+    parser.add_argument("--variant", default="fg", choices=VARIANTS)
+    parser.add_argument("--method", default="magic", choices=METHODS)
+    parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded or dinov2")
+    parser.add_argument("--weights", default="", help="hub name or folder of the backend's weights")
+    parser.add_argument("--objects", default="", help="folder of tool meshes in metres, instead of the project's own set")
+    parser.add_argument("--targets", default="", help="folder of target meshes in metres, instead of the project's own set")
+    parser.add_argument("--limit", type=int, default=0, help="only the first so many cases")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
+    parser.add_argument("--top-k", type=int, default=3, help="candidates tried for a case")
+    parser.add_argument("--noise", type=float, default=None, help="hooking: sideways velocity noise in target radii; by default the strategy's")
+    parser.add_argument("--strategies", default="", help="folder of strategies; by default the installed ones")
+    parser.add_argument("--no-films", action="store_true", help="draw no contact sheets")
+    parser.add_argument("--out", required=True, help="folder for results.json, summary.txt and contact sheets")
+    given = parser.parse_args(args)
+    options = Options(
+        given.task, given.variant, given.method, given.features, given.weights, given.objects, given.targets, given.seed, given.top_k, given.noise, given.strategies
+    )
+    try:
+        evaluate(options, Path(given.out), given.limit, given.jobs, not given.no_films, lambda text: print(text, flush=True))
+    except MagicError as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("evaluate: interrupted; run the same command again to go on", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
