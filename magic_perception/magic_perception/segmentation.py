@@ -18,7 +18,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_perception import clusters
+from magic_perception import clusters, convexity
 from magic_perception.parameters import Parameters
 from magic_perception.table import Plane, fit_plane
 
@@ -313,6 +313,8 @@ class DepthSegmenter:
         cloud = np.concatenate([looked.points[s] for looked, s in zip(looks, solid, strict=True)])
         counts = [int(s.sum()) for s in solid]
         instance = clusters.cluster(cloud, parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
+        if parameters.split:
+            instance = self._split(looks, solid, cloud, instance)
         labels = []
         start = 0
         for mask, s, count, known_pixels in zip(masks, solid, counts, fixed, strict=True):
@@ -322,6 +324,25 @@ class DepthSegmenter:
             labels.append(_fill(image, mask))
             labels[-1][known_pixels] = -1
         return _sizeable(labels, looks, parameters)
+
+
+    @staticmethod
+    def _split(looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
+        normal = np.concatenate(
+            [convexity.normals(looked.points, looked.frame.world_from_camera[:3, 3])[s] for looked, s in zip(looks, solid, strict=True)]
+        )
+        heights = np.concatenate([looked.heights[s] for looked, s in zip(looks, solid, strict=True)])
+        following = int(instance.max(initial=-1)) + 1
+        for label in range(following):
+            mine = np.nonzero(instance == label)[0]
+            if len(mine) < 1500 or np.percentile(heights[mine], 97) < 0.05:
+                continue
+            part = convexity.parts(cloud[mine], normal[mine])
+            for number in range(1, int(part.max()) + 1):
+                instance[mine[part == number]] = following
+                following += 1
+        return instance
 
 
 def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 12.0) -> NDArray[np.int32]:
