@@ -29,7 +29,7 @@ from magic_bringup.graph import Graph, peak_memory
 #: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
 START_TIMEOUT = 120.0
 #: How long to wait for objects beyond the bag's own length, s.  The bag is played in a loop: a camera would go on, too.
-PATIENCE = 8.0
+PATIENCE = 20.0
 #: Between the advertisement and the first message of the replay, s, so that the subscriptions have met their publishers.
 PLAYER_DELAY = 0.7
 
@@ -332,7 +332,8 @@ class Demo:
             ids = ", ".join(o.id for o in watcher.scene.objects)
             self.say(f"perceive: objects after {watcher.perceive_seconds():.2f} s: {ids}")
             # What is known by now is enough; the replay would only take time from the stages after it.
-            graph.stop(["bag_player"])
+            player.sample()
+            player.signal(signal.SIGINT)
         watcher.forget_cameras()
         pending = watcher.send(options)
         if not self._wait(graph, watcher, lambda: pending.result is not None, options.timeout + 30.0):

@@ -91,10 +91,19 @@ def masks_picture(color: Image, masks: list[tuple[str, NDArray[np.bool_], tuple[
 
 
 def heat_picture(view: CanonicalView, heatmap: NDArray[np.float32]) -> Image:
-    """A canonical view under its heat map (any size, 0..1), on the object only."""
+    """A canonical view under its heat map (any size, 0..1), on the object only.
+
+    A heat map that is known only along the contour is widened to a band of 2 % of the picture; the hottest place is white.
+    """
     heat = cv2.resize(np.nan_to_num(heatmap.astype(np.float32)), view.mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    colors = cv2.cvtColor(cv2.applyColorMap((255 * np.clip(heat, 0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-    return np.where(view.mask[..., None], (0.35 * view.image + 0.65 * colors).astype(np.uint8), view.image)
+    heat = heat / max(float(heat.max()), 1e-6)
+    width = max(3, view.mask.shape[0] // 50 | 1)
+    near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    heat = np.maximum(heat, cv2.GaussianBlur(cv2.dilate(heat, near), (0, 0), width / 4))
+    # The square root shows the runners-up, too.
+    colors = cv2.cvtColor(cv2.applyColorMap((255 * np.sqrt(np.clip(heat, 0, 1))).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    around = cv2.dilate(view.mask.astype(np.uint8), near).astype(bool)
+    return np.where(around[..., None], np.maximum((0.4 * view.image).astype(np.uint8), colors), view.image)
 
 
 def contact_picture(view: CanonicalView, contact: Contact, base: Image | None = None) -> Image:
@@ -145,7 +154,7 @@ def scene_picture(scene: Scene, path: NDArray[np.float64] | None = None, size: t
     center, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.15)
     meshes.append(_table(scene.table, center, 1.2 * reach))
     # From the robot's right front: far enough that the sphere around everything fits a field of view of 40 degrees.
-    world_from_camera = look_at(center + 1.25 * reach * transforms.unit([-0.75, -0.8, 0.85]), center)
+    world_from_camera = look_at(center + 1.35 * reach * transforms.unit([-0.75, -0.8, 0.85]), center)
     focal = size[0] / 2 / np.tan(np.radians(20))
     intrinsics = Intrinsics(size[1], size[0], focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2)
     cast, _ = Raycaster(meshes).perspective(intrinsics, world_from_camera)

@@ -28,6 +28,8 @@ from magic_bringup.remote import RemoteAction, RemoteService, Token
 
 #: Where perception's own explanation is looked for when no objects come.
 PERCEPTION = "perception"
+#: How much later than here the same objects may arrive at the matcher, s.
+OBJECTS_LAG = 5.0
 
 
 class StrategyServer(Node):
@@ -332,7 +334,14 @@ class _Stages:
             top_k=request.top_k,
             want_heatmap=True,
         )
-        answer = node._matcher.call(message, min(timeout, node._match_timeout), self._token, node._presence)
+        deadline = time.monotonic() + min(timeout, node._match_timeout)
+        patience = time.monotonic() + OBJECTS_LAG
+        while True:
+            answer = node._matcher.call(message, max(0.0, deadline - time.monotonic()), self._token, node._presence)
+            # The ids were found in the objects that came here; the matcher may just be about to read the same message.
+            if answer.code not in (Code.UNKNOWN_OBJECT, Code.NO_OBJECTS) or time.monotonic() > min(patience, deadline):
+                break
+            self._token.wait(lambda: False, time.monotonic() + 0.05)
         if answer.code != Code.OK or not answer.candidates:
             raise MagicError(code_of(answer.code or Code.NO_MATCH), answer.message or "no contact was found")
         heatmap = answer.heatmap if len(answer.heatmap.data) else None

@@ -209,6 +209,18 @@ def test_the_matchers_reason_is_passed_on(bench):
     assert (result.code, result.message) == (Code.NO_MATCH, "nothing like a hook")
 
 
+def test_objects_may_reach_the_matcher_later(bench):
+    answers = [MatchContact.Response(code=int(Code.UNKNOWN_OBJECT), message="none received yet")] * 3
+
+    def late(request):
+        return answers.pop() if answers else fakes.FakeServers.match(request)
+
+    bench.fakes.on_match = late
+    result, _ = bench.run()
+    assert result.code == 0, result.message
+    assert not answers
+
+
 def test_a_second_goal_is_busy(bench):
     bench.fakes.on_plan = fakes.FakeServers.until_canceled(PlanMotion.Result())
     first = bench.send()
