@@ -71,7 +71,7 @@ def _camera(points: NDArray[np.float64], size: tuple[int, int], direction: NDArr
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     local = (points - centre) @ rotation
     # Stand back until the widest point is within 0.9 of the picture.
-    back = np.maximum(np.abs(local[:, 0]) * focal / (0.45 * width), np.abs(local[:, 1]) * focal / (0.43 * height)) - local[:, 2]
+    back = np.maximum(np.abs(local[:, 0]) * focal / (0.45 * width), np.abs(local[:, 1]) * focal / (0.39 * height)) - local[:, 2]
     distance = max(float(back.max()), 0.15)
     intrinsics = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     return intrinsics, transforms.make(rotation, centre - distance * z)

@@ -1,0 +1,120 @@
+"""The contact points of a demonstration, read off its replay in simulation (paper, III-A).
+
+The paper extracts p_T and p_O "automatically using the contact information in
+simulation": the demonstrated trajectory moves the tool, the target follows as physics
+has it, and the points where the two press on each other, averaged over the goal
+phase, are the contacts.  They are averaged in the frame of the tool, and in the frame
+of the target carried along without turning; each point is weighted by the force that
+it carries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.motion import MotionPlan, Phase, ToolMotion
+from magic_core.scene import CanonicalView, SceneObject
+from magic_core.strategy import Strategy
+from magic_verifier.floating import TARGET, TOOL, FloatingRun, make_setup
+from magic_verifier.goals import TOUCH
+from magic_verifier.simulation import Settings
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a replay found: contact points p_T in the tool's and p_O in the target's frame (3,) metres, the unit outward
+    normal of each surface there (3,) in the same frames, the share of the goal phase in contact, and how many points were read."""
+
+    tool_point: NDArray[np.float64]
+    tool_normal: NDArray[np.float64]
+    target_point: NDArray[np.float64]
+    target_normal: NDArray[np.float64]
+    contact_share: float
+    points: int
+
+
+def replay(
+    strategy: Strategy,
+    tool: SceneObject,
+    target: SceneObject,
+    obstacles: tuple[SceneObject, ...] = (),
+    table: NDArray[np.float64] | None = None,
+    phases: tuple[Phase, ...] = (),
+    settings: Settings | None = None,
+    watched: str = "goal",
+) -> Replay:
+    """Replay ``strategy``'s demonstrated trajectory and read its contacts.
+
+    target: where it stood when the demonstration began.  phases: the one named ``watched`` among them is what is
+    averaged over (the paper's is the goal phase; where the target rolls in the tool, as in scooping, ``contact`` is the
+    phase in which they meet as they were shown to); without phases the second half of the motion is.  A fixed target's contacts are read after the release: the
+    tool, let go, hangs from its contact points.  Raises ``LOST_CONTACT`` where tool and target never press on each other.
+    """
+    settings = settings or Settings(frequency=480.0)
+    table = np.array([0.0, 0.0, 1.0, 0.0]) if table is None else table
+    times = np.asarray(strategy.times, dtype=float)
+    times = times - times[0]
+    world_from_tool = target.world_from_object @ strategy.target_from_tool
+    if len(times) < 2:
+        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", f"{len(times)} poses", "two or more timed poses")
+    if not phases:
+        phases = (Phase("approach", 0.0, times[-1] / 2), Phase("goal", times[-1] / 2, float(times[-1])))
+    releases = strategy.releases and strategy.physics.target_is_fixed
+    if releases:
+        # The tool is let go where the demonstration ends, or at the release phase, and hangs for a second.
+        start = next((p.start for p in phases if p.name == "release"), float(times[-1]))
+        phases = (*(p for p in phases if p.end <= start), Phase("release", start, start + 1.0))
+        keep = times <= start + 1e-9
+        times, world_from_tool = np.append(times[keep], start + 1.0), np.concatenate([world_from_tool[keep], world_from_tool[keep][-1:]])
+    setup = make_setup(replace(tool, world_from_object=world_from_tool[0]), target, obstacles, table, strategy.physics, settings)
+    run = FloatingRun(setup, MotionPlan("fg", ToolMotion(times, world_from_tool, phases)))
+    watched = "release" if releases else watched
+    if watched not in {p.name for p in phases}:
+        raise MagicError(Code.BAD_REQUEST, "phase to read contacts in", watched, [p.name for p in phases])
+    # A ball rolls under the tool: its contact is a place on it as it stood, not on its turning surface.
+    world_from_still = target.world_from_object.copy()
+    sums = {name: np.zeros(3) for name in ("tool_point", "tool_normal", "target_point", "target_normal")}
+    weight, count, touched, looked = 0.0, 0, 0, 0
+    while run.time < run.duration:
+        run.advance()
+        run.world.check((TOOL,) if releases else (TOOL, TARGET))
+        if run.phase != watched:
+            continue
+        looked += 1
+        touches = [t for t in run.world.touches(TOOL, TARGET, TOUCH) if np.linalg.norm(t.impulse) > 0]
+        touched += bool(touches)
+        world_from_still[:3, 3] = run.world.position(TARGET)
+        tool_from_world, target_from_world = transforms.inverse(run.world.pose(TOOL)), transforms.inverse(world_from_still)
+        for touch in touches:
+            force = float(np.linalg.norm(touch.impulse))
+            sums["tool_point"] += force * transforms.apply(tool_from_world, touch.position)
+            sums["target_point"] += force * transforms.apply(target_from_world, touch.position)
+            # The contact's normal points towards the tool: out of the target's surface.
+            sums["target_normal"] += force * (target_from_world[:3, :3] @ touch.normal)
+            sums["tool_normal"] -= force * (tool_from_world[:3, :3] @ touch.normal)
+            weight += force
+            count += 1
+    if count == 0:
+        raise MagicError(Code.LOST_CONTACT, f"contacts in the {watched} phase of the demonstration {strategy.name}", 0, "at least one contact that carries a force")
+    return Replay(
+        sums["tool_point"] / weight,
+        transforms.unit(sums["tool_normal"]),
+        sums["target_point"] / weight,
+        transforms.unit(sums["target_normal"]),
+        touched / max(looked, 1),
+        count,
+    )
+
+
+def distance_in_view(view: CanonicalView, point: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Distance in metres between two points (3,) of the object's frame as the canonical view shows them.
+
+    Contacts are modelled in the view's plane; how deep in the picture a point lies does not matter.
+    """
+    pixels = view.pixels(np.stack([point, other]))
+    return float(np.linalg.norm(pixels[0] - pixels[1])) * view.metres_per_pixel

@@ -1,0 +1,108 @@
+"""The demonstrations that ship with the project do their tasks, with the floating gripper and with the arm."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+
+pytest.importorskip("magic_planner.object_motion")
+
+from magic_planner.arm import ArmPlanner
+from magic_planner.budget import Budget
+from magic_planner.object_motion import plan_tool_motion
+from magic_planner.robot import Robot
+
+from magic_core import strategy as strategies
+from magic_core import transforms
+from magic_core.contact import ContactCandidate
+from magic_core.errors import Code
+from magic_core.motion import MotionPlan
+from magic_core.shapes import make
+from magic_core.shapes.fixtures import demonstrated_pose, fixtures
+from magic_verifier.arm_simulation import ArmOptions
+from magic_verifier.demonstration import distance_in_view, replay
+from magic_verifier.film import film_strip
+from magic_verifier.verification import verify
+
+FOLDER = Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies"
+NAMES = ("hooking", "hanging", "scooping")
+
+
+def demonstration(name):
+    """Strategy, tool, target, fixtures and the reference contact as a candidate."""
+    strategy = strategies.find(name, FOLDER)
+    entry = strategy.environment
+    pose = demonstrated_pose(entry)
+    tool = make(entry["tool"]["family"], entry["tool"]["seed"], **entry["tool"]["parameters"])
+    target = make(entry["target"]["family"], entry["target"]["seed"], **entry["target"]["parameters"]).as_object("target", pose)
+    lying = transforms.make(translation=[0.45, -0.32, 0.0005 - float(tool.mesh.bounds[0][2])])
+    contact = (pose @ strategy.target_contact.object_from_contact)[:3, 3]
+    candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
+    return strategy, tool.as_object("tool", lying, strategy.view), target, tuple(fixtures(entry, contact)), candidate
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return ArmPlanner(Robot())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_floating_demonstration_passes_its_goal_test(name):
+    strategy, tool, target, obstacles, candidate = demonstration(name)
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    verdict = verify(strategy, tool, target, obstacles, scenes.TABLE, candidate, MotionPlan("fg", motion))
+    assert verdict.success, verdict.message
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_arm_does_the_demonstrated_task(name, planner):
+    strategy, tool, target, obstacles, candidate = demonstration(name)
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    verdicts = []
+    for attempt in range(3):
+        plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt, budget=Budget(30.0))
+        verdicts.append(verify(strategy, tool, target, obstacles, scenes.TABLE, candidate, plan))
+        if verdicts[-1].success:
+            break
+    assert verdicts[-1].success, [v.message for v in verdicts]
+    metrics = verdicts[-1].metrics
+    assert metrics["tracking_error"] < 0.03
+    assert metrics["torque_ratio"] < 1
+    assert metrics["grasp_slip"] < 0.02
+
+
+def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
+    strategy, tool, target, obstacles, candidate = demonstration("hooking")
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(30.0))
+    scene = (strategy, tool, target, obstacles, scenes.TABLE, candidate)
+    first, again = verify(*scene, plan), verify(*scene, plan)
+    assert np.array_equal(first.recording.joints, again.recording.joints)
+    assert np.array_equal(first.recording.poses["target"], again.recording.poses["target"])
+
+    weak = verify(*scene, plan, arm_options=ArmOptions(grip_force=0.3))
+    assert weak.code == Code.GRASP_SLIPPED, weak.message
+    soft = verify(*scene, plan, arm_options=ArmOptions(stiffness=(20.0,) * 7, damping=(200.0,) * 7))
+    assert soft.code == Code.LIMIT_EXCEEDED, soft.message
+    away = replace(tool, world_from_object=transforms.make(translation=[0, 0.12, 0]) @ tool.world_from_object)
+    missed = verify(strategy, away, *scene[2:], plan)
+    assert missed.code in (Code.GRASP_SLIPPED, Code.LIMIT_EXCEEDED, Code.PRE_CONTACT_COLLISION), missed.message
+
+    film = film_strip(first.recording, tool, target, obstacles, scenes.TABLE, frames=2, columns=2, size=(160, 120))
+    assert film.shape[2] == 3
+    assert film.std() > 10
+
+
+@pytest.mark.parametrize(("name", "phase", "bound"), [("hooking", "goal", 0.003), ("hanging", "release", 0.003), ("scooping", "contact", 0.005)])
+def test_a_replay_finds_the_annotated_contact_points(name, phase, bound):
+    strategy, tool, target, obstacles, candidate = demonstration(name)
+    phases = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles).phases
+    found = replay(strategy, tool, target, obstacles, scenes.TABLE, phases, watched=phase)
+    for view, contact, point in (
+        (strategy.tool_view, strategy.tool_contact, found.tool_point),
+        (strategy.target_view, strategy.target_contact, found.target_point),
+    ):
+        assert distance_in_view(view, point, contact.object_from_contact[:3, 3]) < bound
+    assert found.tool_normal @ strategy.tool_contact.object_from_contact[:3, 0] > 0.95
