@@ -362,15 +362,21 @@ class ArmPlanner:
             raise StageError("task", MagicError(Code.PATH_IN_COLLISION, f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}", "in collision", "a task path clear of the arm"))
 
     def _follow(self, request: Request, branch: Branch) -> Array:
-        """Joint positions (T, J) at every sample of the task."""
-        targets = (request.poses @ branch.grasp.tool_from_tcp)[:, None]
-        paths, stopped, reason = self.robot.chain.track(targets, branch.path[:1], jump=self.settings.jump)
-        if stopped[0] < len(targets):
-            where, why = request.place(int(stopped[0])), int(reason[0])
-            if why >= 0:
-                raise StageError("task", MagicError(Code.JOINT_LIMIT, f"{where}, {self.robot.chain.names[why]}", "at its limit", f"{self.robot.chain.lower[why]:.3f} to {self.robot.chain.upper[why]:.3f} rad"))
-            raise StageError("task", MagicError(Code.NO_IK, where, "out of reach" if why == -1 else "only by a jump of the joints", "a path that the arm can follow"))
-        return paths[:, 0]
+        """Joint positions (T, J) at every sample of the task: between the key poses by interpolation, then onto the path, all at once."""
+        chain = self.robot.chain
+        targets = request.poses @ branch.grasp.tool_from_tcp
+        if len(request.keys) < 2:
+            return np.repeat(branch.path[:1], len(targets), axis=0)
+        q = np.stack([np.interp(np.arange(len(targets)), request.keys, branch.path[:, j]) for j in range(chain.count)], axis=1)
+        q, solved = chain.solve(targets, q, iterations=12, position=1e-6, angle=1e-5)
+        if not solved.all():
+            where = request.place(int(np.argmin(solved)))
+            raise StageError("task", MagicError(Code.NO_IK, where, "out of reach between the key poses", "a path that the arm can follow"))
+        step = np.abs(np.diff(q, axis=0)).max(axis=1)
+        if step.max() > self.settings.jump / 2:
+            where = request.place(int(step.argmax()) + 1)
+            raise StageError("task", MagicError(Code.NO_IK, where, f"a jump of {step.max():.2f} rad", f"joint steps below {self.settings.jump / 2} rad"))
+        return q
 
     # ------------------------------------------------------------ picking up
 
@@ -432,6 +438,12 @@ class ArmPlanner:
                 break
         return self._free(request, request.start, goal, "approach")
 
+    def _surround(self, request: Request, rough: bool) -> None:
+        """The target and the obstacles in the world, in their own pieces or in fewer and fuller ones."""
+        for item in (request.target, *request.obstacles):
+            pieces = solid_pieces(item)
+            self.robot.add(item.id, convex_shapes(merged(pieces, 6) if rough else pieces), item.world_from_object)
+
     def _carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
         self._hold(request, branch.grasp)
         for q, what in ((start, "lifted"), (goal, "at the start of the task")):
@@ -442,6 +454,17 @@ class ArmPlanner:
 
     def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
         """A collision-free joint path (n, J): straight where that is free, else by RRT-Connect and shortened."""
+        robot = self.robot
+        # Far from things their exact form does not matter, and a check of few pieces is quicker.
+        self._surround(request, True)
+        if robot.collides(start) or robot.collides(goal):
+            self._surround(request, False)
+        try:
+            return self._free_here(request, start, goal, stage)
+        finally:
+            self._surround(request, False)
+
+    def _free_here(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
         import mplib
 
         robot = self.robot
@@ -459,10 +482,11 @@ class ArmPlanner:
             status, path = robot.planner.planner.plan(start, [goal], time=seconds, range=0.3, simplify=False)
             if not str(status).startswith("Exact"):
                 continue
-            path = _shorten(robot, np.asarray(path, dtype=float), rng, request.budget, stage)
+            path = np.asarray(path, dtype=float)
             # OMPL checks edges coarsely; a thin obstacle between two states is found here.
-            if robot.first_collision(path, step=0.03, budget=request.budget, stage=stage) is None:
-                return path
+            for shorter in (_shorten(robot, path, rng, request.budget, stage), path):
+                if robot.first_collision(shorter, step=0.03, budget=request.budget, stage=stage) is None:
+                    return shorter
         raise StageError(stage, MagicError(Code.NO_PATH, f"free motion of stage {stage}", f"none found in {4 * self.settings.free_time:.1f} s", "a way around the obstacles"))
 
     # ------------------------------------------------------------ after the release
@@ -612,7 +636,7 @@ def _phases(ends: Sequence[tuple[str, float]]) -> tuple[Phase, ...]:
     return tuple(phases)
 
 
-def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str, rounds: int = 40) -> Array:
+def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str, rounds: int = 25) -> Array:
     """Replace stretches of a path (n, J) by straight lines wherever those are free."""
     for _ in range(rounds):
         if len(path) < 3:
@@ -622,6 +646,6 @@ def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget
         if b - a < 1e-3:
             continue
         ends = np.stack([np.array([np.interp(s, lengths, path[:, j]) for j in range(path.shape[1])]) for s in (a, b)])
-        if robot.first_collision(ends, step=0.05, budget=budget, stage=stage) is None:
+        if robot.first_collision(ends, step=0.08, budget=budget, stage=stage) is None:
             path = np.concatenate([path[lengths < a - 1e-9], ends, path[lengths > b + 1e-9]])
     return path

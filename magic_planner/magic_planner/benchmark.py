@@ -26,6 +26,7 @@ from magic_core.shapes.fixtures import demonstrated_pose, fixtures
 from magic_core.shapes.shape import section_view
 from magic_core.strategy import Strategy, find
 from magic_planner.budget import Budget
+from magic_planner.collision import mass_centre
 from magic_planner.object_motion import plan_tool_motion
 
 #: Tool families of each task with the region that does the job; target families with a range of radii where there is one.
@@ -65,6 +66,20 @@ def region_name(shape: Shape, wanted: str) -> str:
     return wanted if wanted in shape.regions else next(iter(shape.regions))
 
 
+def resting(shape: Shape) -> np.ndarray:
+    """A tilt about y, as a transform without translation, in which the shape lies still: downhill from upright to the lowest centre of mass."""
+    vertices, centre = shape.mesh.vertices, mass_centre(shape.pieces)[1]
+
+    def height(angle: float) -> float:
+        turn = transforms.from_rpy(0, angle, 0)[:3, :3]
+        return float((turn @ centre)[2] - (vertices @ turn.T)[:, 2].min())
+
+    angle, step = 0.0, np.deg2rad(0.5)
+    while min(height(angle + step), height(angle - step)) < height(angle) - 1e-7 and abs(angle) < np.pi / 2:
+        angle += step if height(angle + step) < height(angle - step) else -step
+    return transforms.from_rpy(0, angle, 0)
+
+
 def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple[float, float] = (0.45, 0.25), yaw: float | None = None) -> Case:
     """A tool of a family and seed lying at ``at`` with a drawn yaw, the strategy's target and fixtures."""
     rng = np.random.default_rng(seed)
@@ -77,7 +92,9 @@ def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple
     else:
         target_shape = make(target_family, seed)
     turn = float(rng.uniform(-0.6, 0.6)) if yaw is None else yaw
-    tool = tool_shape.as_object("tool", transforms.from_rpy(0, 0, turn, [*at, -tool_shape.mesh.bounds[0, 2] + 0.0005]), strategy.view)
+    tilt = resting(tool_shape)
+    low = transforms.apply(tilt, tool_shape.mesh.vertices)[:, 2].min()
+    tool = tool_shape.as_object("tool", transforms.from_rpy(0, 0, turn, [*at, 0.0005 - low]) @ tilt, strategy.view)
     demonstrated = demonstrated_pose(strategy.environment)
     contact = target_contact(target_shape, strategy)
     # The contact point stands where the demonstration's stood, whatever the size of the target.

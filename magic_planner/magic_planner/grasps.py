@@ -202,7 +202,7 @@ def propose(
     frames, pair = _frames(robot, centres, closing, settings)
 
     # The hand above the table: where the tool is picked up it may be drawn back along its own axis, as far as the fingertips still hold.
-    corners = np.concatenate([mesh.vertices for mesh in robot.hand.values()])
+    corners = np.concatenate([_box_corners(mesh) for mesh in robot.hand.values()])
     room = _heights(frames, corners, poses[:1], table)[0] - settings.clearance
     up_in_tool = poses[0, :3, :3].T @ table[:3]
     descent = -(frames[:, :3, 2] @ up_in_tool)
@@ -237,7 +237,7 @@ def propose(
         blocking = f"{tool.id} itself" if not alone else "the target or an obstacle"
         raise MagicError(Code.NO_GRASP, f"{len(ranked)} grasps of {tool.id}", f"the open hand and {blocking} are in collision for {'all' if not alone else alone} of them", "an open hand clear of everything")
     frames, pair, costs = frames[keep], pair[keep], costs[keep]
-    order = np.argsort(costs, kind="stable")[:240]
+    order = np.argsort(costs, kind="stable")[:150]
     costs[order] += 0.6 * (1 - _support(robot, frames[order], widths[pair[order]], pieces))
     order = order[np.argsort(costs[order], kind="stable")]
     # The arm's reach decides in the end, so what comes first should differ: each further grasp of a neighbourhood stands back.
@@ -263,6 +263,11 @@ def _support(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float
         behind, _, _ = _through(hulls, start, -closing)
         found += (np.abs(ahead - widths / 2) < 0.002) & (np.abs(behind - widths / 2) < 0.002)
     return found / 4
+
+
+def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
+    low, high = mesh.bounds
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
 def _frames(
@@ -328,7 +333,7 @@ class _Terms:
         near = np.maximum(0.0, 1 - np.linalg.norm(centres - self.contact, axis=1) / min(0.10, 0.5 * self.size))
         return np.asarray(
             np.linalg.norm(centres - self.guidance, axis=1) / self.size
-            + twist / 0.25
+            + twist / 0.1
             + 0.25 * np.linalg.norm(push, axis=1) / max(float(np.linalg.norm(self.force)) * self.size, 1e-9)
             + 0.8 * near
             + (widths / self.opening) ** 2
