@@ -91,3 +91,45 @@ def parts(points: NDArray[np.floating], normal: NDArray[np.floating], voxel: flo
     if (~sound).any():
         labels[~sound] = part[tree.query(points[~sound])[1]]
     return labels
+
+
+def insides(points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Labels (N,) with the inside of round open things (mugs, bowls, pots) joined to their outside.
+
+    The two surfaces meet at a rim that depth cannot see across.  A part is the inside of another where the other is
+    round in plan, the part lies in that circle and below its top, and its upright surfaces look inward.
+    """
+    from magic_perception.primitives import fit_circle
+
+    labels = labels.copy()
+    numbers = [int(i) for i in np.unique(labels) if i >= 0]
+    members = {i: np.nonzero(labels == i)[0] for i in numbers}
+    members = {i: m[:: max(1, len(m) // 1500)] for i, m in members.items() if len(m) > 60}
+    circles = {}
+    for i, m in members.items():
+        side = m[np.isfinite(normal[m, 0]) & (np.abs(normal[m, 2]) < 0.8)]
+        if len(side) < 60:
+            continue
+        centre, radius = fit_circle(points[side, :2].astype(float))
+        away = points[side, :2] - centre
+        distance = np.linalg.norm(away, axis=1)
+        outward = np.mean(np.sum(normal[side, :2] * away, axis=1) > 0)
+        # Bowls widen upwards: the circle is that of their middle, and the rim may reach half as far again.
+        if 0.02 < radius < 0.2 and outward > 0.7 and np.percentile(np.abs(distance - radius), 80) < 0.3 * radius:
+            circles[i] = (centre, max(radius, float(np.percentile(distance, 90))), float(np.percentile(heights[m], 97)), len(m))
+    for i, m in members.items():
+        finite = m[np.isfinite(normal[m, 0])]
+        best = None
+        for j, (centre, radius, top, _) in circles.items():
+            if i == j:
+                continue
+            toward = centre - points[m, :2]
+            within = np.mean(np.linalg.norm(toward, axis=1) < 1.1 * radius + 0.005)
+            low = np.percentile(heights[m], 90) < top + 0.012
+            upright = finite[np.abs(normal[finite, 2]) < 0.8]
+            inward = np.mean(np.sum(normal[upright, :2] * (centre - points[upright, :2]), axis=1) > 0) if len(upright) > 0.2 * len(finite) else float(np.median(heights[m]) < 0.6 * top)
+            if within > 0.85 and low and inward > 0.75 and (best is None or within > best[0]):
+                best = (within, j)
+        if best is not None:
+            labels[labels == i] = best[1]
+    return labels

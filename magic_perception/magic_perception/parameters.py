@@ -27,7 +27,7 @@ class Parameters:
     resolution: cell of the occupancy grids that outlines come from.
     wall: assumed wall thickness of things that are seen to be hollow from above.
     use_color: refine masks by the colour difference to the table.
-    split: part touching objects at concave edges.
+    split: part touching objects at concave edges; off by default: it may part a mug's sides.
     method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
     """
 

@@ -86,6 +86,9 @@ def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64
 
 def convex_hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The corners (K, 2), counter-clockwise, of the hull of points (N, 2), by the monotone chain; fewer than 3 if they lie on a line."""
+    if len(points) > 100:
+        hull = shapely.convex_hull(shapely.multipoints(points))
+        points = np.asarray(hull.exterior.coords) if hull.geom_type == "Polygon" else np.asarray(hull.coords)
     ordered = sorted(set(map(tuple, points.tolist())))
     if len(ordered) < 3:
         return np.array(ordered)

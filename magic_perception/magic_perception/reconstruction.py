@@ -482,9 +482,11 @@ def _round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: 
         return None
     origin = best[0]
     # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
-    outer = np.sum((eye[:, :2] - sample[:, :2]) * (sample[:, :2] - origin), axis=1) > 0
-    inner_share = float(np.mean(~outer))
-    sample = sample[outer]
+    out, ray = sample[:, :2] - origin, eye[:, :2] - sample[:, :2]
+    cosine = np.sum(ray * out, axis=1) / np.maximum(np.linalg.norm(ray, axis=1) * np.linalg.norm(out, axis=1), 1e-9)
+    inner_share = float(np.mean(cosine < 0))
+    # At grazing incidence stereo rounds the silhouette off backwards, which would make the body wider.
+    sample = sample[cosine > 0.35]
     near = np.abs(np.linalg.norm(sample[:, :2] - origin, axis=1) - best[1]) < max(0.008, 0.15 * best[1])
     axis, model = origin, None
     for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):

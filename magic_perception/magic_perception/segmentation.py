@@ -329,6 +329,8 @@ class DepthSegmenter:
     @staticmethod
     def _split(looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]) -> NDArray[np.int64]:
         """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
+        if not any((looked.heights[s] > 0.05).sum() > 1500 for looked, s in zip(looks, solid, strict=True)):
+            return instance
         normal = np.concatenate(
             [convexity.normals(looked.points, looked.frame.world_from_camera[:3, 3])[s] for looked, s in zip(looks, solid, strict=True)]
         )
@@ -342,7 +344,7 @@ class DepthSegmenter:
             for number in range(1, int(part.max()) + 1):
                 instance[mine[part == number]] = following
                 following += 1
-        return instance
+        return convexity.insides(cloud, normal, instance, heights)
 
 
 def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 12.0) -> NDArray[np.int32]:

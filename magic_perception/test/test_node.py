@@ -135,7 +135,7 @@ def test_the_node_gives_what_the_core_gives(frames):
     low, high = (0.15, -0.6, -0.05), (0.95, 0.6, 0.5)
     # Poses go through quaternions on their way: so do the core's.
     rounded = [type(f)(f.color, f.depth, f.intrinsics, cv.transform_from_msg(cv.transform_to_msg(f.world_from_camera)), f.camera, f.stamp) for f in frames]
-    expected = perceive(rounded, parameters=Parameters(region_low=low, region_high=high, split=True))
+    expected = perceive(rounded, parameters=Parameters(region_low=low, region_high=high))
     with Bench() as bench:
         bench.transforms()
         bench.until(lambda: bench.objects and bench.markers, "objects", tick=lambda: [bench.send(f) for f in frames])
