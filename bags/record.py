@@ -166,17 +166,21 @@ def hanging_scene(seed: int) -> list[Thing]:
     return [Thing("mug", mug, lying(mug, 0.50, -0.30, np.deg2rad(70))), Thing("rod", rod, make_strategies.rod_pose(rod), known=True)]
 
 
+#: Where the ladle lies in the scooping scene: x, y, yaw.
+LADLE = (0.46, 0.31, 0.1)
+
+
 def scooping_scene(seed: int) -> list[Thing]:
     """A ladle on its back, a ball and the quarter pipe."""
     ladle = make("ladle", seed + 1, bowl_radius=0.05, aspect=1.0, depth=0.036, handle=0.22, angle=np.deg2rad(14), handle_thickness=0.012, handle_breadth=0.02)
     radius = 0.035
     ball = make("sphere", seed + 5, radius=radius)
-    ball_pose = transforms.make(translation=[make_strategies.BALL_X, 0.0, radius])
+    ball_pose = make_strategies.scooped_ball(radius)
     strategy = make_strategies.scooping()
     arc = fixtures(strategy.environment, ball_pose[:3, 3] + radius * strategy.target_normal)[0]
     arc_shape = make("quarter_pipe", 0, **make_strategies.ARC)
     return [
-        Thing("ladle", ladle, settled(ladle, lying(ladle, 0.45, -0.25, np.deg2rad(12)))),
+        Thing("ladle", ladle, settled(ladle, lying(ladle, *LADLE))),
         Thing("ball", ball, ball_pose),
         Thing("arc", arc_shape, arc.world_from_object, known=True),
     ]

@@ -10,11 +10,9 @@ hooking   an L hook, flat at the height of the ball's middle, pulls a ball of ra
           bend, whose middle leads.
 hanging   a coat hanger is slid on to a horizontal rod from its free end, which
           points to the robot, is lowered on to it and let go.
-scooping  a spoon, handle upright, pushes a ball along the table towards the robot
-          and on to a quarter pipe, then turns by 90 degrees about an axis 0.2 m above
-          the table, so that the ball ends in the bowl, and lifts it.  The hand, which
-          took the spoon from above as it lay on its back, points away from the robot
-          at first and down at the end, both within easy reach.
+scooping  a spoon, handle upright, pushes a ball along the table across the robot's
+          front (along -y) on to a quarter pipe, then turns by 90 degrees about an axis
+          0.2 m above the table, so that the ball ends in the bowl, and lifts it.
 """
 
 from __future__ import annotations
@@ -186,17 +184,26 @@ def hanging() -> Strategy:
     )
 
 
-#: The quarter pipe of the scooping demonstration and of the scooping scenes.
-ARC = {"radius": TURN_RADIUS, "width": 0.16, "back": 0.02}
-BALL_X = 0.69
+#: The quarter pipe of the scooping demonstration and of the scooping scenes. It ends at 75 degrees: a full quarter is so high
+#: that the wrist, which follows the handle over it, runs into it; by 60 degrees small balls fall off the spoon.
+ARC = {"radius": TURN_RADIUS, "width": 0.16, "back": 0.02, "extent": np.deg2rad(75)}
+#: Direction of the slide (rad about world z; 0: towards the robot, -x) and where the target's contact point is when it begins.
+SLIDE_YAW = np.pi / 2
+SCOOP_FROM = np.array([0.52, 0.195, 0.0])
 
 
 def arc_from_target(shape: Shape) -> NDArray[np.float64]:
-    """Pose of the quarter pipe from the target's contact point on the table: it faces +x, away from the robot."""
-    half_turn = transforms.from_rpy(0, 0, np.pi)
+    """Pose of the quarter pipe from the target's contact point on the table: it faces the target."""
+    slide, half_turn = transforms.from_rpy(0, 0, SLIDE_YAW), transforms.from_rpy(0, 0, np.pi)
     # In its own frame the surface starts (level) at the box's low x.
     low = shape.mesh.bounds[0]
-    return transforms.make(translation=[-SLIDE - ARC_OFFSET, 0, 0]) @ half_turn @ transforms.make(translation=[-low[0], 0, -low[2]])
+    return slide @ transforms.make(translation=[-SLIDE - ARC_OFFSET, 0, 0]) @ half_turn @ transforms.make(translation=[-low[0], 0, -low[2]])
+
+
+def scooped_ball(radius: float) -> NDArray[np.float64]:
+    """world_from_ball (4, 4) of a ball on the table whose contact point is where the slide begins."""
+    back = transforms.from_rpy(0, 0, SLIDE_YAW)[:3, :3] @ [-radius, 0.0, 0.0]
+    return transforms.make(translation=SCOOP_FROM + back + [0, 0, radius])
 
 
 def scooping() -> Strategy:
@@ -207,7 +214,8 @@ def scooping() -> Strategy:
     arc = make("quarter_pipe", 0, **ARC)
     tool_view = tool.view("section")
     tool_contact = tool.contact("bowl", tool_view, towards=(0, 0, 1))
-    direction, normal = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    turn_to_world = transforms.from_rpy(0, 0, SLIDE_YAW)[:3, :3]
+    direction, normal = np.round(turn_to_world @ [0.0, -1.0, 0.0], 12), np.round(turn_to_world @ [1.0, 0.0, 0.0], 12)
     seen = target_view(target, "section", direction)
     touched = target_contact(seen, radius * normal, normal, radius)
 
@@ -215,7 +223,7 @@ def scooping() -> Strategy:
     # The deepest bowls reach round the ball before their bottoms touch it: the start leaves them room.
     back, near = np.array([0.10, 0.0, 0.0]), np.array([0.06, 0.0, 0.0])
     times, slide = _line([back, near, np.array([-SLIDE, 0.0, 0.0])], speed)
-    # Contact frame of the target: x = +x, z = -y, y = +z of the world.
+    # Contact frame of the target: x against the slide, y up.
     arm = TURN_RADIUS - radius
     start = _stack(slide, 0.0)
     angle_s = np.linspace(0, 1, int(1.5 * arm * np.pi / 2 / speed / SAMPLE) + 1)[1:]
@@ -255,7 +263,7 @@ def scooping() -> Strategy:
         physics=Physics(friction=0.3, tool_density=600.0, target_density=300.0),
         reflections=("turn",),
         environment={
-            "world_from_target": pose_data(transforms.make(translation=[BALL_X, 0.0, radius])),
+            "world_from_target": pose_data(scooped_ball(radius)),
             "tool": {"family": "spoon", "seed": 1, "parameters": dict(tool.parameters)},
             "target": {"family": "sphere", "seed": 3, "parameters": dict(target.parameters)},
             "fixtures": [{"id": "arc", "family": "quarter_pipe", "seed": 0, "parameters": dict(arc.parameters), "from_target": pose_data(arc_from_target(arc))}],
@@ -270,7 +278,7 @@ def _stack(offsets: NDArray[np.float64], angle: float) -> Poses:
 
 def _spoke(axis: NDArray[np.float64], arm: float, angle: float) -> NDArray[np.float64]:
     """The tool's contact frame on a spoke of length ``arm`` turned by ``angle`` about the axis point (3,); 0: straight down."""
-    # About the contact frame's z (world -y) the bottom of the circle moves towards -x for a negative angle.
+    # About the contact frame's z the bottom of the circle moves along the slide for a negative angle.
     turn = transforms.from_rotvec([0, 0, -angle])
     return transforms.make(translation=axis) @ turn @ transforms.make(translation=[0, -arm, 0]) @ OPPOSED
 

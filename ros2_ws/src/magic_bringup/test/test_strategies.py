@@ -121,12 +121,11 @@ def test_mugs_hang_by_their_handles(seed: int) -> None:
     assert verdict.success, verdict.message
 
 
-@pytest.mark.parametrize(("family", "radius"), [("spoon", 0.035), ("ladle", 0.045), ("measuring_cup", 0.015)])
+@pytest.mark.parametrize(("family", "radius"), [("spoon", 0.035), ("ladle", 0.045), ("measuring_cup", 0.035)])
 def test_other_spoons_scoop_other_balls(family: str, radius: float) -> None:
     strategy = strategies.load(FOLDER / "scooping")
     tool, target = make(family, 0), make("sphere", 0, radius=radius)
     view = make_strategies.target_view(target, "section", strategy.target_view_direction)
     contact = make_strategies.target_contact(view, radius * strategy.target_normal, strategy.target_normal, radius)
-    x = make_strategies.BALL_X + 0.035 - radius
-    verdict = replay(strategy, tool, tool.contact("bowl", towards=(0, 0, 1)), target, contact, transforms.make(translation=[x, 0, radius]))
+    verdict = replay(strategy, tool, tool.contact("bowl", towards=(0, 0, 1)), target, contact, make_strategies.scooped_ball(radius))
     assert verdict.success, verdict.message

@@ -242,16 +242,19 @@ def mug_tree(seed: int = 0, **given: float | str) -> Shape:
 
 
 def quarter_pipe(seed: int = 0, **given: float | str) -> Shape:
-    """A concave quarter of a cylinder's inside that leads from the table up a wall; region ``arc``: its surface.
+    """A concave quarter of a cylinder's inside (or less: ``extent``) that leads from the table up; region ``arc``: its surface.
 
     The surface starts level at -x and rises towards +x about an axis along y.
     """
     d = Draw("quarter_pipe", seed, given)
     radius, width, back = d.real("radius", 0.2, 0.2), d.real("width", 0.2, 0.2), d.real("back", 0.02, 0.02)
+    extent = d.real("extent", np.pi / 2, np.pi / 2)
     color = d.wood()
     d.done()
+    if not np.deg2rad(12) <= extent <= np.pi / 2 + 1e-9:
+        raise ValueError(f"an extent of {np.rad2deg(extent):.1f} degrees; allowed: 12 to 90")
     # The first column would be thinner than a hair: the steps widen towards the table.
-    angle = np.concatenate([[0.0], np.linspace(np.deg2rad(6), np.pi / 2, 25)])
+    angle = np.concatenate([[0.0], np.linspace(np.deg2rad(6), extent, max(2, int(np.ceil(np.rad2deg(extent) / 3.6))))])
     x, z = radius * np.sin(angle), radius * (1 - np.cos(angle))
 
     def column(points: list[tuple[float, float]]) -> Array:
@@ -259,8 +262,8 @@ def quarter_pipe(seed: int = 0, **given: float | str) -> Shape:
 
     pieces = [hull(column([(x[0], 0), (x[1], 0), (x[1], z[1])]))]
     pieces += [hull(column([(x[i], 0), (x[i + 1], 0), (x[i + 1], z[i + 1]), (x[i], z[i])])) for i in range(1, len(x) - 1)]
-    pieces.append(hull(column([(radius, 0), (radius + back, 0), (radius + back, radius), (radius, radius)])))
-    outline = np.array([(0, 0), (radius + back, 0), (radius + back, radius), *zip(x[::-1], z[::-1], strict=True)])[:-1]
+    pieces.append(hull(column([(x[-1], 0), (x[-1] + back, 0), (x[-1] + back, z[-1]), (x[-1], z[-1])])))
+    outline = np.array([(0, 0), (x[-1] + back, 0), (x[-1] + back, z[-1]), *zip(x[::-1], z[::-1], strict=True)])[:-1]
     n = len(outline)
     vertices = np.concatenate([np.column_stack([outline[:, 0], np.full(n, y), outline[:, 1]]) for y in (-width / 2, width / 2)])
     i = np.arange(n)
@@ -269,7 +272,7 @@ def quarter_pipe(seed: int = 0, **given: float | str) -> Shape:
     fan = np.array([(1, k, (k + 1) % n) for k in range(2, n)])
     faces = np.concatenate([fan, fan[:, ::-1] + n, np.column_stack([i, i + n, j + n]), np.column_stack([i, j + n, j])]).astype(np.int32)
     # The lowest degrees are thinner than paper: nothing is to be touched there.
-    fine = np.linspace(np.deg2rad(7), np.deg2rad(89), 42)
+    fine = np.linspace(np.deg2rad(7), extent - np.deg2rad(1), 42)
     surface = np.column_stack([radius * np.sin(fine), 0 * fine, radius * (1 - np.cos(fine))])
     normals = np.column_stack([-np.sin(fine), 0 * fine, np.cos(fine)])
     regions = {"arc": Region(surface, normals, radius, True)}
