@@ -52,7 +52,7 @@ NEAR = 5.0
 #: A radius beyond this many object sizes is a straight edge.
 STRAIGHT = 50.0
 
-#: Differences of |s / r - alpha| below this are a tie.
+#: s / r this near to alpha has met it; see _functional_scale.
 TIE = 0.75
 
 _RAYS, _RAY_STEPS = 120, 72
@@ -261,8 +261,16 @@ def _extent(distance: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np
 
 def curvature_map(contour: Contour, indices: NDArray[np.int64], scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Signed curvature (B,) 1/px and normals (B, 2) at many contour points and one scale, without suppression."""
-    a, normal, extent = measure(contour, indices, np.full(len(indices), float(scale)), suppress=False)
-    return arc_curvature(np.nan_to_num(a), extent), normal
+    half = int(np.ceil(min(np.pi * scale, float(contour.lengths.max())))) + 1
+    window, once = contour.window(indices, half)
+    # 32 points a side tell as much as all of them.
+    columns = half + np.unique(np.rint(np.linspace(-half, half, 65)).astype(int))
+    window, once = window[:, columns], once[:, columns]
+    points, centres = contour.points[window], contour.points[indices]
+    distance = np.hypot(points[..., 0] - centres[:, :1], points[..., 1] - centres[:, 1:])
+    use = connected(distance, once, np.full(len(indices), float(scale)), 0)
+    a, normal = fit(points, contour.normals[window], use, centres, np.full(len(indices), float(scale)))
+    return arc_curvature(np.nan_to_num(a), _extent(distance, use)), normal
 
 
 def _search(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -277,6 +285,26 @@ def _search(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.fl
             result[i] = contour.nearest(points[i] + sign * distance[i] * normals[i])
         best = np.where(there, distance, best)
     return result
+
+
+def _functional_scale(
+    value: NDArray[np.float64], usable: NDArray[np.bool_], concave: NDArray[np.bool_], indices: NDArray[np.int64]
+) -> tuple[int, float]:
+    """Index of the motion functional scale for s / r (J,), and how much of the scale before it belongs to it (0..1).
+
+    A sharp corner meets alpha at every scale alike, a rounded one comes near to it from
+    some scale on for good: the argmin alone would fall on any of these by noise.  The
+    smallest scale that comes within ``TIE`` of alpha is taken, to a fraction of a step, so
+    that it does not jump when the object is turned or scaled; where none does, the argmin.
+    """
+    cost = np.where(usable, np.abs(value - ALPHA), np.inf)
+    near = usable & (value >= ALPHA - TIE)
+    if not near.any() or cost.min() > 1.0:
+        return int(np.argmin(cost)), 0.0
+    best = int(np.argmax(near))
+    if best == 0 or not usable[best - 1] or concave[best - 1] != concave[best] or indices[best - 1] != indices[best]:
+        return best, 0.0
+    return best, float(np.clip((value[best] - (ALPHA - TIE)) / max(value[best] - value[best - 1], 1e-9), 0.0, 1.0))
 
 
 def estimate(
@@ -308,29 +336,32 @@ def estimate(
                 indices[accepted], a[accepted] = moved[accepted], a2[better]
                 normal[accepted], extent[accepted] = normal2[better], extent2[better]
     with np.errstate(invalid="ignore"):
-        cost = np.abs(extent * 2 * np.abs(a) - ALPHA)
-    cost = np.where(np.isfinite(a), cost, np.inf)
-    if concave is not None:
-        right = np.isfinite(a) & ((a < 0) == concave)
-        if right.any():
-            cost = np.where(right, cost, np.inf)
-    # A sharp corner meets alpha at every scale alike: of equals the smallest is taken.
-    tie = TIE if cost.min() < 1.0 else 0.0
-    best = int(np.argmax(cost <= cost.min() + tie))
-    if not np.isfinite(cost[best]):
+        value = extent * 2 * np.abs(a)
+    usable = np.isfinite(value)
+    if concave is not None and (usable & ((a < 0) == concave)).any():
+        usable &= (a < 0) == concave
+    if not usable.any():
         raise MagicError(Code.NO_CURVATURE, "contour points around the contact", int(contour.lengths[contour.loop[index]]), "at least 5 on its edge")
     curvature = arc_curvature(np.nan_to_num(a), extent)
-    radius = 1.0 / max(abs(float(curvature[best])), 1e-12)
+    best, share = _functional_scale(value, usable, (a < 0), indices)
+    scale, signed = float(scales[best]), float(curvature[best])
+    direction = normal[best]
+    if share > 0:  # between the scale before and this one
+        scale = float(scales[best - 1] ** share * scales[best] ** (1 - share))
+        signed = float(curvature[best - 1] * share + curvature[best] * (1 - share))
+        direction = normal[best - 1] * share + normal[best] * (1 - share)
+        direction = direction / max(float(np.hypot(*direction)), 1e-9)
+    radius = 1.0 / max(abs(signed), 1e-12)
     if radius > STRAIGHT * contour.size:
         radius = np.inf
     return Estimate(
         index=int(indices[best]),
         point=contour.points[indices[best]].copy(),
-        normal=normal[best].copy(),
+        normal=direction.copy(),
         radius=float(radius),
-        concave=bool(curvature[best] < 0),
-        scale=float(scales[best]),
-        fitness=float(cost[best]),
+        concave=bool(signed < 0),
+        scale=scale,
+        fitness=float(abs(value[best] - ALPHA)),
         scales=scales,
         curvatures=np.where(np.isfinite(a), curvature, np.nan),
     )

@@ -102,13 +102,15 @@ class Example:
         """The contact in the middle of a region."""
         return self.shape.contact(name, self.view)
 
-    def near(self, points: NDArray[np.float64], normals: NDArray[np.float64], tolerance: float) -> NDArray[np.bool_]:
-        """Which picture points (N, 2) with normals lie within ``tolerance`` px of a region, with normals within 60 degrees."""
+    def near(self, points: NDArray[np.float64], normals: NDArray[np.float64], tolerance: float, share: float = 1.0) -> NDArray[np.bool_]:
+        """Which picture points (N, 2) with normals lie within ``tolerance`` px of a region, or of the middle ``share`` of it, with normals within 60 degrees."""
         result = np.zeros(len(points), bool)
         for name in self.names():
             region = self.shape.region(name)
-            pixels = self.view.pixels(region.points)
-            picture = region.normals @ self.view.object_from_view[:3, :2]
+            count = len(region.points)
+            margin = int(round(0.5 * (1 - share) * (count - 1)))
+            pixels = self.view.pixels(region.points[margin : count - margin])
+            picture = region.normals[margin : count - margin] @ self.view.object_from_view[:3, :2]
             gap = np.hypot(*(points[:, None] - pixels[None]).transpose(2, 0, 1))
             nearest = np.argmin(gap, axis=1)
             # Between the region's own samples the distance is that to the polyline.

@@ -1,0 +1,106 @@
+"""DINOv2 and DINOv3 features through transformers, any size, from the hub or a local folder."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.errors import Code, MagicError
+from magic_core.scene import CanonicalView
+from magic_matcher import global_matching
+from magic_matcher.contour import Contour
+from magic_matcher.features import GlobalMatch, Reference
+
+MODELS = ("dinov2", "dinov2_with_registers", "dinov3_vit")
+_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+_STD = np.array([0.229, 0.224, 0.225], np.float32)
+
+
+class Dinov2Features:
+    """The paper's global stage.
+
+    weights: a hub name or a folder; tokens: side n of the feature map, the picture is then n
+    patches wide (37: 518 px at DINOv2's patch of 14); aggregation ``aligned`` or
+    ``pairs``; components d' of the joint PCA (``None``: no PCA).  On the CPU fp32, on a GPU half
+    precision.  The tokens are those of the last block before the final norm.
+    """
+
+    name = "dinov2"
+
+    def __init__(
+        self,
+        weights: str,
+        device: str = "cpu",
+        tokens: int = 37,
+        aggregation: str = "aligned",
+        components: int | None = global_matching.COMPONENTS,
+        rotations: int = global_matching.ROTATIONS,
+        reflections: bool = True,
+    ) -> None:
+        try:
+            import torch
+            from transformers import AutoConfig, AutoModel
+        except ImportError as error:
+            raise MagicError(Code.FEATURE_WEIGHTS, "dinov2 features", str(error), "an environment with torch and transformers") from error
+        try:
+            config = AutoConfig.from_pretrained(weights)
+            if config.model_type not in MODELS:
+                raise MagicError(Code.FEATURE_WEIGHTS, f"model type of {weights}", config.model_type, MODELS)
+            self._torch = torch
+            self._device = torch.device(device)
+            self._dtype = torch.float32 if self._device.type == "cpu" else torch.float16
+            self._model = AutoModel.from_pretrained(weights, dtype=self._dtype).to(self._device).eval()
+        except MagicError:
+            raise
+        except (OSError, ValueError, RuntimeError, KeyError) as error:
+            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            raise MagicError(
+                Code.FEATURE_WEIGHTS, f"weights {weights}: {reason}", None, "a hub name that can be reached, or a folder with config.json and model.safetensors"
+            ) from error
+        self._weights = str(weights)
+        self._patch = int(config.patch_size)
+        self._extra = 1 + int(getattr(config, "num_register_tokens", 0) or 0)
+        self.aggregation, self.components = aggregation, components
+        self._n, self.size = tokens, tokens * self._patch
+        self._views = global_matching.Views.all(rotations, reflections)
+        self._lock = threading.Lock()
+
+    def key(self) -> str:
+        """Weights (name, and for a folder the files' sizes and times), grid and views: all that shapes what is kept of a reference."""
+        digest = hashlib.sha256(f"{self._weights} {self._n} {self._patch} {self._dtype} {self._views}".encode())
+        folder = Path(self._weights)
+        if folder.is_dir():
+            for path in sorted(folder.glob("*")):
+                if path.is_file():
+                    stat = path.stat()
+                    digest.update(f"{path.resolve()} {stat.st_size} {stat.st_mtime_ns}".encode())
+        return "dinov2-" + digest.hexdigest()[:24]
+
+    def extract(self, pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Feature maps (V, n, n, d) of pictures (V, S, S, 3) uint8 RGB, S = self.size; a few pictures at a time, to bound memory."""
+        torch = self._torch
+        maps = []
+        with self._lock, torch.inference_mode():
+            for start in range(0, len(pictures), 4):
+                batch = (pictures[start : start + 4].astype(np.float32) / 255 - _MEAN) / _STD
+                pixels = torch.from_numpy(np.ascontiguousarray(batch.transpose(0, 3, 1, 2))).to(self._device, self._dtype)
+                # hidden_states[-1] is the last block's output where the model norms after it
+                hidden = self._model(pixel_values=pixels, output_hidden_states=True).hidden_states[-1]
+                tokens = hidden[:, self._extra :].float().cpu().numpy()
+                maps.append(tokens.reshape(len(batch), self._n, self._n, -1))
+        return np.concatenate(maps)
+
+    def prepare(self, reference: Reference) -> global_matching.PreparedGlobal:
+        """The reference's 24 views through the network, once."""
+        return global_matching.prepare(reference.view, reference.pixel, self.extract, self.size, self._views)
+
+    def propose(
+        self, prepared: Any, view: CanonicalView, contour: Contour, target_radius: float | None, count: int, heatmap: bool = False
+    ) -> GlobalMatch:
+        """One pass of the network, then the best places over all relative views."""
+        return global_matching.propose(prepared, view, self.extract, self.size, count, self.aggregation, self.components, heatmap)

@@ -1,0 +1,156 @@
+"""The local stage against shapes whose curvature is known."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magic_core.errors import Code, MagicError
+from magic_matcher import contour, curvature
+
+SIZE = 384
+V, U = np.mgrid[0:SIZE, 0:SIZE]
+CENTRE = np.array([191.3, 190.7])
+
+
+def disc(radius, centre=CENTRE):
+    return np.hypot(U - centre[0], V - centre[1]) <= radius
+
+
+def ring(outer, inner):
+    return disc(outer) & ~disc(inner)
+
+
+def polygon(points):
+    mask = np.zeros((SIZE, SIZE), np.uint8)
+    cv2.fillPoly(mask, [np.round(np.asarray(points) * 16).astype(np.int32)], 1, shift=4)
+    return mask > 0
+
+
+def hook(radius=24.0, width=18.0, turn=0.0, scale=1.0, mirror=False):
+    """An L with a round inner corner: its mask, and where the middle of that corner lies."""
+    a = np.linspace(np.pi / 2, 0, 20)
+    inner = np.column_stack([radius * np.cos(a), radius * np.sin(a)])
+    path = np.concatenate([[(-150, radius)], inner, [(radius, -60)]])
+    outer = np.concatenate([[(radius + width, -60)], (radius + width) / radius * inner[::-1], [(-150, radius + width)]])
+    points = np.concatenate([path, outer])
+    corner = radius * np.array([np.cos(np.pi / 4), np.sin(np.pi / 4)])
+    c, s = np.cos(turn), np.sin(turn)
+    linear = scale * np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if mirror else 1.0, 1.0])
+    shift = CENTRE - linear @ np.array([-45.0, -5.0])
+    return polygon(points @ linear.T + shift), linear @ corner + shift, linear @ np.array([-1, -1]) / np.sqrt(2) / scale
+
+
+@pytest.mark.parametrize("radius", [10, 15, 30, 60, 100, 150])
+def test_disc(radius):
+    c = contour.extract(disc(radius))
+    angle = 0.3
+    found = curvature.estimate(c, c.nearest(CENTRE + radius * np.array([np.cos(angle), np.sin(angle)])))
+    assert found.radius == pytest.approx(radius, rel=0.03)
+    assert not found.concave
+    # At a small radius the contour point itself is known to half a step only.
+    assert found.normal @ [np.cos(angle), np.sin(angle)] > np.cos(max(0.03, 0.7 / radius))
+
+
+@pytest.mark.parametrize(("outer", "inner"), [(60, 56), (60, 50), (100, 94), (30, 26), (150, 145)])
+def test_thin_ring_has_two_edges(outer, inner):
+    c = contour.extract(ring(outer, inner))
+    direction = np.array([np.cos(0.3), np.sin(0.3)])
+    out = curvature.estimate(c, c.nearest(CENTRE + outer * direction))
+    into = curvature.estimate(c, c.nearest(CENTRE + inner * direction))
+    assert out.radius == pytest.approx(outer, rel=0.05) and not out.concave
+    assert into.radius == pytest.approx(inner, rel=0.05) and into.concave
+    assert out.normal @ direction > 0.95 and into.normal @ direction < -0.95
+
+
+def test_one_step_misjudges_what_two_steps_get_right():
+    # A disc before a wall: at large scales the wall is no part of the disc's edge, and the walk does not reach it.
+    mask = disc(40)
+    mask |= (CENTRE[0] + 46 <= U) & (CENTRE[0] + 60 >= U)
+    c = contour.extract(mask)
+    found = curvature.estimate(c, c.nearest(CENTRE + [40, 0]))
+    assert found.radius == pytest.approx(40, rel=0.05) and not found.concave
+
+
+def test_parallel_edges_are_straight():
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[180:190, 40:340] = True
+    c = contour.extract(mask)
+    for v, normal in ((179.5, [0, -1]), (189.5, [0, 1])):
+        found = curvature.estimate(c, c.nearest((190, v)))
+        assert found.radius > 3 * c.size
+        assert found.normal @ normal > 0.999
+
+
+@pytest.mark.parametrize(("a", "b"), [(140, 110), (120, 90), (150, 130)])
+def test_ellipse_at_scales_short_against_its_radius(a, b):
+    c = contour.extract(((U - CENTRE[0]) / a) ** 2 + ((V - CENTRE[1]) / b) ** 2 <= 1)
+    tip, flat = b * b / a, a * a / b
+    for offset, radius in (((a, 0), tip), ((0, b), flat)):
+        found = curvature.estimate(c, c.nearest(CENTRE + offset), scales=np.array([0.4 * radius]))
+        assert found.radius == pytest.approx(radius, rel=0.05) and not found.concave
+
+
+def test_corners():
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[50:330, 50:70] = True
+    mask[50:70, 50:250] = True
+    c = contour.extract(mask)
+    inner = curvature.estimate(c, c.nearest((69.5, 69.5)))
+    outer = curvature.estimate(c, c.nearest((49.5, 49.5)))
+    assert inner.concave and not outer.concave
+    assert inner.normal @ [1, 1] > 1.4 and outer.normal @ [-1, -1] > 1.4
+
+
+@pytest.mark.parametrize("radius", [20, 30, 40])
+def test_fillet_is_right_at_scales_within_it(radius):
+    mask, corner, normal = hook(radius)
+    c = contour.extract(mask)
+    found = curvature.estimate(c, c.nearest(corner), scales=np.array([0.7 * radius]))
+    assert found.radius == pytest.approx(radius, rel=0.06) and found.concave
+    assert found.normal @ normal > 0.99
+
+
+@settings(max_examples=10, deadline=None)
+@given(turn=st.floats(0, 2 * np.pi), scale=st.floats(0.55, 1.0), mirror=st.booleans())
+def test_equivariance(turn, scale, mirror):
+    plain, corner, normal = hook()
+    moved, corner2, normal2 = hook(turn=turn, scale=scale, mirror=mirror)
+    first, second = contour.extract(plain), contour.extract(moved)
+    a, b = curvature.estimate(first, first.nearest(corner)), curvature.estimate(second, second.nearest(corner2))
+    assert a.concave and b.concave
+    assert b.radius / scale == pytest.approx(a.radius, rel=0.2)
+    assert a.normal @ normal > 0.98 and b.normal @ normal2 > 0.98
+
+
+def test_arc_curvature_inverts_the_fit():
+    for radius in (10.0, 40.0):
+        for t in (0.3, 1.0, 1.6, 1.95):
+            w = np.linspace(-1, 1, 4001) * 2 * np.arcsin(t / 2)
+            x, y = radius * np.sin(w), radius * (1 - np.cos(w))
+            a = np.sum(y * x * x) / np.sum(x**4)
+            assert curvature.arc_curvature(a, t * radius) == pytest.approx(1 / radius, rel=2e-3)
+            assert curvature.arc_curvature(-a, t * radius) == pytest.approx(-1 / radius, rel=2e-3)
+
+
+def test_convexity_search_crosses_the_stroke():
+    mask, corner, normal = hook()
+    c = contour.extract(mask)
+    outside = c.nearest(corner - 18 * normal)  # the outer side of the bend
+    found = curvature.estimate(c, outside, concave=True)
+    assert found.concave
+    assert np.hypot(*(found.point - corner)) < 8
+
+
+def test_empty_and_tiny_masks_have_codes():
+    for mask in (np.zeros((50, 50), bool), np.pad(np.ones((1, 1), bool), 20)):
+        with pytest.raises(MagicError) as caught:
+            contour.extract(mask)
+        assert caught.value.code == Code.EMPTY_MASK
+
+
+def test_contour_touching_the_border():
+    c = contour.extract(np.ones((60, 80), bool))
+    assert c.points.min() >= -1 and c.points[:, 0].max() <= 80
+    assert np.allclose(np.hypot(*c.normals.T), 1)

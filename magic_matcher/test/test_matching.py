@@ -1,0 +1,189 @@
+"""Both stages together with the embedded features."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from magic_core import shapes, strategy, transforms
+from magic_core.contact import Contact, turned_over
+from magic_core.errors import Code, MagicError
+from magic_core.scene import CanonicalView, Scene
+from magic_matcher import contour, features, jobs, matching
+from magic_matcher.cache import Cache
+from magic_matcher.features import make_reference
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    return matching.Matcher(features.load("embedded"))
+
+
+def reference_of(job, family, region, seed, radius):
+    shown = jobs.example(job, family, seed)
+    contact = shown.contact(region)
+    return make_reference(shown.view, contact.pixel, contact.normal, radius / shown.view.metres_per_pixel, shown.contour), contact
+
+
+def moved(view: CanonicalView, angle, mirror):
+    """The view's mask turned by ``angle`` about the picture's centre, mirrored first."""
+    size = view.mask.shape[0]
+    c, s = np.cos(angle), np.sin(angle)
+    linear = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if mirror else 1.0, 1.0])
+    middle = np.full(2, (size - 1) / 2)
+    back = np.linalg.inv(linear)[::-1, ::-1]  # in (v, u)
+    mask = ndimage.affine_transform(np.pad(view.mask, 100).astype(float), back, middle + 100 - back @ (middle + 100), order=1) > 0.5
+    image = np.where(mask[..., None], 150, 0).astype(np.uint8).repeat(3, axis=2)
+    return CanonicalView(image, mask, view.metres_per_pixel, np.eye(4), view.kind), linear, middle
+
+
+def test_the_reference_matches_itself(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    result = matcher.match_views(reference, contact, [matching.Tool("same", reference.view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025)
+    best = result.candidates[0]
+    assert np.hypot(*(best.tool.pixel - contact.pixel)) < 4
+    assert best.s_dino > 0.9 and best.s_curv > 0.9 and not best.flipped
+    assert min(best.rotation, 2 * np.pi - best.rotation) < 0.1
+    assert best.tool_from_reference == pytest.approx(np.eye(4), abs=0.1)
+
+
+@pytest.mark.parametrize(("angle", "mirror"), [(0.7, False), (2.5, False), (0.0, True), (4.0, True)])
+def test_the_match_turns_with_the_tool(matcher, angle, mirror):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    view, linear, middle = moved(reference.view, angle, mirror)
+    result = matcher.match_views(reference, contact, [matching.Tool("t", view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025)
+    best = result.candidates[0]
+    expected = linear @ (contact.pixel - middle) + middle + 100
+    assert np.hypot(*(best.tool.pixel - expected)) < 5
+    assert best.flipped == mirror
+    assert (best.rotation - angle + 0.15) % (2 * np.pi) < 0.3
+
+
+def test_a_mirrored_match_aligns_the_turned_frame(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    view, _, _ = moved(reference.view, 0.0, True)
+    best = matcher.match_views(reference, contact, [matching.Tool("t", view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025).candidates[0]
+    assert best.tool_from_reference @ contact.object_from_contact == pytest.approx(turned_over(best.tool.object_from_contact), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("job", "family", "region", "tool", "radius"),
+    [
+        ("hooking", "l_hook", "inner", "caliper", 0.02),
+        ("hooking", "l_hook", "inner", "j_hook", 0.02),
+        ("hooking", "l_hook", "inner", "letter", 0.02),
+        ("hanging", "hanger", "hook", "mug", 0.006),
+        ("hanging", "hanger", "hook", "scissors", 0.006),
+        ("scooping", "spoon", "bowl", "ladle", 0.025),
+        ("scooping", "spoon", "bowl", "measuring_cup", 0.025),
+    ],
+)
+def test_contacts_go_to_the_functionally_same_place(matcher, job, family, region, tool, radius):
+    reference, contact = reference_of(job, family, region, 5001, radius)
+    target = jobs.disc_target(radius, jobs.JOBS[job].view)
+    right = []
+    for seed in range(9100, 9106):
+        example = jobs.example(job, tool, seed)
+        if not jobs.usable(example, radius / example.view.metres_per_pixel):
+            continue
+        result = matcher.match_views(reference, contact, [matching.Tool(tool, example.view)], target, reference_target_radius=radius)
+        pixels = np.array([c.tool.pixel for c in result.candidates])
+        normals = np.array([c.tool.normal for c in result.candidates])
+        right.append(bool(example.near(pixels, normals, example.contour.size / 50).any()))
+    assert np.mean(right) >= 0.8
+
+
+def test_candidates_are_different_places_best_first(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    tool = jobs.example("hooking", "caliper", 4)
+    result = matcher.match_views(reference, contact, [matching.Tool("c", tool.view)], jobs.disc_target(0.02, "top"), 5, reference_target_radius=0.025, heatmap=True)
+    scores = [c.score for c in result.candidates]
+    assert scores == sorted(scores, reverse=True) and len(scores) <= 5
+    for i, a in enumerate(result.candidates):
+        for b in result.candidates[:i]:
+            assert np.hypot(*(a.tool.pixel - b.tool.pixel)) >= matching.SAME_PLACE * tool.contour.size
+    assert result.heatmap.shape == tool.view.mask.shape and 0.5 < result.heatmap.max() <= 1
+
+
+def test_the_better_tool_is_selected(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    tools = [matching.Tool("letter_i", shapes.make("letter", 0, glyph="I").view()), matching.Tool("hook", shapes.make("l_hook", 8).view())]
+    result = matcher.match_views(reference, contact, tools, jobs.disc_target(0.025, "top"), reference_target_radius=0.025)
+    assert result.candidates[0].tool_id == "hook"
+    assert {c.tool_id for c in result.candidates} == {"letter_i", "hook"}
+
+
+# ---------------------------------------------------------------- targets
+
+
+def demonstration(tmp_path, normal=(1.0, 0, 0), direction=(0.0, 0, -1)):
+    """A strategy with a hook and a standing cylinder."""
+    hook, cylinder = shapes.make("l_hook", 1), shapes.make("cylinder", 1, radius=0.025)
+    tool_view, target_view = hook.view(), cylinder.view()
+    contact = hook.contact("inner", tool_view)
+    target = Contact(np.array([300.0, 190.0]), np.array([1.0, 0.0]), 0.025, False, 0.04, np.eye(4))
+    return strategy.Strategy(
+        "test", "", "top", "plan", tool_view, contact, target_view, target, np.array(normal), np.array(direction), np.array([0.0]), np.eye(4)[None],
+        hook.mesh, cylinder.mesh, (), strategy.Goal("hook"), strategy.Physics(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, 2.7])
+@pytest.mark.parametrize("radius", [0.015, 0.03])
+def test_target_contact_lies_on_the_side_asked_for(tmp_path, yaw, radius):
+    found = demonstration(tmp_path)
+    item = shapes.make("cylinder", 2, radius=radius).as_object("o", transforms.from_rpy(0, 0, yaw, (0.5, 0.1, 0.02)))
+    view = matching.target_view(item, found)
+    contact = matching.target_contact(found, view, item.world_from_object)
+    world = item.world_from_object @ contact.object_from_contact
+    assert world[:3, 0] == pytest.approx([1, 0, 0], abs=0.05)
+    assert world[:3, 2] == pytest.approx([0, 0, -1], abs=1e-6)
+    assert world[:2, 3] == pytest.approx([0.5 + radius, 0.1], abs=0.002)
+    assert contact.radius == pytest.approx(radius, rel=0.06) and not contact.concave
+
+
+def test_support_point_is_in_the_middle_of_a_flat_side():
+    mask = np.zeros((100, 200), bool)
+    mask[30:70, 20:180] = True
+    c = contour.extract(mask)
+    assert c.points[matching.support_point(c, np.array([0.0, -1.0]))] == pytest.approx([99.5, 29.5], abs=1.0)
+
+
+def test_target_and_tools_are_chosen_where_none_is_named(tmp_path):
+    found = demonstration(tmp_path)
+    items = [
+        shapes.make(family, 4).as_object(f"{family}", transforms.make(translation=(0.4, 0.1 * k, 0.02)))
+        for k, family in enumerate(("caliper", "cylinder", "l_hook"))
+    ]
+    scene = Scene(tuple(items), np.array([0, 0, 1.0, 0]))
+    tools, target = matching.select(scene, found, [], "")
+    assert target.id == "cylinder" and [t.id for t in tools] == ["caliper", "l_hook"]
+    tools, target = matching.select(scene, found, ["l_hook"], "")
+    assert target.id == "cylinder" and [t.id for t in tools] == ["l_hook"]
+    for ids, name, code in ((["nothing"], "", Code.UNKNOWN_OBJECT), ([], "nothing", Code.UNKNOWN_OBJECT), (["cylinder"], "cylinder", Code.BAD_REQUEST)):
+        with pytest.raises(MagicError) as caught:
+            matching.select(scene, found, ids, name)
+        assert caught.value.code == code
+    result = matching.match(found, tools, target, features.load("embedded"))
+    assert result.target_id == "cylinder" and result.candidates[0].target.radius > 0
+
+
+def test_codes_of_bad_views(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    empty = CanonicalView(np.zeros((50, 50, 3), np.uint8), np.zeros((50, 50), bool), 1.0, np.eye(4))
+    with pytest.raises(MagicError) as caught:
+        matcher.match_views(reference, contact, [matching.Tool("e", empty)], None)
+    assert caught.value.code == Code.EMPTY_MASK
+    for pixel in ((500, 10), (np.nan, 1), (5, 380)):
+        with pytest.raises(MagicError) as caught:
+            make_reference(reference.view, np.array(pixel, dtype=float))
+        assert caught.value.code == Code.POINT_OUTSIDE
+
+
+def test_cache_keeps_and_survives_damage(tmp_path):
+    cache = Cache(tmp_path)
+    calls = []
+    assert cache.get("a", lambda: calls.append(1) or {"x": 1}) == {"x": 1}
+    assert cache.get("a", lambda: calls.append(1) or {"x": 2}) == {"x": 1} and len(calls) == 1
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"not a pickle")
+    assert cache.get("a", lambda: calls.append(1) or {"x": 3}) == {"x": 3} and len(calls) == 2
