@@ -1,0 +1,171 @@
+"""The node: answers by ids and by images, every failure with its code, several at a time."""
+
+import os
+import threading
+import time
+
+import numpy as np
+import pytest
+
+os.environ["ROS_DOMAIN_ID"] = "71"
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("magic_interfaces.srv")
+
+from magic_interfaces.msg import SceneObjectArray  # noqa: E402
+from magic_interfaces.srv import MatchContact  # noqa: E402
+from rclpy.executors import MultiThreadedExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+
+from magic_core import conversions, qos, shapes, strategy, transforms  # noqa: E402
+from magic_core.errors import Code, MagicError  # noqa: E402
+from magic_core.scene import Scene  # noqa: E402
+from magic_matcher.matcher import MatcherNode  # noqa: E402
+
+
+def until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "deadline passed"
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def graph(demonstration, tmp_path_factory):
+    root = tmp_path_factory.mktemp("strategies")
+    strategy.save(demonstration, root / "test")
+    (root / "broken").mkdir()
+    (root / "broken" / "strategy.yaml").write_text("name: broken\n")
+    rclpy.init(args=["--ros-args", "-p", f"strategies:={root}", "-p", "cache:=none"])
+    node = MatcherNode()
+    other = rclpy.create_node("asker")
+    client = other.create_client(MatchContact, "match_contact")
+    publisher = other.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
+    executor = MultiThreadedExecutor(6)
+    executor.add_node(node)
+    executor.add_node(other)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    until(client.service_is_ready)
+    items = [
+        shapes.make(family, 4).as_object(family, transforms.make(translation=(0.4, 0.1 * k, 0.02)))
+        for k, family in enumerate(("caliper", "cylinder", "l_hook"))
+    ]
+
+    class Graph:
+        def ask(self, **fields):
+            return self.start(**fields)()
+
+        def start(self, **fields):
+            future = client.call_async(MatchContact.Request(**fields))
+
+            def wait():
+                until(future.done)
+                return future.result()
+
+            return wait
+
+        def show(self):
+            publisher.publish(conversions.scene_to_msg(Scene(tuple(items), np.array([0, 0, 1.0, 0]))))
+            until(lambda: node._scene is not None)
+
+    yield Graph()
+    executor.shutdown()
+    thread.join(5)
+    node.destroy_node()
+    other.destroy_node()
+    rclpy.try_shutdown()
+
+
+def image_request(demonstration, **changes):
+    view = conversions.view_to_msg(demonstration.tool_view)
+    for name, value in changes.items():
+        setattr(view, name, value)
+    return view
+
+
+def test_before_any_objects_the_answer_says_so(graph):
+    answer = graph.ask(strategy="test", tool_ids=["l_hook"])
+    assert answer.code == Code.UNKNOWN_OBJECT and "none received" in answer.message
+
+
+def test_images_need_no_objects(graph, demonstration):
+    answer = graph.ask(strategy="test", tool_views=[image_request(demonstration)], want_heatmap=True, top_k=2)
+    assert answer.code == Code.OK, answer.message
+    assert 1 <= len(answer.candidates) <= 2 and not answer.candidates[0].has_target and np.isnan(answer.candidates[0].point.x)
+    assert np.hypot(*(np.array(answer.candidates[0].tool.pixel) - demonstration.tool_contact.pixel)) < 10
+    assert answer.heatmap.encoding == "32FC1" and answer.heatmap.width == 384
+    assert answer.features == "embedded" and answer.seconds > 0
+
+
+def test_by_ids(graph):
+    graph.show()
+    answer = graph.ask(strategy="test", tool_ids=["l_hook"], target_id="cylinder")
+    assert answer.code == Code.OK, answer.message
+    best = answer.candidates[0]
+    assert best.tool_id == "l_hook" and best.has_target and answer.target_id == "cylinder"
+    assert abs(best.point.x - 0.4) < 0.3 and abs(best.point.z - 0.02) < 0.01
+    assert answer.heatmap.width == 0
+    scores = [c.score for c in answer.candidates]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_choosing_tool_and_target(graph):
+    graph.show()
+    answer = graph.ask(strategy="test")
+    assert answer.code == Code.OK and answer.target_id == "cylinder"
+    assert {c.tool_id for c in answer.candidates} == {"caliper", "l_hook"}
+
+
+def test_every_failure_has_its_code(graph, demonstration):
+    graph.show()
+    view = conversions.view_to_msg(demonstration.tool_view)
+    empty = image_request(demonstration, mask=conversions.image_to_msg(np.zeros((384, 384), bool), "mono8"))
+    wrong = image_request(demonstration, mask=conversions.image_to_msg(np.ones((10, 10), bool), "mono8"))
+    for fields, code in (
+        ({"strategy": ""}, Code.UNKNOWN_STRATEGY),
+        ({"strategy": "juggling"}, Code.UNKNOWN_STRATEGY),
+        ({"strategy": "/nowhere/at/all"}, Code.UNKNOWN_STRATEGY),
+        ({"strategy": "broken"}, Code.BAD_STRATEGY),
+        ({"strategy": "test", "tool_ids": ["spoon"]}, Code.UNKNOWN_OBJECT),
+        ({"strategy": "test", "target_id": "spoon"}, Code.UNKNOWN_OBJECT),
+        ({"strategy": "test", "tool_ids": ["l_hook"], "target_id": "l_hook"}, Code.BAD_REQUEST),
+        ({"strategy": "test", "tool_ids": ["l_hook"], "tool_views": [view]}, Code.BAD_REQUEST),
+        ({"strategy": "test", "tool_views": [empty]}, Code.EMPTY_MASK),
+        ({"strategy": "test", "tool_views": [wrong]}, Code.BAD_REQUEST_IMAGE),
+        ({"strategy": "test", "tool_views": [image_request(demonstration, kind="upside")]}, Code.BAD_REQUEST_IMAGE),
+        ({"strategy": "test", "tool_views": [image_request(demonstration, metres_per_pixel=-1.0)]}, Code.BAD_REQUEST_IMAGE),
+    ):
+        answer = graph.ask(**fields)
+        assert answer.code == code, (fields.get("strategy"), answer.code, answer.message)
+        assert answer.message and not answer.candidates
+
+
+def test_concurrent_requests_get_their_own_answers(graph):
+    graph.show()
+    alone = {name: graph.ask(strategy="test", tool_ids=[name], target_id="cylinder") for name in ("l_hook", "caliper")}
+    waiting = [(name, graph.start(strategy="test", tool_ids=[name], target_id="cylinder")) for name in ("l_hook", "caliper") * 4]
+    for name, wait in waiting:
+        answer = wait()
+        assert answer.code == Code.OK and {c.tool_id for c in answer.candidates} == {name}
+        assert [c.score for c in answer.candidates] == [c.score for c in alone[name].candidates]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "code"), [("features", "resnet", Code.BAD_REQUEST), ("features", "dinov2", Code.FEATURE_WEIGHTS)]
+)
+def test_bad_parameters_keep_the_node_from_starting(graph, monkeypatch, name, value, code):
+    with pytest.raises(MagicError) as caught:
+        _with_parameter(monkeypatch, name, value)
+    assert caught.value.code == code
+
+
+def _with_parameter(monkeypatch, name, value):
+    from rclpy.node import Node
+
+    original = Node.__init__
+    monkeypatch.setattr(
+        Node, "__init__", lambda self, node_name, **rest: original(self, "second", parameter_overrides=[Parameter(name, value=value)], use_global_arguments=False, **rest)
+    )
+    MatcherNode().destroy_node()
