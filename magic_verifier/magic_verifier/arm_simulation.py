@@ -185,7 +185,7 @@ class ArmRun:
 
     def metrics(self) -> dict[str, float]:
         """Largest tracking error (rad), share of the effort limit used, slip (m, rad) and the width gripped (m)."""
-        return dict(self._metrics)
+        return {name: value for name, value in self._metrics.items() if np.isfinite(value)}
 
     # ------------------------------------------------------------ stepping
 

@@ -21,7 +21,7 @@ TABLE_COLORS = ((226, 222, 214), (214, 209, 199))
 BACKGROUND = (244, 245, 247)
 LIGHT = np.array([-0.35, -0.45, 1.0])
 #: Frames are cast at this multiple of their size and scaled down.
-OVERSAMPLING = 2
+OVERSAMPLING = 1.5
 
 
 def _painted(item: SceneObject, color: tuple[int, int, int], world_from_object: NDArray[np.float64]) -> Mesh:
@@ -83,18 +83,16 @@ def _picture(meshes: list[Mesh], intrinsics: Intrinsics, world_from_camera: NDAr
     image = shade(cast, light=LIGHT, ambient=0.5, background=BACKGROUND).astype(np.float32)
     # Shadows: a second ray from each surface point towards the light.
     seen = cast.ids >= 0
-    local = intrinsics.unproject(np.nan_to_num(depth, nan=1.0))
-    points = transforms.apply(world_from_camera, local)
-    shadow = np.zeros(seen.shape, dtype=bool)
-    origins = points[seen] + 1e-3 * cast.normals[seen]
-    if len(origins):
-        direction = np.broadcast_to(transforms.unit(LIGHT), origins.shape)
-        shadow[seen] = np.isfinite(caster.cast(origins[None], direction[None]).distance[0])
-    image[shadow] *= 0.68
+    points = transforms.apply(world_from_camera, intrinsics.unproject(depth)[seen])
+    if len(points):
+        shadow = caster.occluded(points + 1e-3 * cast.normals[seen], transforms.unit(LIGHT))
+        image[seen] *= np.where(shadow, 0.68, 1.0).astype(np.float32)[:, None]
     # The table fades into the background with distance.
-    far = np.clip((np.nan_to_num(depth, nan=0.0) - np.nanmedian(depth)) / (2.5 * max(np.nanmedian(depth), 1e-3)), 0, 1)[..., None] if seen.any() else 0.0
-    table = (cast.ids == 0)[..., None]
-    image = np.where(table, image * (1 - far) + np.array(BACKGROUND) * far, image)
+    table = cast.ids == 0
+    if table.any():
+        middle = float(np.median(depth[seen]))
+        far = np.clip((depth[table] - middle) / (2.5 * max(middle, 1e-3)), 0, 1)[:, None]
+        image[table] += far * (np.array(BACKGROUND, dtype=np.float32) - image[table])
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
@@ -132,7 +130,7 @@ def film_strip(
     # What fell off and flew away would make everything else tiny.
     points = np.concatenate(way)
     points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < 1.5]
-    big = (size[0] * OVERSAMPLING, size[1] * OVERSAMPLING)
+    big = (round(size[0] * OVERSAMPLING), round(size[1] * OVERSAMPLING))
     intrinsics, world_from_camera = _camera(points, big, np.array(direction))
     still = [_table(table, points.mean(axis=0))] + [_painted(o, OBSTACLE_COLOR, o.world_from_object) for o in obstacles]
     pictures = []

@@ -10,7 +10,9 @@ fills the gap: it asks, in a world of its own, how deep a posed body is in other
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -143,17 +145,24 @@ def usable_pieces(name: str, pieces: tuple[Mesh, ...] | list[Mesh]) -> list[NDAr
     return hulls
 
 
+@lru_cache(maxsize=1)
+def engine() -> Any:
+    """The module sapien, imported on first use, without its warning that there is no Vulkan: nothing here renders with it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*[Vv]ulkan.*")
+        import sapien
+    return sapien
+
+
 def to_pose(transform: NDArray[np.float64]) -> Any:
     """4x4 transform to sapien.Pose."""
-    import sapien
-
+    sapien = engine()
     return sapien.Pose(transform[:3, 3], transforms.quaternion_wxyz(transform))
 
 
 def to_poses(stack: NDArray[np.float64]) -> list[Any]:
     """(T, 4, 4) transforms to a list of sapien.Pose."""
-    import sapien
-
+    sapien = engine()
     quaternions = transforms.quaternion_wxyz(stack)
     return [sapien.Pose(p, q) for p, q in zip(stack[:, :3, 3], quaternions, strict=True)]
 
@@ -171,9 +180,7 @@ class World:
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
-        import sapien
-
-        self._sapien = sapien
+        sapien = self._sapien = engine()
         self.settings = settings or Settings()
         # Configuration is global in SAPIEN and read when the system is made.
         sapien.physx.set_scene_config(

@@ -238,6 +238,8 @@ def _run_once(
         recording = None
         if recorder is not None and error.code != Code.SIMULATION_EXPLODED:
             recording = recorder.recording()
+        if run is not None:
+            metrics = {**metrics, **getattr(run, "metrics", dict)()}
         return Judgement(error.code, error.message, metrics), recording, run.time if run is not None else 0.0
 
 

@@ -81,6 +81,12 @@ class Raycaster:
         rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).astype(np.float32)
         return self._scene.test_occlusions(self._o3d.core.Tensor(np.ascontiguousarray(rays))).numpy().astype(bool)
 
+    def occluded(self, origins: NDArray[np.float64], direction: ArrayLike) -> NDArray[np.bool_]:
+        """Whether anything lies on the way from points (N, 3) in one unit direction (3,): shadows."""
+        rays = np.empty((len(origins), 6), dtype=np.float32)
+        rays[:, :3], rays[:, 3:] = origins, np.asarray(direction, dtype=float)
+        return self._scene.test_occlusions(self._o3d.core.Tensor(rays)).numpy().astype(bool)
+
     def perspective(self, intrinsics: Intrinsics, world_from_camera: NDArray[np.float64]) -> tuple[Cast, NDArray[np.float32]]:
         """Look through a pinhole camera; also returns the depth image (H, W), metres along z, NaN where nothing is."""
         rays = intrinsics.unproject(np.ones((intrinsics.height, intrinsics.width)))
