@@ -198,7 +198,7 @@ class ArmPlanner:
             budget.check("task")
             feedback("task", f"following the task with grasps {lot} to {min(lot + self.settings.grasps, len(grasps)) - 1}")
             branches = self._branches(request, grasps[lot : lot + self.settings.grasps], failures)
-            for group in _by_grasp(branches):
+            for group in _by_grasp(self._clear(request, branches, failures)):
                 if tried >= self.settings.tries:
                     raise failures.error()
                 if any(_alike(group[0].grasp.tool_from_tcp, other) for other in chosen):
@@ -305,6 +305,37 @@ class ArmPlanner:
             branches.append(Branch(grasps[index[n]], path, float(cost)))
         return sorted(branches, key=lambda b: b.cost)
 
+    def _clear(self, request: Request, branches: Sequence[Branch], failures: Failures) -> list[Branch]:
+        """The branches whose arm, seen without the tool, is clear of everything at every key pose; best first, no more than are tried."""
+        robot = self.robot
+        robot.detach()
+        if robot.world.has_object(request.tool.id):
+            robot.world.remove_object(request.tool.id)
+        robot.open_to(robot.config.opening)
+        times = request.times[request.keys]
+        fixed = request.strategy.physics.target_is_fixed
+        clear: list[Branch] = []
+        # Where one branch fails others fail too: the places of the last failures are looked at first.
+        order = list(range(len(request.keys)))
+        for n, branch in enumerate(branches):
+            if n % 8 == 0:
+                request.budget.check("task")
+            hit = None
+            for place, k in enumerate(order):
+                self._ignore_target(request, not fixed and bool(times[k] > request.met + 1e-9))
+                if robot.collides(branch.path[k]):
+                    hit = (k, robot.collision(branch.path[k]))
+                    order.insert(0, order.pop(place))
+                    break
+            if hit is None:
+                clear.append(branch)
+                if len(clear) >= 4 * self.settings.tries:
+                    break
+            else:
+                failures.add("task", MagicError(Code.PATH_IN_COLLISION, f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}", "in collision", "a task path clear of the arm"))
+        self._ignore_target(request, False)
+        return clear
+
     def _complete(self, request: Request, branch: Branch, only_check: bool) -> MotionPlan | None:
         """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError."""
         self._check_task(request, branch)
@@ -404,6 +435,8 @@ class ArmPlanner:
         for q in solutions[np.argsort(far, kind="stable")][:8]:
             request.budget.check("approach")
             back = self._straight(tip, -settings.standoff * tip[:3, 2], q)
+            if back is None:
+                back = self._straight(tip, -settings.standoff / 2 * tip[:3, 2], q)
             if back is None:
                 problem = problem or StageError("approach", MagicError(Code.NO_IK, f"coming straight to the grasp of {request.tool.id}", "out of reach", f"{settings.standoff} m of straight way"))
                 continue

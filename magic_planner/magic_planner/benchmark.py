@@ -29,11 +29,11 @@ from magic_planner.budget import Budget
 from magic_planner.collision import mass_centre
 from magic_planner.object_motion import plan_tool_motion
 
-#: Tool families of each task with the region that does the job; target families with a range of radii where there is one.
+#: For each task: the tool families with the region that does the job, the target's family, and where the tool lies (x, y).
 TASKS = {
-    "hooking": ((("l_hook", "inner"), ("j_hook", "inner"), ("caliper", "jaw"), ("scissors", "inner")), "cylinder"),
-    "hanging": ((("mug", "handle"), ("hanger", "hook")), "rod"),
-    "scooping": ((("spoon", "bowl"), ("ladle", "bowl"), ("measuring_cup", "bowl")), "sphere"),
+    "hooking": ((("l_hook", "inner"), ("j_hook", "inner"), ("caliper", "jaw"), ("scissors", "inner")), "cylinder", (0.44, -0.22)),
+    "hanging": ((("mug", "handle"), ("hanger", "hook")), "rod", (0.50, -0.28)),
+    "scooping": ((("spoon", "bowl"), ("ladle", "bowl"), ("measuring_cup", "bowl")), "sphere", (0.45, 0.31)),
 }
 
 
@@ -80,8 +80,8 @@ def resting(shape: Shape) -> np.ndarray:
     return transforms.from_rpy(0, angle, 0)
 
 
-def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple[float, float] = (0.45, 0.25), yaw: float | None = None) -> Case:
-    """A tool of a family and seed lying at ``at`` with a drawn yaw, the strategy's target and fixtures."""
+def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple[float, float] | None = None, yaw: float | None = None) -> Case:
+    """A tool of a family and seed lying at ``at`` (default: the task's place) with a drawn yaw, the strategy's target and fixtures."""
     rng = np.random.default_rng(seed)
     tool_shape = make(family, seed)
     target_family = TASKS[strategy.name][1]
@@ -91,7 +91,8 @@ def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple
         target_shape = make("sphere", seed, radius=float(rng.choice([0.015, 0.035, 0.045])))
     else:
         target_shape = make(target_family, seed)
-    turn = float(rng.uniform(-0.6, 0.6)) if yaw is None else yaw
+    turn = float(rng.uniform(-0.4, 0.4)) if yaw is None else yaw
+    at = TASKS[strategy.name][2] if at is None else at
     tilt = resting(tool_shape)
     low = transforms.apply(tilt, tool_shape.mesh.vertices)[:, 2].min()
     tool = tool_shape.as_object("tool", transforms.from_rpy(0, 0, turn, [*at, 0.0005 - low]) @ tilt, strategy.view)

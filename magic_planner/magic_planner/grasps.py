@@ -29,7 +29,7 @@ from magic_planner.robot import Robot
 class GraspSettings:
     """agreement: least cosine between the inward normal at one finger and the outward normal at the other.
     samples: surface points tried.  pairs: antipodal pairs kept of them.
-    angles: approach directions about the closing axis.  poses: hand poses looked at in one lot.  standoff: metres of straight way to the grasp.
+    angles: approach directions about the closing axis.  poses: hand poses tested in one lot.  looked: hand poses whose pads are looked at.  standoff: metres of straight way to the grasp.
      clearance: metres kept
     between hand and table.  margin: metres left on each side of the object in the open hand.  away: metres
     around the contact in which no finger is placed.  friction, force, density: of the slip estimate (N, kg/m^3)."""
@@ -38,6 +38,7 @@ class GraspSettings:
     samples: int = 500
     pairs: int = 300
     poses: int = 1500
+    looked: int = 200
     standoff: float = 0.08
     angles: int = 16
     clearance: float = 0.0015
@@ -237,8 +238,10 @@ def propose(
         blocking = f"{tool.id} itself" if not alone else "the target or an obstacle"
         raise MagicError(Code.NO_GRASP, f"{len(ranked)} grasps of {tool.id}", f"the open hand and {blocking} are in collision for {'all' if not alone else alone} of them", "an open hand clear of everything")
     frames, pair, costs = frames[keep], pair[keep], costs[keep]
-    order = np.argsort(costs, kind="stable")[:150]
-    costs[order] += 0.6 * (1 - _support(robot, frames[order], widths[pair[order]], pieces))
+    order = np.argsort(costs, kind="stable")
+    looked = order[: settings.looked]
+    costs[order[settings.looked :]] += 1.0
+    costs[looked] += _misfit(robot, frames[looked], widths[pair[looked]], pieces)
     order = order[np.argsort(costs[order], kind="stable")]
     # The arm's reach decides in the end, so what comes first should differ: each further grasp of a neighbourhood stands back.
     seen: dict[tuple[int, ...], int] = {}
@@ -251,18 +254,27 @@ def propose(
     return [Grasp(frames[i], float(widths[pair[i]]), float(costs[i])) for i in order]
 
 
-def _support(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], reach: float = 0.005) -> NDArray[np.float64]:
-    """(G,) share of the finger pads that meets material: four lines beside each grasp's own that find the same width there."""
+def _misfit(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], reach: float = 0.005) -> NDArray[np.float64]:
+    """(G,) cost of finger pads that do not lie flat: what is gripped askew turns in the hand when the fingers close.
+
+    Lines beside each grasp's own, ``reach`` metres off across and along the fingers, measure how the two gripped faces
+    are tilted to the pads (radians, 2 a radian), and where there is nothing to grip (0.5 where all of them miss).
+    """
     hulls = [hull(piece.vertices) for piece in pieces]
-    closing = frames[:, :3, "xy".index(robot.config.closing_axis)]
-    across, along = frames[:, :3, 1 - "xy".index(robot.config.closing_axis)], frames[:, :3, 2]
-    found = np.zeros(len(frames))
-    for shift in (across, -across, along, -along):
-        start = frames[:, :3, 3] + reach * shift
-        ahead, _, _ = _through(hulls, start, closing)
-        behind, _, _ = _through(hulls, start, -closing)
-        found += (np.abs(ahead - widths / 2) < 0.002) & (np.abs(behind - widths / 2) < 0.002)
-    return found / 4
+    index = "xy".index(robot.config.closing_axis)
+    closing = frames[:, :3, index]
+    tilts, missing = np.zeros(len(frames)), np.zeros(len(frames))
+    for axis in (frames[:, :3, 1 - index], frames[:, :3, 2]):
+        sides = []
+        for sign in (1, -1):
+            start = frames[:, :3, 3] + sign * reach * axis
+            sides.append((_through(hulls, start, closing)[0], _through(hulls, start, -closing)[0]))
+        absent = [(a < 0.3 * widths / 2) | (b < 0.3 * widths / 2) for a, b in sides]
+        missing += (absent[0].astype(float) + absent[1]) / 4
+        there = ~(absent[0] | absent[1])
+        for face in (0, 1):
+            tilts += np.where(there, np.minimum(np.abs(sides[0][face] - sides[1][face]) / (2 * reach), 0.6), 0.3 * (absent[0] != absent[1])) / 2
+    return tilts * 2.0 + 0.5 * missing
 
 
 def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
@@ -329,11 +341,11 @@ class _Terms:
         # Torque about the closing axis is held by friction alone; the fingers' width holds the rest.
         push = np.cross(self.contact - centres, self.force)
         hang = np.max([np.abs(np.einsum("gi,gi->g", np.cross(self.centre - centres, w), closing)) for w in self.weights], axis=0)
-        twist = np.abs(np.einsum("gi,gi->g", push, closing)) + hang
+        twist = np.abs(np.einsum("gi,gi->g", push, closing)) + 2 * hang
         near = np.maximum(0.0, 1 - np.linalg.norm(centres - self.contact, axis=1) / min(0.10, 0.5 * self.size))
         return np.asarray(
             np.linalg.norm(centres - self.guidance, axis=1) / self.size
-            + twist / 0.1
+            + twist / 0.2
             + 0.25 * np.linalg.norm(push, axis=1) / max(float(np.linalg.norm(self.force)) * self.size, 1e-9)
             + 0.8 * near
             + (widths / self.opening) ** 2
