@@ -50,12 +50,12 @@ class Contour:
         """Index of the contour point nearest to a pixel (2,)."""
         return int(np.argmin(np.sum((self.points - np.asarray(pixel, dtype=float)) ** 2, axis=1)))
 
-    def window(self, indices: NDArray[np.int64], half: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Neighbours along the loop: indices (B, 2 half + 1) and which of them are there once.
+    def window(self, indices: NDArray[np.int64], half: int, stride: int = 1) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Neighbours along the loop, every ``stride``-th: indices (B, 2 half + 1) and which of them are there once.
 
         Column ``half`` is the point itself; a short loop is covered once, not again and again.
         """
-        offsets = np.arange(-half, half + 1)
+        offsets = np.arange(-half, half + 1) * stride
         loop = self.loop[indices]
         start, length = self.starts[loop][:, None], self.lengths[loop][:, None]
         position = (indices[:, None] - start + offsets) % length

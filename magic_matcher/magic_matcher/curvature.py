@@ -46,6 +46,9 @@ SCALES = 18
 #: The walk along the contour may leave the disc for this many pixels (released code: 5).
 GAP = 5
 
+#: Contour points used on a length of one scale; more do not change the fit.
+DENSITY = 32
+
 #: Where the sign disagrees with the reference S lies this far along the normal, px (released code).
 NEAR = 5.0
 
@@ -55,7 +58,7 @@ STRAIGHT = 50.0
 #: s / r this near to alpha has met it; see _functional_scale.
 TIE = 0.75
 
-_RAYS, _RAY_STEPS = 120, 72
+_RAYS, _RAY_STEPS = 96, 56
 
 
 @dataclass(frozen=True)
@@ -221,13 +224,22 @@ def measure(
     S lies ``NEAR`` px along the normal on the side that sign asks for.  suppress=False
     stops after the first estimate (ablation).
     """
+    order = np.argsort(scales)
+    if len(order) > 4 and scales[order[-1]] > 3 * scales[order[0]]:
+        # Small and large scales apart: neither needs the other's reach or the other's density.
+        a, normal, extent = np.empty(len(scales)), np.empty((len(scales), 2)), np.empty(len(scales))
+        for part in np.array_split(order, 2):
+            a[part], normal[part], extent[part] = measure(contour, indices[part], scales[part], concave, suppress)
+        return a, normal, extent
     # Any arc that stays within s and can be taken for one edge is shorter than a full circle of radius s.
-    half = int(np.ceil(min(np.pi * float(scales.max()), float(contour.lengths.max())))) + 1
-    window, once = contour.window(indices, half)
+    stride = max(1, int(scales.min() / DENSITY))
+    half = int(np.ceil(min(np.pi * float(scales.max()), float(contour.lengths.max())) / stride)) + 1
+    gap = max(1, GAP // stride)
+    window, once = contour.window(indices, half, stride)
     points, normals = contour.points[window], contour.normals[window]
     centres = contour.points[indices]
     distance = np.hypot(*(points - centres[:, None, :]).transpose(2, 0, 1))
-    use = connected(distance, once, scales)
+    use = connected(distance, once, scales, gap)
     a, normal = fit(points, normals, use, centres, scales)
     extent = _extent(distance, use)
     if not suppress:
@@ -245,7 +257,7 @@ def measure(
     seen[:, half] = True
     second = use & seen
     # Suppression may open gaps: what lies behind one is another edge.
-    second = connected(np.where(second, distance, np.inf), once, scales, GAP)
+    second = connected(np.where(second, distance, np.inf), once, scales, gap)
     enough = second.sum(axis=1) >= np.maximum(5, 0.25 * use.sum(axis=1))
     second = np.where(enough[:, None], second, use)
     return *fit(points, normals, second, centres, scales), _extent(distance, second)
