@@ -28,6 +28,8 @@ from magic_bringup.remote import RemoteAction, RemoteService, Token
 
 #: Where perception's own explanation is looked for when no objects come.
 PERCEPTION = "perception"
+#: How old such an explanation may be, s.
+COMPLAINT_AGE = 30.0
 #: How much later than here the same objects may arrive at the matcher, s.
 OBJECTS_LAG = 5.0
 
@@ -136,7 +138,7 @@ class StrategyServer(Node):
 
     def complaint(self) -> DiagnosticStatus | None:
         """Perception's worst recent diagnostic, where it has one; among equals one that says more than that nothing comes."""
-        recent = [s for t, s in list(self._complaints.values()) if time.monotonic() - t < 5.0 and s.level != DiagnosticStatus.OK]
+        recent = [s for t, s in list(self._complaints.values()) if time.monotonic() - t < COMPLAINT_AGE and s.level != DiagnosticStatus.OK]
         return max(recent, key=lambda s: (s.level, complaint_code(s) not in (None, Code.NO_FRAMES, Code.STALE_DATA)), default=None)
 
     # ------------------------------------------------------------ the action

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from magic_core import qos
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -45,6 +46,25 @@ class Bench:
         self.graph = graph
         self.watcher = watcher
         self.lines: list[str] = []
+        self._codes: dict[str, tuple[int, str]] = {}
+        watcher.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            for item in status.values:
+                if item.key == "code":
+                    self._codes[status.name] = int(item.value), status.message
+
+    def diagnosed(self, code: int, says: tuple[str, ...] = ()) -> None:
+        """Wait until one of perception's diagnostics has this code and says all this."""
+
+        def named() -> bool:
+            return any(c == code and all(s in message for s in says) for c, message in list(self._codes.values()))
+
+        try:
+            until(named)
+        except AssertionError as error:
+            raise AssertionError(f"no diagnostic with code {int(code)} and {says}, but {self._codes}") from error
 
     def ready(self, wanted: tuple[str, ...] = ()) -> None:
         """Wait for the nodes (all of them, or the named ones)."""
@@ -119,7 +139,7 @@ def first_messages(bag: Path) -> dict[str, Any]:
 
 
 class Feed(Node):
-    """Publishes one set of messages again and again at 10 Hz with growing stamps, changed as a test wants.
+    """Publishes one set of messages again and again at 5 Hz with growing stamps, changed as a test wants.
 
     ``change(topic, message)`` gets a copy and returns what is to be sent; ``None``: nothing.
     """
@@ -136,7 +156,7 @@ class Feed(Node):
         for _, message, publisher, latched in self._out:
             if latched:
                 publisher.publish(message)
-        self.create_timer(0.1, self._tick)
+        self.create_timer(0.2, self._tick)
 
     def _tick(self) -> None:
         now = self.get_clock().now().to_msg()
