@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_verifier.simulation import extremes
 
 #: Faces above which the surface is sampled rather than used whole.
 SAMPLES = 400_000
@@ -42,7 +43,7 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
     grid[tuple(index.T)] = True
     # What cannot be reached from outside is inside.
     filled = ndimage.binary_fill_holes(grid)
-    hull = _hull(surface)
+    hull = _hull(extremes(surface, 1000))
     # The cubes reach beyond the surface: what fills its hull even so is convex.
     if hull is not None and ConvexHull(hull.vertices).volume <= filled.sum() * pitch**3:
         return (hull,)

@@ -7,6 +7,7 @@ has a ``release`` phase the tool becomes free at its start.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -229,9 +230,9 @@ class FloatingRun:
         """(0,): there is no arm."""
         return np.zeros(0)
 
-    def intrusions(self, interval: float = 0.02) -> tuple[Intrusion, ...]:
+    def intrusions(self, interval: float = 0.02, check: Callable[[float], None] = lambda _time: None) -> tuple[Intrusion, ...]:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
-        phase begins, sampled every ``interval`` seconds up to the release."""
+        phase begins, sampled every ``interval`` seconds up to the release; ``check`` may raise to end it early."""
         setup, motion = self.setup, self._motion
         end = self.duration if self.release_time is None else self.release_time
         times = np.append(np.arange(0.0, end, interval), end)
@@ -240,7 +241,7 @@ class FloatingRun:
 
         def note(name: str, depth: float, time: float) -> None:
             early = time < self.contact_time
-            if depth > 0 and (known := worst.get((name, early))) is None or depth > 0 and depth > known.depth:
+            if depth > 0 and ((known := worst.get((name, early))) is None or depth > known.depth):
                 worst[(name, early)] = Intrusion(name, depth, time, early)
 
         heights = np.einsum("tij,nj->tni", poses[:, :3, :3], setup.tool.corners) + poses[:, None, :3, 3]
@@ -252,7 +253,9 @@ class FloatingRun:
             others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
         if others:
             probe = Probe(setup.settings, list(setup.tool.hulls), others)
-            for time, pose in zip(times, to_poses(poses), strict=True):
+            for index, (time, pose) in enumerate(zip(times, to_poses(poses), strict=True)):
+                if index % 32 == 0:
+                    check(0.0)
                 name, depth = probe.deepest(pose)
                 if name:
                     note(name, depth, float(time))

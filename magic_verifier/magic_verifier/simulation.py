@@ -32,6 +32,8 @@ MIN_VOLUME = 1e-12
 MAX_PIECES = 1024
 #: PhysX convex meshes hold at most 255 vertices; the rest is left out in :func:`reduced`.
 MAX_VERTICES = 200
+#: Above this number only the outermost points of a piece are looked at.
+MANY_POINTS = 20_000
 
 STATIC = "static"
 KINEMATIC = "kinematic"
@@ -81,24 +83,30 @@ class Touch:
     impulse: NDArray[np.float64]
 
 
+def extremes(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Of points (N, 3) those furthest out in ``count`` evenly spread directions."""
+    # A Fibonacci sphere: directions spread evenly without chance; two of them may share their furthest point.
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k
+    directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
+    chunk = max(1, 4_000_000 // len(points))
+    chosen = [np.argmax(points @ directions[i : i + chunk].T, axis=0) for i in range(0, count, chunk)]
+    return points[np.unique(np.concatenate(chosen))]
+
+
 def reduced(points: NDArray[np.float64], limit: int = MAX_VERTICES) -> NDArray[np.float64]:
     """The corners of the convex hull of points (N, 3); at most ``limit`` of them, those furthest out in evenly
     spread directions.  Raises ``QhullError`` or ``ValueError`` where the points span no volume."""
+    if len(points) > MANY_POINTS:
+        points = extremes(points, 4 * limit)  # an exact hull of a million points takes a minute
     if len(points) < 4:
         raise ValueError(f"{len(points)} points span no volume")
     hull = ConvexHull(points)
     if hull.volume < MIN_VOLUME:
         raise ValueError(f"hull of {hull.volume:.2g} m^3")
     corners = points[hull.vertices]
-    if len(corners) <= limit:
-        return corners
-    # A Fibonacci sphere: directions spread evenly without chance; two of them may share their furthest corner.
-    k = np.arange(limit) + 0.5
-    z = 1 - 2 * k / limit
-    angle = np.pi * (1 + 5**0.5) * k
-    directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
-    chosen = np.unique(np.argmax(corners @ directions.T, axis=0))
-    return corners[chosen]
+    return corners if len(corners) <= limit else extremes(corners, limit)
 
 
 def sphere_of(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:

@@ -37,11 +37,14 @@ RECORD_RATE = 30.0
 class Limits:
     """What a motion may do apart from its goal.
 
-    overlap: depth in metres to which the tool may be in static things before the contact phase, and in a fixed target when
-    it is let go (reconstructions are that uncertain, and a touch is an overlap of about nothing), and in the table at any
-    time; press: the same for other static things after the contact phase has begun, where the tool may well slide along them; nudge (m): how far the target may be pushed
-    before the contact phase; early_force (N): how hard a held tool may touch fixed things before it; slip (m) and slip_angle (rad): how far the
-    tool may move in the gripper between lift and release; tracking (rad): how far a joint may lag behind.
+    overlap: depth in metres to which the tool may be in static things before the contact phase,
+    in a fixed target when it is let go (reconstructions are that uncertain, and a touch is an
+    overlap of about nothing), and in the table at any time; press: the same for other static
+    things after the contact phase has begun, where the tool may well slide along them; nudge
+    (m): how far the target may be pushed before the contact phase; early_force (N): how hard a
+    held tool may touch fixed things before it; slip (m) and slip_angle (rad): how far the tool
+    may move in the gripper between lift and release; tracking (rad): how far a joint may lag
+    behind; required_rate: share of perturbed runs that must pass.
     """
 
     overlap: float = 0.0015
@@ -125,9 +128,9 @@ class _Stop:
             raise MagicError(Code.SIMULATION_TIMEOUT, f"out of time after {simulated:.2f} simulated seconds")
 
 
-def _refuse_intrusions(strategy: Strategy, run: FloatingRun, limits: Limits) -> dict[str, float]:
+def _refuse_intrusions(strategy: Strategy, run: FloatingRun, limits: Limits, stop: _Stop) -> dict[str, float]:
     """Raise where the planned tool goes through static things; returns what was measured."""
-    found = run.intrusions()
+    found = run.intrusions(check=stop.check)
     for item in sorted(found, key=lambda i: i.time):
         if item.before_contact and item.depth > limits.overlap:
             raise MagicError(
@@ -206,7 +209,7 @@ def _run_once(
         goal = goals.goal_test(strategy, run, rng)
         recorder = _Recorder(run)
         if plan.variant == "fg":
-            metrics = _refuse_intrusions(strategy, run, limits)
+            metrics = _refuse_intrusions(strategy, run, limits, stop)
         end = run.duration + goal.settle
         if run.release_time is not None:
             end = max(end, run.release_time + goal.settle)
