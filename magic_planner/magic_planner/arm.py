@@ -27,7 +27,7 @@ from magic_planner import timing
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, convex_shapes, mass_centre, merged, solid_pieces
 from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
-from magic_planner.object_motion import _plane, tool_contact_frame, waypoint_times
+from magic_planner.object_motion import table_plane, tool_contact_frame, waypoint_times
 from magic_planner.robot import Robot
 
 Array = NDArray[np.float64]
@@ -127,7 +127,9 @@ class ArmPlanner:
     def warm_up(self) -> None:
         """Load and build what the first request would otherwise wait for."""
         self.robot.warm_up()
-        timing.parameterise(np.stack([self.robot.home, self.robot.home + 0.05]), self.robot.velocity_limits, self.robot.acceleration_limits, 0.02)
+        timing.parameterise(
+            np.stack([self.robot.home, self.robot.home + 0.05]), self.robot.velocity_limits, self.robot.acceleration_limits, 0.02
+        )
 
     # ------------------------------------------------------------ one request
 
@@ -150,10 +152,44 @@ class ArmPlanner:
         """The arm's motion that takes the tool from where it lies along ``motion``.
 
         start (J,): where the arm is (default: home).  attempt: 0 for the best grasp, n for the n-th next that differs from
-        those before.  Raises NO_GRASP, NO_IK, JOINT_LIMIT, START_IN_COLLISION, PATH_IN_COLLISION, NO_PATH, DYNAMIC_LIMIT,
+        those before.  A tool's retreat that the arm cannot follow is left out.
+
+        Raises NO_GRASP, NO_IK, JOINT_LIMIT, START_IN_COLLISION, PATH_IN_COLLISION, NO_PATH, DYNAMIC_LIMIT,
         TIME_PARAMETERISATION, PLANNING_TIMEOUT, CANCELED, each naming the stage and the waypoint, pair or limit.
         """
         budget = budget or Budget()
+        given = (strategy, tool, target, candidate, reflection)
+        rest = (table, obstacles, start, attempt, seed, budget, feedback)
+        try:
+            return self._plan(*given, motion, *rest)
+        except MagicError as error:
+            ending = next((p for p in motion.phases if p.name == "retreat"), None)
+            if ending is None or strategy.releases or error.code not in (Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION):
+                raise
+            # What the tool is for is done by then: better to stop there than not to act.
+            feedback("task", f"without the tool's retreat, as {error.message}")
+            until = motion.times <= ending.start + 1e-9
+            shorter = ToolMotion(
+                motion.times[until], motion.world_from_tool[until], tuple(p for p in motion.phases if p.end <= ending.start + 1e-9)
+            )
+            return self._plan(*given, shorter, *rest)
+
+    def _plan(
+        self,
+        strategy: Strategy,
+        tool: SceneObject,
+        target: SceneObject,
+        candidate: ContactCandidate,
+        reflection: str,
+        motion: ToolMotion,
+        table: Array | Sequence[float],
+        obstacles: Sequence[SceneObject],
+        start: Array | None,
+        attempt: int,
+        seed: int,
+        budget: Budget,
+        feedback: Callable[[str, str], None],
+    ) -> MotionPlan:
         robot = self.robot
         start = robot.home.copy() if start is None else np.asarray(start, dtype=float)
         if start.shape != (robot.count,) or not np.all(np.isfinite(start)):
@@ -161,7 +197,12 @@ class ArmPlanner:
         over = np.flatnonzero((start < robot.chain.lower - 1e-3) | (start > robot.chain.upper + 1e-3))
         if len(over):
             j = int(over[0])
-            raise MagicError(Code.JOINT_LIMIT, f"start, {robot.chain.names[j]}", round(float(start[j]), 4), f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad")
+            raise MagicError(
+                Code.JOINT_LIMIT,
+                f"start, {robot.chain.names[j]}",
+                round(float(start[j]), 4),
+                f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad",
+            )
         release = next((p.start for p in motion.phases if p.name == "release"), None) if strategy.releases else None
         count = len(motion.times) if release is None else int(np.searchsorted(motion.times, release + 1e-9))
         times, poses = motion.times[:count], motion.world_from_tool[:count]
@@ -171,7 +212,7 @@ class ArmPlanner:
             target=target,
             obstacles=tuple(obstacles),
             motion=motion,
-            plane=_plane(table),
+            plane=table_plane(table),
             start=start,
             seed=seed,
             budget=budget,
@@ -216,7 +257,9 @@ class ArmPlanner:
                     tried -= 1
                     break
         if chosen:
-            raise MagicError(Code.NO_GRASP, "stage grasp: attempt", attempt, f"0 to {len(chosen) - 1}: there are {len(chosen)} different grasps")
+            raise MagicError(
+                Code.NO_GRASP, "stage grasp: attempt", attempt, f"0 to {len(chosen) - 1}: there are {len(chosen)} different grasps"
+            )
         raise failures.error()
 
     def _keys(self, poses: Array) -> NDArray[np.int64]:
@@ -250,11 +293,18 @@ class ArmPlanner:
         met = int(np.searchsorted(request.times, request.met))
         last = len(request.poses) - 1
         # The force on the contact: what moves the target along the table, or holds the tool up where the target is fixed.
-        loaded, density = (request.tool, request.strategy.physics.tool_density) if fixed else (request.target, 2 * request.strategy.physics.target_density)
+        loaded, density = (
+            (request.tool, request.strategy.physics.tool_density)
+            if fixed
+            else (request.target, 2 * request.strategy.physics.target_density)
+        )
         force = float(np.clip(mass_centre(solid_pieces(loaded))[0] * density * 9.81, 0.5, 30.0))
         settings = replace(self.grasping, density=request.strategy.physics.tool_density, force=force, standoff=self.settings.standoff)
         rng = np.random.default_rng(request.seed)
-        clouds = {item.id: transforms.apply(item.world_from_object, surface(solid_pieces(item), 200, rng)[0]) for item in (request.target, *request.obstacles)}
+        clouds = {
+            item.id: transforms.apply(item.world_from_object, surface(solid_pieces(item), 200, rng)[0])
+            for item in (request.target, *request.obstacles)
+        }
         static, swept = [], [transforms.apply(transforms.inverse(request.tool.world_from_object), np.concatenate(list(clouds.values())))]
         for index in np.unique([*np.linspace(0, last, 7).astype(int), min(met, last)]):
             # Once it is touched the target goes with the tool, unless it is fixed.
@@ -263,14 +313,23 @@ class ArmPlanner:
                 final = request.strategy.releases and index == last
                 (swept if final else static).append(transforms.apply(transforms.inverse(request.poses[index]), np.concatenate(there)))
         swept_points, static_points = np.concatenate(swept), np.concatenate(static) if static else np.zeros((0, 3))
-        grasps = propose(self.robot, request.tool, tool_from_contact, request.plane, poses, settings, request.seed, static_points, swept_points)
+        grasps = propose(
+            self.robot, request.tool, tool_from_contact, request.plane, poses, settings, request.seed, static_points, swept_points
+        )
         checks = [(request.tool.world_from_object, [target, *others])]
         for index in sorted({0, min(met, last), last}):
             checks.append((request.poses[index], [target, *others] if fixed or index <= met else others))
-        free, blocked = collision_free(self.robot, grasps, request.tool, checks, self.settings.grasps * self.settings.rounds, request.budget)
+        free, blocked = collision_free(
+            self.robot, grasps, request.tool, checks, self.settings.grasps * self.settings.rounds, request.budget
+        )
         if not free:
             name = max(blocked, key=lambda k: blocked[k])
-            raise MagicError(Code.NO_GRASP, f"stage grasp: {len(grasps)} grasps of {request.tool.id}", f"hand and {name} in collision for {blocked[name]} of them", "an open hand clear of everything")
+            raise MagicError(
+                Code.NO_GRASP,
+                f"stage grasp: {len(grasps)} grasps of {request.tool.id}",
+                f"hand and {name} in collision for {blocked[name]} of them",
+                "an open hand clear of everything",
+            )
         return free
 
     def _branches(self, request: Request, grasps: Sequence[Grasp], failures: Failures) -> list[Branch]:
@@ -280,7 +339,15 @@ class ArmPlanner:
         frames = np.stack([g.tool_from_tcp for g in grasps])
         index, q = robot.inverse(keys[0] @ frames, np.stack([robot.home, request.start]))
         if not len(index):
-            failures.add("task", MagicError(Code.NO_IK, f"{request.place(0)}: {len(grasps)} grasps", "none within the arm's reach", f"a hand within {robot.chain.reach:.2f} m of the base, at a pose that the joint limits allow"))
+            failures.add(
+                "task",
+                MagicError(
+                    Code.NO_IK,
+                    f"{request.place(0)}: {len(grasps)} grasps",
+                    "none within the arm's reach",
+                    f"a hand within {robot.chain.reach:.2f} m of the base, at a pose that the joint limits allow",
+                ),
+            )
             return []
         targets = keys[:, None] @ frames[index][None]
         paths, stopped, reason = robot.chain.track(targets, q, jump=settings.jump)
@@ -291,9 +358,25 @@ class ArmPlanner:
             why = int(reason[best])
             ways = f"{len(index)} postures with {len(grasps)} grasps"
             if why >= 0:
-                failures.add("task", MagicError(Code.JOINT_LIMIT, f"{where}, {robot.chain.names[why]}", f"at its limit for the best of {ways}", f"{robot.chain.lower[why]:.3f} to {robot.chain.upper[why]:.3f} rad"))
+                failures.add(
+                    "task",
+                    MagicError(
+                        Code.JOINT_LIMIT,
+                        f"{where}, {robot.chain.names[why]}",
+                        f"at its limit for the best of {ways}",
+                        f"{robot.chain.lower[why]:.3f} to {robot.chain.upper[why]:.3f} rad",
+                    ),
+                )
             else:
-                failures.add("task", MagicError(Code.NO_IK, f"{where}: {ways}", "out of reach" if why == -1 else "only by a jump of the joints", f"a path that the arm can follow, joint steps below {settings.jump} rad"))
+                failures.add(
+                    "task",
+                    MagicError(
+                        Code.NO_IK,
+                        f"{where}: {ways}",
+                        "out of reach" if why == -1 else "only by a jump of the joints",
+                        f"a path that the arm can follow, joint steps below {settings.jump} rad",
+                    ),
+                )
             return []
         branches = []
         for n in np.flatnonzero(whole):
@@ -332,7 +415,15 @@ class ArmPlanner:
                 if len(clear) >= 4 * self.settings.tries:
                     break
             else:
-                failures.add("task", MagicError(Code.PATH_IN_COLLISION, f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}", "in collision", "a task path clear of the arm"))
+                failures.add(
+                    "task",
+                    MagicError(
+                        Code.PATH_IN_COLLISION,
+                        f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}",
+                        "in collision",
+                        "a task path clear of the arm",
+                    ),
+                )
         self._ignore_target(request, False)
         return clear
 
@@ -373,7 +464,7 @@ class ArmPlanner:
         self._ignore_target(request, False)
 
     def _ignore_target(self, request: Request, ignored: bool) -> None:
-        links = [n for n in self.robot.planner.user_link_names]
+        links = list(self.robot.planner.user_link_names)
         self.robot.allow(request.target.id, *links, allowed=ignored)
 
     def _check_task(self, request: Request, branch: Branch) -> None:
@@ -390,7 +481,15 @@ class ArmPlanner:
             hit = robot.first_collision(branch.path[before - 1 :], budget=request.budget, stage="task")
             hit = None if hit is None else (hit[0] + before - 1, hit[1])
         if hit is not None:
-            raise StageError("task", MagicError(Code.PATH_IN_COLLISION, f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}", "in collision", "a task path clear of the arm"))
+            raise StageError(
+                "task",
+                MagicError(
+                    Code.PATH_IN_COLLISION,
+                    f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}",
+                    "in collision",
+                    "a task path clear of the arm",
+                ),
+            )
 
     def _follow(self, request: Request, branch: Branch) -> Array:
         """Joint positions (T, J) at every sample of the task: between the key poses by interpolation, then onto the path, all at once."""
@@ -406,7 +505,9 @@ class ArmPlanner:
         step = np.abs(np.diff(q, axis=0)).max(axis=1)
         if step.max() > self.settings.jump / 2:
             where = request.place(int(step.argmax()) + 1)
-            raise StageError("task", MagicError(Code.NO_IK, where, f"a jump of {step.max():.2f} rad", f"joint steps below {self.settings.jump / 2} rad"))
+            raise StageError(
+                "task", MagicError(Code.NO_IK, where, f"a jump of {step.max():.2f} rad", f"joint steps below {self.settings.jump / 2} rad")
+            )
         return q
 
     # ------------------------------------------------------------ picking up
@@ -426,7 +527,10 @@ class ArmPlanner:
         tip = request.tool.world_from_object @ branch.grasp.tool_from_tcp
         _, solutions = robot.inverse(tip[None], np.stack([branch.path[0], request.start]), seeds=16)
         if not len(solutions):
-            raise StageError("approach", MagicError(Code.NO_IK, f"the grasp of {request.tool.id} where it lies", "out of reach", "a tool that the arm can reach"))
+            raise StageError(
+                "approach",
+                MagicError(Code.NO_IK, f"the grasp of {request.tool.id} where it lies", "out of reach", "a tool that the arm can reach"),
+            )
         # The posture nearest to both neighbours costs the least motion.
         far = np.abs(solutions - branch.path[0]).max(axis=1) + np.abs(solutions - request.start).max(axis=1)
         problem: StageError | None = None
@@ -438,11 +542,22 @@ class ArmPlanner:
             if back is None:
                 back = self._straight(tip, -settings.standoff / 2 * tip[:3, 2], q)
             if back is None:
-                problem = problem or StageError("approach", MagicError(Code.NO_IK, f"coming straight to the grasp of {request.tool.id}", "out of reach", f"{settings.standoff} m of straight way"))
+                problem = problem or StageError(
+                    "approach",
+                    MagicError(
+                        Code.NO_IK,
+                        f"coming straight to the grasp of {request.tool.id}",
+                        "out of reach",
+                        f"{settings.standoff} m of straight way",
+                    ),
+                )
                 continue
             hit = robot.first_collision(back[::-1], budget=request.budget, stage="approach")
             if hit is not None:
-                problem = StageError("approach", MagicError(Code.PATH_IN_COLLISION, f"coming to the grasp: {hit[1]}", "in collision", "a clear way to the tool"))
+                problem = StageError(
+                    "approach",
+                    MagicError(Code.PATH_IN_COLLISION, f"coming to the grasp: {hit[1]}", "in collision", "a clear way to the tool"),
+                )
                 continue
             ways.append((back[::-1], q))
         self._hold(request, branch.grasp)
@@ -452,12 +567,19 @@ class ArmPlanner:
             for height in (settings.lift, settings.lift / 2):
                 up = self._straight(tip, height * request.plane[:3], q)
                 if up is None:
-                    problem = StageError("lift", MagicError(Code.NO_IK, f"lifting {request.tool.id} by {height:.2f} m", "out of reach", "a lift that the arm can follow"))
+                    problem = StageError(
+                        "lift",
+                        MagicError(
+                            Code.NO_IK, f"lifting {request.tool.id} by {height:.2f} m", "out of reach", "a lift that the arm can follow"
+                        ),
+                    )
                     continue
                 hit = robot.first_collision(up, budget=request.budget, stage="lift")
                 if hit is None:
                     return back, q, up
-                problem = StageError("lift", MagicError(Code.PATH_IN_COLLISION, f"lifting {request.tool.id}: {hit[1]}", "in collision", "a clear lift"))
+                problem = StageError(
+                    "lift", MagicError(Code.PATH_IN_COLLISION, f"lifting {request.tool.id}: {hit[1]}", "in collision", "a clear lift")
+                )
         assert problem is not None
         raise problem
 
@@ -482,7 +604,12 @@ class ArmPlanner:
         for q, what in ((start, "lifted"), (goal, "at the start of the task")):
             pair = self.robot.collision(q)
             if pair is not None:
-                raise StageError("transfer", MagicError(Code.PATH_IN_COLLISION, f"the tool {what}: {pair}", "in collision", "a tool in the hand clear of everything"))
+                raise StageError(
+                    "transfer",
+                    MagicError(
+                        Code.PATH_IN_COLLISION, f"the tool {what}: {pair}", "in collision", "a tool in the hand clear of everything"
+                    ),
+                )
         return self._free(request, start, goal, "transfer")
 
     def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
@@ -520,7 +647,15 @@ class ArmPlanner:
             for shorter in (_shorten(robot, path, rng, request.budget, stage), path):
                 if robot.first_collision(shorter, step=0.03, budget=request.budget, stage=stage) is None:
                     return shorter
-        raise StageError(stage, MagicError(Code.NO_PATH, f"free motion of stage {stage}", f"none found in {4 * self.settings.free_time:.1f} s", "a way around the obstacles"))
+        raise StageError(
+            stage,
+            MagicError(
+                Code.NO_PATH,
+                f"free motion of stage {stage}",
+                f"none found in {4 * self.settings.free_time:.1f} s",
+                "a way around the obstacles",
+            ),
+        )
 
     # ------------------------------------------------------------ after the release
 
@@ -535,19 +670,30 @@ class ArmPlanner:
         for direction in (back, transforms.unit(back + 0.5 * request.plane[:3]), transforms.unit(back - 0.5 * request.plane[:3])):
             path = self._straight(tip, settings.retreat * direction, task[-1])
             if path is None:
-                problem = problem or StageError("retreat", MagicError(Code.NO_IK, "taking the open hand away", "out of reach", f"{settings.retreat} m of straight way"))
+                problem = problem or StageError(
+                    "retreat", MagicError(Code.NO_IK, "taking the open hand away", "out of reach", f"{settings.retreat} m of straight way")
+                )
                 continue
             hit = robot.first_collision(path, budget=request.budget, stage="retreat")
             if hit is None:
                 return path
-            problem = StageError("retreat", MagicError(Code.PATH_IN_COLLISION, f"taking the open hand away: {hit[1]}", "in collision", "a clear way back"))
+            problem = StageError(
+                "retreat", MagicError(Code.PATH_IN_COLLISION, f"taking the open hand away: {hit[1]}", "in collision", "a clear way back")
+            )
         assert problem is not None
         raise problem
 
     # ------------------------------------------------------------ timing
 
     def _timed(
-        self, request: Request, branch: Branch, come: Array, pick: tuple[Array, Array, Array], carry: Array, task: Array, retreat: Array | None
+        self,
+        request: Request,
+        branch: Branch,
+        come: Array,
+        pick: tuple[Array, Array, Array],
+        carry: Array,
+        task: Array,
+        retreat: Array | None,
     ) -> MotionPlan:
         robot, settings = self.robot, self.settings
         velocity, acceleration, step = robot.velocity_limits, robot.acceleration_limits, settings.time_step
@@ -565,7 +711,12 @@ class ArmPlanner:
             began = track.now
             clock = track.follow(request.times, task, self._rests(request), velocity, acceleration, step)
         except timing.Infeasible as error:
-            raise StageError("timing", MagicError(Code.TIME_PARAMETERISATION, "time parameterisation", str(error), "a path that velocity and acceleration limits allow")) from error
+            raise StageError(
+                "timing",
+                MagicError(
+                    Code.TIME_PARAMETERISATION, "time parameterisation", str(error), "a path that velocity and acceleration limits allow"
+                ),
+            ) from error
         for phase in request.motion.phases:
             if phase.start < request.times[-1] - 1e-9:
                 names.append((phase.name, began + float(clock(min(phase.end, float(request.times[-1]))))))
@@ -577,7 +728,12 @@ class ArmPlanner:
             try:
                 track.append(timing.parameterise(retreat, velocity * 0.6, acceleration, step))
             except timing.Infeasible as error:
-                raise StageError("timing", MagicError(Code.TIME_PARAMETERISATION, "time parameterisation of the retreat", str(error), "a path that the limits allow")) from error
+                raise StageError(
+                    "timing",
+                    MagicError(
+                        Code.TIME_PARAMETERISATION, "time parameterisation of the retreat", str(error), "a path that the limits allow"
+                    ),
+                ) from error
             names.append(("retreat", track.now))
         times, q, qd, qdd = track.arrays()
         self._check_limits(request, branch, times, q, qd, qdd, grasp_time, release_time)
@@ -591,7 +747,9 @@ class ArmPlanner:
         return MotionPlan(
             "arm",
             ToolMotion(times, poses, phases),
-            ArmMotion(times, robot.chain.names, q, qd, qdd, branch.grasp.tool_from_tcp, branch.grasp.width, grasp_time, release_time, phases),
+            ArmMotion(
+                times, robot.chain.names, q, qd, qdd, branch.grasp.tool_from_tcp, branch.grasp.width, grasp_time, release_time, phases
+            ),
         )
 
     def _rests(self, request: Request) -> list[int]:
@@ -604,17 +762,38 @@ class ArmPlanner:
             found.add(min(last, int(np.abs(request.times - when).argmin())))
         return sorted(found)
 
-    def _check_limits(self, request: Request, branch: Branch, times: Array, q: Array, qd: Array, qdd: Array, grasp_time: float, release_time: float | None) -> None:
+    def _check_limits(
+        self, request: Request, branch: Branch, times: Array, q: Array, qd: Array, qdd: Array, grasp_time: float, release_time: float | None
+    ) -> None:
         robot = self.robot
         over = np.argwhere((q < robot.chain.lower - 1e-6) | (q > robot.chain.upper + 1e-6))
         if len(over):
             i, j = over[0]
-            raise StageError("timing", MagicError(Code.JOINT_LIMIT, f"{robot.chain.names[j]} at {times[i]:.2f} s", round(float(q[i, j]), 4), f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad"))
-        for values, limits, unit in ((qd, robot.chain.velocity, "rad/s"), (qdd, np.array(robot.acceleration_limits) / robot.config.acceleration_scale, "rad/s^2")):
+            raise StageError(
+                "timing",
+                MagicError(
+                    Code.JOINT_LIMIT,
+                    f"{robot.chain.names[j]} at {times[i]:.2f} s",
+                    round(float(q[i, j]), 4),
+                    f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad",
+                ),
+            )
+        for values, limits, unit in (
+            (qd, robot.chain.velocity, "rad/s"),
+            (qdd, np.array(robot.acceleration_limits) / robot.config.acceleration_scale, "rad/s^2"),
+        ):
             over = np.argwhere(np.abs(values) > limits * 1.001)
             if len(over):
                 i, j = over[0]
-                raise StageError("timing", MagicError(Code.DYNAMIC_LIMIT, f"{robot.chain.names[j]} at {times[i]:.2f} s", f"{values[i, j]:.3f} {unit}", f"up to {limits[j]:.3f} {unit}"))
+                raise StageError(
+                    "timing",
+                    MagicError(
+                        Code.DYNAMIC_LIMIT,
+                        f"{robot.chain.names[j]} at {times[i]:.2f} s",
+                        f"{values[i, j]:.3f} {unit}",
+                        f"up to {limits[j]:.3f} {unit}",
+                    ),
+                )
         some = np.unique(np.linspace(0, len(times) - 1, min(len(times), 60)).astype(int))
         held = (times[some] >= grasp_time) & (times[some] <= (np.inf if release_time is None else release_time))
         volume, centre = mass_centre(solid_pieces(request.tool))
@@ -622,11 +801,21 @@ class ArmPlanner:
         for rows, load in ((some[held], mass), (some[~held], 0.0)):
             if not len(rows):
                 continue
-            torques = np.abs(robot.chain.gravity_torques(q[rows], load, transforms.apply(transforms.inverse(branch.grasp.tool_from_tcp), centre)))
+            torques = np.abs(
+                robot.chain.gravity_torques(q[rows], load, transforms.apply(transforms.inverse(branch.grasp.tool_from_tcp), centre))
+            )
             over = np.argwhere(torques > robot.chain.effort)
             if len(over):
                 i, j = over[0]
-                raise StageError("timing", MagicError(Code.DYNAMIC_LIMIT, f"{robot.chain.names[j]} at {times[rows[i]]:.2f} s with {load:.2f} kg in hand", f"{torques[i, j]:.1f} N m", f"up to {robot.chain.effort[j]} N m"))
+                raise StageError(
+                    "timing",
+                    MagicError(
+                        Code.DYNAMIC_LIMIT,
+                        f"{robot.chain.names[j]} at {times[rows[i]]:.2f} s with {load:.2f} kg in hand",
+                        f"{torques[i, j]:.1f} N m",
+                        f"up to {robot.chain.effort[j]} N m",
+                    ),
+                )
 
 
 class StageError(Exception):

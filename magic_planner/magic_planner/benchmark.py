@@ -52,13 +52,17 @@ def target_contact(shape: Shape, strategy: Strategy) -> Contact:
     """The support point of a standing target along the strategy's normal, in a view along its direction."""
     direction, normal = strategy.target_view_direction, strategy.target_normal
     up = np.array([1.0, 0, 0]) if abs(direction[2]) > 0.9 else np.array([0, 0, 1.0])
-    view = section_view(shape.mesh, direction, up) if strategy.view == "section" else canonical_view(shape.mesh, direction, up, strategy.view)
+    view = (
+        section_view(shape.mesh, direction, up) if strategy.view == "section" else canonical_view(shape.mesh, direction, up, strategy.view)
+    )
     reach = shape.mesh.vertices @ normal
     top = shape.mesh.vertices[reach > reach.max() - 1e-4]
     point = view.points(view.pixels(top.mean(axis=0)))
     pixel = view.pixels(point)
     picture = transforms.unit(normal @ view.object_from_view[:3, :2])
-    return Contact(pixel, picture, strategy.target_contact.radius, False, strategy.target_contact.scale, contact_frame(view, pixel, picture))
+    return Contact(
+        pixel, picture, strategy.target_contact.radius, False, strategy.target_contact.scale, contact_frame(view, pixel, picture)
+    )
 
 
 def region_name(shape: Shape, wanted: str) -> str:
@@ -67,7 +71,7 @@ def region_name(shape: Shape, wanted: str) -> str:
 
 
 def resting(shape: Shape) -> np.ndarray:
-    """A tilt about y, as a transform without translation, in which the shape lies still: downhill from upright to the lowest centre of mass."""
+    """A tilt about y, as a transform, in which the shape lies still: downhill from upright to the lowest centre of mass."""
     vertices, centre = shape.mesh.vertices, mass_centre(shape.pieces)[1]
 
     def height(angle: float) -> float:
@@ -80,7 +84,9 @@ def resting(shape: Shape) -> np.ndarray:
     return transforms.from_rpy(0, angle, 0)
 
 
-def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple[float, float] | None = None, yaw: float | None = None) -> Case:
+def make_case(
+    strategy: Strategy, family: str, region: str, seed: int, at: tuple[float, float] | None = None, yaw: float | None = None
+) -> Case:
     """A tool of a family and seed lying at ``at`` (default: the task's place) with a drawn yaw, the strategy's target and fixtures."""
     rng = np.random.default_rng(seed)
     tool_shape = make(family, seed)
@@ -105,7 +111,13 @@ def make_case(strategy: Strategy, family: str, region: str, seed: int, at: tuple
     name = region_name(tool_shape, region)
     towards = (0, 0, 1) if strategy.view == "section" else None
     tool_contact = tool_shape.contact(name, tool_shape.view(strategy.view), towards=towards)
-    return Case(f"{family}-{seed}/{name}", tool, target, around, ContactCandidate("tool", tool_contact, contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4)))
+    return Case(
+        f"{family}-{seed}/{name}",
+        tool,
+        target,
+        around,
+        ContactCandidate("tool", tool_contact, contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4)),
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -150,7 +162,15 @@ def main(arguments: list[str] | None = None) -> int:
                 if motion is not None:
                     try:
                         plan = planner.plan(
-                            strategy, case.tool, case.target, case.candidate, "keep", motion, (0, 0, 1, 0), case.obstacles, budget=Budget(options.timeout)
+                            strategy,
+                            case.tool,
+                            case.target,
+                            case.candidate,
+                            "keep",
+                            motion,
+                            (0, 0, 1, 0),
+                            case.obstacles,
+                            budget=Budget(options.timeout),
                         )
                         assert plan.arm_motion is not None
                         text = f"ok, {plan.arm_motion.times[-1]:.1f} s of motion, {1e3 * plan.arm_motion.grasp_width:.0f} mm grasp"

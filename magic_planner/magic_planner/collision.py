@@ -15,7 +15,6 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 
-
 #: Hulls of arrays seen lately: the same pieces are asked for by every stage of every attempt.
 _HULLS: OrderedDict[int, tuple[Any, tuple[NDArray[np.float64], NDArray[np.int32]]]] = OrderedDict()
 _KEPT_HULLS = 4000

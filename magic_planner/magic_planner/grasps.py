@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
@@ -29,10 +28,11 @@ from magic_planner.robot import Robot
 class GraspSettings:
     """agreement: least cosine between the inward normal at one finger and the outward normal at the other.
     samples: surface points tried.  pairs: antipodal pairs kept of them.
-    angles: approach directions about the closing axis.  poses: hand poses tested in one lot.  looked: hand poses whose pads are looked at.  standoff: metres of straight way to the grasp.
+    angles: approach directions about the closing axis.  poses: hand poses tested in one lot.  looked: hand poses whose pads are
+    looked at.  standoff: metres of straight way to the grasp.
      clearance: metres kept
     between hand and table.  margin: metres left on each side of the object in the open hand.  away: metres
-    around the contact in which no finger is placed.  friction, force, density: of the slip estimate (N, kg/m^3)."""
+    around the contact in which no finger is placed.  force, density: of the slip estimate (N, kg/m^3)."""
 
     agreement: float = 0.9
     samples: int = 500
@@ -44,7 +44,6 @@ class GraspSettings:
     clearance: float = 0.0015
     margin: float = 0.003
     away: float = 0.035
-    friction: float = 0.5
     force: float = 5.0
     density: float = 600.0
 
@@ -96,7 +95,9 @@ def in_the_way(
         for first in range(0, len(frames), chunk):
             part = slice(first, first + chunk)
             rotation = frames[part, :3, :3].astype(np.float32)
-            local = points.astype(np.float32) @ rotation - np.einsum("gji,gj->gi", rotation, frames[part, :3, 3].astype(np.float32))[:, None]
+            local = (
+                points.astype(np.float32) @ rotation - np.einsum("gji,gj->gi", rotation, frames[part, :3, 3].astype(np.float32))[:, None]
+            )
             near = ((local > whole_low) & (local < whole_high)).all(axis=2)
             which, index = np.nonzero(near)
             some = local[which, index]
@@ -212,13 +213,20 @@ def propose(
     allowed = max(0.0, robot.tip_reach - 0.0025)
     low = back <= allowed
     if not low.any():
-        raise MagicError(Code.NO_GRASP, f"grasps of {tool.id}", "the hand would go through the table where the tool lies", "fingertips above the table")
+        raise MagicError(
+            Code.NO_GRASP, f"grasps of {tool.id}", "the hand would go through the table where the tool lies", "fingertips above the table"
+        )
     frames, pair, back = frames[low], pair[low], back[low]
     frames[:, :3, 3] -= frames[:, :3, 2] * back[:, None]
     if len(poses) > 1:
         high = _heights(frames, corners, poses[1:], table).min(axis=0) > settings.clearance * 0.5
         if not high.any():
-            raise MagicError(Code.NO_GRASP, f"grasps of {tool.id}", "the hand would go through the table during the task", "a hand above the table on the whole path")
+            raise MagicError(
+                Code.NO_GRASP,
+                f"grasps of {tool.id}",
+                "the hand would go through the table during the task",
+                "a hand above the table on the whole path",
+            )
         frames, pair, back = frames[high], pair[high], back[high]
 
     costs = first[pair] + terms.of_approach(frames, back)
@@ -236,7 +244,12 @@ def propose(
     keep = np.concatenate(kept)
     if not len(keep):
         blocking = f"{tool.id} itself" if not alone else "the target or an obstacle"
-        raise MagicError(Code.NO_GRASP, f"{len(ranked)} grasps of {tool.id}", f"the open hand and {blocking} are in collision for {'all' if not alone else alone} of them", "an open hand clear of everything")
+        raise MagicError(
+            Code.NO_GRASP,
+            f"{len(ranked)} grasps of {tool.id}",
+            f"the open hand and {blocking} are in collision for {alone if alone else 'all'} of them",
+            "an open hand clear of everything",
+        )
     frames, pair, costs = frames[keep], pair[keep], costs[keep]
     order = np.argsort(costs, kind="stable")
     looked = order[: settings.looked]
@@ -254,7 +267,9 @@ def propose(
     return [Grasp(frames[i], float(widths[pair[i]]), float(costs[i])) for i in order]
 
 
-def _misfit(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], reach: float = 0.005) -> NDArray[np.float64]:
+def _misfit(
+    robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], reach: float = 0.005
+) -> NDArray[np.float64]:
     """(G,) cost of finger pads that do not lie flat: what is gripped askew turns in the hand when the fingers close.
 
     Lines beside each grasp's own, ``reach`` metres off across and along the fingers, measure how the two gripped faces
@@ -273,7 +288,9 @@ def _misfit(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float6
         missing += (absent[0].astype(float) + absent[1]) / 4
         there = ~(absent[0] | absent[1])
         for face in (0, 1):
-            tilts += np.where(there, np.minimum(np.abs(sides[0][face] - sides[1][face]) / (2 * reach), 0.6), 0.3 * (absent[0] != absent[1])) / 2
+            tilts += (
+                np.where(there, np.minimum(np.abs(sides[0][face] - sides[1][face]) / (2 * reach), 0.6), 0.3 * (absent[0] != absent[1])) / 2
+            )
     return tilts * 2.0 + 0.5 * missing
 
 
@@ -305,7 +322,9 @@ def _frames(
     return frames.reshape(-1, 4, 4), pair
 
 
-def _heights(frames: NDArray[np.float64], points: NDArray[np.float64], poses: NDArray[np.float64], table: NDArray[np.float64]) -> NDArray[np.float64]:
+def _heights(
+    frames: NDArray[np.float64], points: NDArray[np.float64], poses: NDArray[np.float64], table: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(K, G): least height over the table of points (P, 3) of the hand, for each pose (K) and grasp (G)."""
     up = np.einsum("kji,j->ki", poses[:, :3, :3], table[:3])
     ground = poses[:, :3, 3] @ table[:3] + table[3]
@@ -337,7 +356,7 @@ class _Terms:
         self.opening = robot.config.opening
 
     def of_pairs(self, centres: NDArray[np.float64], closing: NDArray[np.float64], widths: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M,): the torque that the fingers must hold by friction, nearness to the contact, distance from the guidance point, a wide grip."""
+        """(M,): torque that the fingers must hold by friction, nearness to the contact, distance from the guidance point, width."""
         # Torque about the closing axis is held by friction alone; the fingers' width holds the rest.
         push = np.cross(self.contact - centres, self.force)
         hang = np.max([np.abs(np.einsum("gi,gi->g", np.cross(self.centre - centres, w), closing)) for w in self.weights], axis=0)

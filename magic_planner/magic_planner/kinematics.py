@@ -103,7 +103,10 @@ class Chain:
         """
         frames, tip = self.frames(np.atleast_2d(q))
         axes = np.einsum("njik,jk->nji", frames[:, :, :3, :3], self.axes)
-        points = [np.einsum("nij,j->ni", frames[:, j, :3, :3], centre) + frames[:, j, :3, 3] for j, centre in zip(self.mass_joint, self.mass_centre, strict=True)]
+        points = [
+            np.einsum("nij,j->ni", frames[:, j, :3, :3], centre) + frames[:, j, :3, 3]
+            for j, centre in zip(self.mass_joint, self.mass_centre, strict=True)
+        ]
         loads = [(j, point, mass * GRAVITY) for j, point, mass in zip(self.mass_joint, points, self.masses, strict=True)]
         if payload:
             centre = np.zeros(3) if payload_centre is None else np.asarray(payload_centre)
@@ -205,7 +208,9 @@ class Chain:
 def pose_error(targets: Array, tips: Array) -> Array:
     """(N, 6): translation, then rotation vector in base axes, that carries each tip onto its target."""
     relative = targets[:, :3, :3] @ tips[:, :3, :3].transpose(0, 2, 1)
-    axis = 0.5 * np.stack([relative[:, 2, 1] - relative[:, 1, 2], relative[:, 0, 2] - relative[:, 2, 0], relative[:, 1, 0] - relative[:, 0, 1]], axis=1)
+    axis = 0.5 * np.stack(
+        [relative[:, 2, 1] - relative[:, 1, 2], relative[:, 0, 2] - relative[:, 2, 0], relative[:, 1, 0] - relative[:, 0, 1]], axis=1
+    )
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, (np.trace(relative, axis1=1, axis2=2) - 1) / 2)
     scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)
@@ -224,6 +229,10 @@ def _origin(element: ElementTree.Element | None) -> Array:
     if element is None:
         return np.eye(4)
     return transforms.from_rpy(*_numbers(element.get("rpy"), "0 0 0"), _numbers(element.get("xyz"), "0 0 0"))
+
+
+def _bound(limit: ElementTree.Element | None, key: str, default: float) -> float:
+    return float(limit.get(key, default)) if limit is not None else default
 
 
 def load_chain(urdf: str | Path, tip: str, base: str | None = None) -> Chain:
@@ -263,10 +272,10 @@ def _chain(root: ElementTree.Element, tip: str, base: str | None) -> Chain:
             else:
                 b, c = fixed @ cross, fixed @ cross @ cross
             limit = joint.find("limit")
-            bound = (lambda key, default: float(limit.get(key, default)) if limit is not None else float(default))  # noqa: E731
-            turn = str(4 * np.pi)
-            low, high = (-2 * np.pi, 2 * np.pi) if kind == "continuous" else (bound("lower", "-" + turn), bound("upper", turn))
-            rows.append((fixed, b, c, direction, kind == "prismatic", low, high, bound("velocity", "1"), bound("effort", "inf")))
+            low, high = -2 * np.pi, 2 * np.pi
+            if kind != "continuous":
+                low, high = _bound(limit, "lower", low), _bound(limit, "upper", high)
+            rows.append((fixed, b, c, direction, kind == "prismatic", low, high, _bound(limit, "velocity", 1.0), _bound(limit, "effort", np.inf)))
             names.append(joint.get("name"))
             fixed = np.eye(4)
         carrier[joint.find("child").get("link")] = (len(names) - 1, fixed.copy())  # type: ignore[union-attr]

@@ -7,7 +7,6 @@ import time
 from typing import Any
 
 import numpy as np
-from magic_interfaces.action import PlanMotion
 from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -19,6 +18,7 @@ from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import describe, parameter, run
+from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
 
@@ -66,14 +66,20 @@ class PlannerNode(Node):
         config = RobotConfig(
             urdf=parameter(self, "robot.urdf", "", "URDF of arm and gripper; empty: the Panda of example-robot-data."),
             srdf=parameter(self, "robot.srdf", "", "SRDF with the pairs of links that may touch."),
-            package_root=parameter(self, "robot.package_root", "", "Folder that package:// stands for; empty: found from the URDF's place."),
+            package_root=parameter(
+                self, "robot.package_root", "", "Folder that package:// stands for; empty: found from the URDF's place."
+            ),
             move_group=parameter(self, "robot.move_group", "panda_hand_tcp", "Link between the fingertips, z out of the hand."),
             closing_axis=parameter(self, "robot.closing_axis", "y", "Axis of that link along which the fingers close.", choices=("x", "y")),
             opening=parameter(self, "robot.opening", 0.08, "Metres between the open fingers.", low=0.005, high=1.0),
             home=tuple(parameter(self, "robot.home", list(PANDA_HOME), "Home configuration, rad.")),
-            acceleration=tuple(parameter(self, "robot.acceleration", list(PANDA_ACCELERATION), "Acceleration limits, rad/s^2, one a joint or one for all.")),
+            acceleration=tuple(
+                parameter(self, "robot.acceleration", list(PANDA_ACCELERATION), "Acceleration limits, rad/s^2, one a joint or one for all.")
+            ),
             velocity_scale=parameter(self, "robot.velocity_scale", 0.3, "Share of the velocity limits that is used.", low=0.01, high=1.0),
-            acceleration_scale=parameter(self, "robot.acceleration_scale", 0.2, "Share of the acceleration limits that is used.", low=0.01, high=1.0),
+            acceleration_scale=parameter(
+                self, "robot.acceleration_scale", 0.2, "Share of the acceleration limits that is used.", low=0.01, high=1.0
+            ),
         )
         grasping = GraspSettings(
             agreement=parameter(self, "grasp.agreement", 0.9, "Least cosine between the normals at the two fingers.", low=0.0, high=1.0),
@@ -110,7 +116,10 @@ class PlannerNode(Node):
         finally:
             self._busy.release()
         result.seconds = time.monotonic() - started
-        self.get_logger().info(f"{handle.request.strategy} {handle.request.variant} {handle.request.tool.id}: {Code(result.code).name}: {result.message} ({result.seconds:.2f} s)")
+        self.get_logger().info(
+            f"{handle.request.strategy} {handle.request.variant} {handle.request.tool.id}: {Code(result.code).name}: "
+            f"{result.message} ({result.seconds:.2f} s)"
+        )
         if result.code == Code.OK:
             handle.succeed()
         elif result.code == Code.CANCELED and handle.is_cancel_requested:
@@ -144,13 +153,27 @@ class PlannerNode(Node):
         budget.check("motion")
         if goal.variant == "fg":
             if goal.attempt:
-                raise MagicError(Code.BAD_REQUEST, "attempt", goal.attempt, "0: the floating gripper has one motion for each candidate and reflection")
+                raise MagicError(
+                    Code.BAD_REQUEST, "attempt", goal.attempt, "0: the floating gripper has one motion for each candidate and reflection"
+                )
             return MotionPlan("fg", motion)
         if self._arm is None:
             raise MagicError(Code.UNKNOWN_VARIANT, "variant", goal.variant, "fg, as this planner was started without an arm")
         start = self._start(goal.start)
         return self._arm.plan(
-            strategy, tool, target, candidate, reflection, motion, table, obstacles, start, int(goal.attempt), int(goal.seed), budget, feedback
+            strategy,
+            tool,
+            target,
+            candidate,
+            reflection,
+            motion,
+            table,
+            obstacles,
+            start,
+            int(goal.attempt),
+            int(goal.seed),
+            budget,
+            feedback,
         )
 
     def _start(self, state: JointState) -> NDArray[np.float64] | None:
@@ -158,7 +181,9 @@ class PlannerNode(Node):
         if not state.name and not state.position:
             return None
         if len(state.name) != len(state.position):
-            raise MagicError(Code.BAD_REQUEST, "start: names and positions", f"{len(state.name)} and {len(state.position)}", "as many positions as names")
+            raise MagicError(
+                Code.BAD_REQUEST, "start: names and positions", f"{len(state.name)} and {len(state.position)}", "as many positions as names"
+            )
         found = dict(zip(state.name, state.position, strict=True))
         names = self._arm.robot.chain.names
         missing = [name for name in names if name not in found]

@@ -60,12 +60,14 @@ def plan_tool_motion(
     tool would start inside the target or an obstacle.
     """
     if candidate.target is None:
-        raise MagicError(Code.BAD_REQUEST, f"candidate of tool {tool.id}", "without a target contact", "a candidate with the target's contact filled in")
+        raise MagicError(
+            Code.BAD_REQUEST, f"candidate of tool {tool.id}", "without a target contact", "a candidate with the target's contact filled in"
+        )
     if candidate.tool_id and candidate.tool_id != tool.id:
         raise MagicError(Code.BAD_REQUEST, "tool of the candidate", candidate.tool_id, f"{tool.id!r}, the tool of the request")
     if reflection not in REFLECTIONS:
         raise MagicError(Code.BAD_REQUEST, "reflection", reflection, REFLECTIONS)
-    plane = _plane(table)
+    plane = table_plane(table)
     _rigid(tool.world_from_object, f"pose of {tool.id}")  # the arm starts from it
     world_from_target = _rigid(target.world_from_object, f"pose of {target.id}")
     target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
@@ -116,7 +118,9 @@ def waypoint_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np
     for i in range(1, len(waypoints)):
         speed = float(waypoints[i].speed)
         if not (np.isfinite(speed) and speed > 0):
-            raise MagicError(Code.BAD_STRATEGY, f"speed of waypoint {waypoints[i].name} of {strategy.name}", speed, "a number of m/s above 0")
+            raise MagicError(
+                Code.BAD_STRATEGY, f"speed of waypoint {waypoints[i].name} of {strategy.name}", speed, "a number of m/s above 0"
+            )
         seconds, share = straight_line(float(np.linalg.norm(offsets[i] - offsets[i - 1])), speed)
         times.append(now + seconds)
         points.append(offsets[i - 1] + share[:, None] * (offsets[i] - offsets[i - 1]))
@@ -172,9 +176,16 @@ def demonstrated_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArra
     times = np.asarray(strategy.times, dtype=float)
     demonstrated = np.asarray(strategy.target_from_tool, dtype=float)
     if len(times) < 2 or demonstrated.shape != (len(times), 4, 4):
-        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", f"{len(times)} times, poses {demonstrated.shape}", "two or more timed poses")
+        raise MagicError(
+            Code.BAD_STRATEGY,
+            f"trajectory of {strategy.name}",
+            f"{len(times)} times, poses {demonstrated.shape}",
+            "two or more timed poses",
+        )
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(demonstrated)) and np.all(np.diff(times) > 0)):
-        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", "NaN, or times that do not increase", "finite poses at increasing times")
+        raise MagicError(
+            Code.BAD_STRATEGY, f"trajectory of {strategy.name}", "NaN, or times that do not increase", "finite poses at increasing times"
+        )
     target_from_contact = _reference(strategy.target_contact, f"target contact of {strategy.name}")
     tool_from_contact = _reference(strategy.tool_contact, f"tool contact of {strategy.name}")
     at = refined_times(times, demonstrated)
@@ -202,7 +213,9 @@ def demonstrated_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArra
     return at, contacts, join_phases(pieces)
 
 
-def refined_times(times: NDArray[np.float64], poses: NDArray[np.float64], length: float = STEP_LENGTH, angle: float = STEP_ANGLE) -> NDArray[np.float64]:
+def refined_times(
+    times: NDArray[np.float64], poses: NDArray[np.float64], length: float = STEP_LENGTH, angle: float = STEP_ANGLE
+) -> NDArray[np.float64]:
     """The given times (T,) and as many between them as keep each step of poses (T, 4, 4) within length and angle."""
     moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turned = np.array([transforms.rotation_angle(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)])
@@ -244,7 +257,9 @@ def join_phases(ends: Sequence[tuple[str, float]]) -> tuple[Phase, ...]:
     return tuple(phases)
 
 
-def lift_above(plane: NDArray[np.float64], world_from_tool: NDArray[np.float64], points: NDArray[np.float64], clearance: float = TABLE_CLEARANCE) -> float:
+def lift_above(
+    plane: NDArray[np.float64], world_from_tool: NDArray[np.float64], points: NDArray[np.float64], clearance: float = TABLE_CLEARANCE
+) -> float:
     """Least rise along world up, metres, that keeps points (N, 3) of the tool frame above the plane at all poses (T, 4, 4)."""
     normal = plane[:3]
     in_tool = np.einsum("tji,j->ti", world_from_tool[:, :3, :3], normal)
@@ -252,7 +267,8 @@ def lift_above(plane: NDArray[np.float64], world_from_tool: NDArray[np.float64],
     return max(0.0, (clearance - float(height.min())) / float(normal[2]))
 
 
-def _plane(table: NDArray[np.float64] | Sequence[float]) -> NDArray[np.float64]:
+def table_plane(table: NDArray[np.float64] | Sequence[float]) -> NDArray[np.float64]:
+    """(4,) coefficients with a unit normal that points up; BAD_MOTION for a plane that is not finite or stands on edge."""
     plane = np.asarray(table, dtype=float).reshape(-1)
     if plane.shape != (4,) or not np.all(np.isfinite(plane)):
         raise MagicError(Code.BAD_MOTION, "table plane", plane.tolist(), "four finite coefficients a, b, c, d")

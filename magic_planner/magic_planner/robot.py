@@ -74,7 +74,9 @@ def panda_folder() -> Path:
                 return Path(str(file.locate())).resolve().parents[1]
     except metadata.PackageNotFoundError:
         pass
-    raise MagicError(Code.BAD_REQUEST, "URDF of the Panda", "not found", "the Python package example-robot-data, or parameters urdf and srdf")
+    raise MagicError(
+        Code.BAD_REQUEST, "URDF of the Panda", "not found", "the Python package example-robot-data, or parameters urdf and srdf"
+    )
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,9 @@ class Robot:
             try:
                 self.planner = mplib.Planner(urdf=str(copy), srdf=str(srdf), move_group=self.config.move_group, new_package_keyword="")
             except (RuntimeError, ValueError, AssertionError) as error:
-                raise MagicError(Code.BAD_REQUEST, f"robot {urdf}", str(error).splitlines()[0], "a URDF and SRDF that MPlib reads") from error
+                raise MagicError(
+                    Code.BAD_REQUEST, f"robot {urdf}", str(error).splitlines()[0], "a URDF and SRDF that MPlib reads"
+                ) from error
         self.world = self.planner.planning_world
         self.count = self.chain.count
         self.home = np.array(self.config.home, dtype=float)
@@ -175,14 +179,18 @@ class Robot:
                 self.hand[name] = Mesh(*hull(np.concatenate(points)))
         self.open_to(self.config.opening)
         if not self.hand:
-            raise MagicError(Code.BAD_REQUEST, "gripper of the URDF", "no collision shape moves with the last joint", "a hand with collision geometry")
+            raise MagicError(
+                Code.BAD_REQUEST, "gripper of the URDF", "no collision shape moves with the last joint", "a hand with collision geometry"
+            )
         #: How far the fingertips reach beyond the tip frame's origin, metres.
         self.tip_reach = float(max(m.vertices[:, 2].max() for m in self.hand.values()))
         across = "xy".index(self.config.closing_axis)
         depth = {name: m.vertices[:, 2].max() for name, m in self.hand.items()}
         deepest = max(depth.values())
         #: Links that touch what is held: those that reach as deep as the fingertips.
-        self.finger_links = tuple(n for n, d in depth.items() if d > deepest - 0.005 and abs(self.hand[n].vertices[:, across].mean()) > 1e-3)
+        self.finger_links = tuple(
+            n for n, d in depth.items() if d > deepest - 0.005 and abs(self.hand[n].vertices[:, across].mean()) > 1e-3
+        )
 
     def hand_body(self) -> Body:
         """The open hand as one body in the frame of the move group."""
@@ -262,8 +270,13 @@ class Robot:
             return Collision("the arm", "something")
         return Collision(found[0].link_name1 or found[0].object_name1, found[0].link_name2 or found[0].object_name2)
 
-    def first_collision(self, path: NDArray[np.float64], step: float = 0.04, budget: Budget | None = None, stage: str = "") -> tuple[int, Collision] | None:
-        """Index of the first row of a path (N, J) before which the arm touches something, and the pair; rows are joined by straight lines checked every ``step`` rad."""
+    def first_collision(
+        self, path: NDArray[np.float64], step: float = 0.04, budget: Budget | None = None, stage: str = ""
+    ) -> tuple[int, Collision] | None:
+        """Index of the first row of a path (N, J) before which the arm touches something, and the pair.
+
+        Rows are joined by straight lines, checked every ``step`` rad.
+        """
         for i, q in enumerate(path):
             if budget is not None and i % 16 == 0:
                 budget.check(stage)
@@ -317,7 +330,9 @@ class Robot:
         seeds = min(seeds, len(library))
         near = library[np.atleast_2d(tree.query(self._features(targets), k=seeds)[1].reshape(len(targets), seeds))]
         if starts is not None and len(starts):
-            near = np.concatenate([near, np.broadcast_to(np.atleast_2d(starts)[None], (len(targets), *np.atleast_2d(starts).shape))], axis=1)
+            near = np.concatenate(
+                [near, np.broadcast_to(np.atleast_2d(starts)[None], (len(targets), *np.atleast_2d(starts).shape))], axis=1
+            )
         each = near.shape[1]
         q, solved = self.chain.solve(np.repeat(targets, each, axis=0), near.reshape(-1, self.count), iterations=25)
         inside = np.minimum(q - self.chain.lower, self.chain.upper - q).min(axis=1) > margin
@@ -341,7 +356,9 @@ def _package_root(urdf: Path, text: str) -> Path:
         for folder in urdf.parents:
             if (folder / named.group(1)).is_file():
                 return folder
-        raise MagicError(Code.BAD_REQUEST, f"mesh of {urdf}", named.group(0), "parameter package_root: the folder that package:// stands for")
+        raise MagicError(
+            Code.BAD_REQUEST, f"mesh of {urdf}", named.group(0), "parameter package_root: the folder that package:// stands for"
+        )
     return urdf.parent
 
 

@@ -89,7 +89,9 @@ class Track:
         q = np.repeat(self._rows[-1][0][-1:], count, axis=0)
         self.append((np.linspace(0, seconds, count), q, np.zeros_like(q), np.zeros_like(q)))
 
-    def follow(self, clock: Array, q: Array, rests: Sequence[int], velocity: Array, acceleration: Array, step: float) -> Callable[[float], float]:
+    def follow(
+        self, clock: Array, q: Array, rests: Sequence[int], velocity: Array, acceleration: Array, step: float
+    ) -> Callable[[float], float]:
         """Add a path q (T, J) that the tool passes at times ``clock`` (T,), never faster than that.
 
         rests: indices, first and last among them, at which the tool stands still.  Returns the function from the

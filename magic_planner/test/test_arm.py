@@ -6,8 +6,8 @@ import dataclasses
 import time
 
 import numpy as np
-import pytest
 import planner_scenes as scenes
+import pytest
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
@@ -127,7 +127,9 @@ def test_a_releasing_strategy_lets_go_and_backs_off(arm):
     assert [p.name for p in motion.phases][-2:] == ["release", "retreat"]
     assert motion.release_time == pytest.approx(span(plan, "release").start)
     after = plan.tool_motion.times > motion.release_time
-    np.testing.assert_allclose(plan.tool_motion.world_from_tool[after], np.repeat(plan.tool_motion.world_from_tool[-1:], after.sum(), axis=0))
+    np.testing.assert_allclose(
+        plan.tool_motion.world_from_tool[after], np.repeat(plan.tool_motion.world_from_tool[-1:], after.sum(), axis=0)
+    )
     tips = arm.robot.chain.forward(motion.positions[[np.searchsorted(motion.times, motion.release_time), -1]])
     assert np.linalg.norm(tips[1, :3, 3] - tips[0, :3, 3]) == pytest.approx(0.08, abs=2e-3)
 
@@ -203,3 +205,12 @@ def test_feedback_names_the_stages(arm):
     stages = []
     arm.plan(*problem(), feedback=lambda stage, message: stages.append(stage))
     assert stages[0] == "grasp" and set(stages) >= {"grasp", "task", "lift", "transfer", "approach", "timing"}
+
+
+def test_a_retreat_out_of_reach_is_left_out(arm):
+    strategy = scenes.pulling()
+    waypoints = (*strategy.waypoints, Waypoint("up", np.array([-0.25, 0, -1.2]), "retreat", 0.3))
+    given = problem(waypoints=waypoints)
+    assert given[-1].phases[-1].name == "retreat"
+    plan = arm.plan(*given)
+    assert [p.name for p in plan.arm_motion.phases][-1] == "goal"

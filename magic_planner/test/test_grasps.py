@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import planner_scenes as scenes
+import pytest
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
@@ -64,7 +64,10 @@ def test_the_mass_of_pieces_and_their_merging():
     assert sum(mass_centre([p])[0] for p in few) == pytest.approx(0.012)
     vertices, faces = hull(pieces[0].vertices)
     corners = vertices[faces]
-    assert np.all(np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1) - [0.05, 0, 0]) > 0)
+    assert np.all(
+        np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1) - [0.05, 0, 0])
+        > 0
+    )
 
 
 def test_a_hand_stays_above_the_table_and_out_of_the_tool(arm):

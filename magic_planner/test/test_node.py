@@ -31,11 +31,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def graph(folder):
-    from magic_interfaces.action import PlanMotion
     from rclpy.action import ActionClient
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
+    from magic_interfaces.action import PlanMotion
     from magic_planner.node import PlannerNode
 
     rclpy.init(domain_id=DOMAIN)
@@ -58,9 +58,8 @@ def graph(folder):
 
 
 def goal(**changes):
-    from magic_interfaces.action import PlanMotion
-
     from magic_core import conversions as convert
+    from magic_interfaces.action import PlanMotion
 
     tool, tool_contact = scenes.hook()
     target, target_contact = scenes.standing_cylinder()
