@@ -80,7 +80,9 @@ class ArmRun:
         positions = np.asarray(motion.positions, dtype=float)
         times = np.asarray(motion.times, dtype=float)
         if tuple(motion.joint_names) != ARM_JOINTS or positions.shape != (len(times), len(ARM_JOINTS)) or len(times) < 2:
-            raise MagicError(Code.BAD_MOTION, "arm motion", f"{len(times)} rows of {list(motion.joint_names)}", f"two rows or more of {list(ARM_JOINTS)}")
+            raise MagicError(
+                Code.BAD_MOTION, "arm motion", f"{len(times)} rows of {list(motion.joint_names)}", f"two rows or more of {list(ARM_JOINTS)}"
+            )
         if not (np.all(np.isfinite(positions)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)):
             raise MagicError(Code.BAD_MOTION, "arm motion", "times or positions", "finite positions at strictly increasing times")
         self.setup = setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
@@ -154,12 +156,16 @@ class ArmRun:
         # Rows of the links that the arm's joints move, in the order in which the engine reports joint forces.
         self._driven = [[link.name for link in robot.links].index(self._panda.joints[name].child) for name in ARM_JOINTS]
         for joint in self._finger_joints:
-            joint.set_drive_properties(options.finger_stiffness, options.grip_force / options.closing_speed, force_limit=200.0, mode="force")
+            joint.set_drive_properties(
+                options.finger_stiffness, options.grip_force / options.closing_speed, force_limit=200.0, mode="force"
+            )
             joint.set_armature(np.array([0.1], dtype=np.float32))
         self._tcp = robot.find_link_by_name(TCP_LINK)
         self._order = [robot.active_joints.index(j) for j in (*self._arm_joints, *self._finger_joints)]
         if self._order != list(range(9)):
-            raise MagicError(Code.BAD_SCENE, "order of the arm's joints", [j.name for j in robot.active_joints], [*ARM_JOINTS, *FINGER_JOINTS])
+            raise MagicError(
+                Code.BAD_SCENE, "order of the arm's joints", [j.name for j in robot.active_joints], [*ARM_JOINTS, *FINGER_JOINTS]
+            )
         return robot
 
     # ------------------------------------------------------------ what the goal tests ask
@@ -255,7 +261,9 @@ class ArmRun:
         q = np.asarray(self._robot.qpos, dtype=float).ravel()[:7]
         qd = np.asarray(self._robot.qvel, dtype=float).ravel()[:7]
         if not (np.all(np.isfinite(q)) and np.all(np.isfinite(qd))):
-            raise MagicError(Code.SIMULATION_EXPLODED, f"state of the arm at {self.time:.2f} s", "not a number", "finite joint positions and velocities")
+            raise MagicError(
+                Code.SIMULATION_EXPLODED, f"state of the arm at {self.time:.2f} s", "not a number", "finite joint positions and velocities"
+            )
         error = np.abs(q - command)
         worst = int(error.argmax())
         self._metrics["tracking_error"] = max(self._metrics["tracking_error"], float(error[worst]))

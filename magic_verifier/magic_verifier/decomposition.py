@@ -53,7 +53,9 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
     pieces = []
     for lower, upper in boxes:
         corner, end = origin + lower * pitch, origin + upper * pitch
-        pieces.append(_piece(corner, end, filled[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))], grid, lower, surface, tree, pitch))
+        pieces.append(
+            _piece(corner, end, filled[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))], grid, lower, surface, tree, pitch)
+        )
     return tuple(p for p in pieces if p is not None)
 
 

@@ -50,10 +50,12 @@ def replay(
 ) -> Replay:
     """Replay ``strategy``'s demonstrated trajectory and read its contacts.
 
-    target: where it stood when the demonstration began.  phases: the one named ``watched`` among them is what is
-    averaged over (the paper's is the goal phase; where the target rolls in the tool, as in scooping, ``contact`` is the
-    phase in which they meet as they were shown to); without phases the second half of the motion is.  A fixed target's contacts are read after the release: the
-    tool, let go, hangs from its contact points.  Raises ``LOST_CONTACT`` where tool and target never press on each other.
+    target: where it stood when the demonstration began.  phases: the one named ``watched`` among
+    them is what is averaged over (the paper's is the goal phase; where the target rolls in the tool,
+    as in scooping, ``contact`` is the phase in which they meet as they were shown to); without
+    phases the second half of the motion is.  A fixed target's contacts are read after the release:
+    the tool, let go, hangs from its contact points.  Raises ``LOST_CONTACT`` where tool and target
+    never press on each other.
     """
     settings = settings or Settings(frequency=480.0)
     table = np.array([0.0, 0.0, 1.0, 0.0]) if table is None else table
@@ -100,7 +102,12 @@ def replay(
             weight += force
             count += 1
     if count == 0:
-        raise MagicError(Code.LOST_CONTACT, f"contacts in the {watched} phase of the demonstration {strategy.name}", 0, "at least one contact that carries a force")
+        raise MagicError(
+            Code.LOST_CONTACT,
+            f"contacts in the {watched} phase of the demonstration {strategy.name}",
+            0,
+            "at least one contact that carries a force",
+        )
     return Replay(
         sums["tool_point"] / weight,
         transforms.unit(sums["tool_normal"]),

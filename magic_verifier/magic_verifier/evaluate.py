@@ -107,7 +107,9 @@ def cases(options: Options) -> list[Case]:
     tools, targets = tool_names(options), target_names(options)
     if options.task == "hooking" and options.variant == "fg":
         return [Case(_short(target), tuple(tools), target) for target in targets]
-    return [Case(_short(tool) + ("" if len(targets) == 1 else " " + _short(target)), (tool,), target) for tool in tools for target in targets]
+    return [
+        Case(_short(tool) + ("" if len(targets) == 1 else " " + _short(target)), (tool,), target) for tool in tools for target in targets
+    ]
 
 
 def _short(name: str) -> str:
@@ -219,7 +221,14 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     torch.set_num_threads(1)
     seconds = {"match": 0.0, "plan": 0.0, "verify": 0.0}
     tried: list[dict[str, Any]] = []
-    answer: dict[str, Any] = {"object": case.name, "success": False, "reason": "", "candidates": tried, "simulations": 0, "seconds": seconds}
+    answer: dict[str, Any] = {
+        "object": case.name,
+        "success": False,
+        "reason": "",
+        "candidates": tried,
+        "simulations": 0,
+        "seconds": seconds,
+    }
     try:
         strategy = _strategy(options)
         tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
@@ -287,7 +296,17 @@ def _try(
                 from magic_planner.budget import Budget
 
                 plan = _arm_planner().plan(
-                    strategy, tool, target, candidate, reflection, motion, TABLE, obstacles, attempt=attempt, seed=options.seed, budget=Budget(PLANNING_TIME)
+                    strategy,
+                    tool,
+                    target,
+                    candidate,
+                    reflection,
+                    motion,
+                    TABLE,
+                    obstacles,
+                    attempt=attempt,
+                    seed=options.seed,
+                    budget=Budget(PLANNING_TIME),
                 )
             else:
                 plan = MotionPlan("fg", motion)
@@ -295,9 +314,7 @@ def _try(
             return {"code": error.code.name, "message": error.message, "stage": "plan"}, last, False
         finally:
             seconds["plan"] += time.perf_counter() - started
-        verdict = verify(
-            strategy, tool, target, obstacles, TABLE, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0
-        )
+        verdict = verify(strategy, tool, target, obstacles, TABLE, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0)
         seconds["verify"] += verdict.seconds
         answer["simulations"] += 1
         entry = {
@@ -370,7 +387,9 @@ def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path:
         if picture is None:
             continue
         label = np.full((22, picture.shape[1], 3), 255, np.uint8)
-        cv2.putText(label, f"{case['object']}: {case['reason']}"[:90], (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
+        cv2.putText(
+            label, f"{case['object']}: {case['reason']}"[:90], (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA
+        )
         tiles.append(np.concatenate([label, picture]))
     if not tiles:
         path.unlink(missing_ok=True)
@@ -459,13 +478,25 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
     parser.add_argument("--top-k", type=int, default=3, help="candidates tried for a case")
-    parser.add_argument("--noise", type=float, default=None, help="hooking: sideways velocity noise in target radii; by default the strategy's")
+    parser.add_argument(
+        "--noise", type=float, default=None, help="hooking: sideways velocity noise in target radii; by default the strategy's"
+    )
     parser.add_argument("--strategies", default="", help="folder of strategies; by default the installed ones")
     parser.add_argument("--no-films", action="store_true", help="draw no contact sheets")
     parser.add_argument("--out", required=True, help="folder for results.json, summary.txt and contact sheets")
     given = parser.parse_args(args)
     options = Options(
-        given.task, given.variant, given.method, given.features, given.weights, given.objects, given.targets, given.seed, given.top_k, given.noise, given.strategies
+        given.task,
+        given.variant,
+        given.method,
+        given.features,
+        given.weights,
+        given.objects,
+        given.targets,
+        given.seed,
+        given.top_k,
+        given.noise,
+        given.strategies,
     )
     try:
         evaluate(options, Path(given.out), given.limit, given.jobs, not given.no_films, lambda text: print(text, flush=True))

@@ -157,7 +157,7 @@ def film_strip(
 
 
 def _captioned(picture: NDArray[np.uint8], time: str, phase: str) -> NDArray[np.uint8]:
-    height, width = picture.shape[:2]
+    width = picture.shape[1]
     picture = cv2.rectangle(picture, (0, 0), (width, 20), (255, 255, 255), -1)
     cv2.putText(picture, time, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (30, 30, 35), 1, cv2.LINE_AA)
     (text_width, _), _ = cv2.getTextSize(phase, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)

@@ -126,7 +126,11 @@ def perturbed(setup: Setup, perturbation: Perturbation, rng: np.random.Generator
         return replace(setup, physics=physics)
     pose = setup.target.world_from_object
     origin = transforms.apply(pose, setup.target.centre)
-    about = transforms.make(translation=origin + [*shift, 0.0]) @ transforms.from_rpy(0, 0, turn) @ transforms.make(translation=-origin)
+    about = (
+        transforms.make(translation=origin + np.array([*shift, 0.0]))
+        @ transforms.from_rpy(0, 0, turn)
+        @ transforms.make(translation=-origin)
+    )
     return replace(setup, physics=physics, target=replace(setup.target, world_from_object=about @ pose))
 
 
@@ -262,7 +266,9 @@ class FloatingRun:
         return tuple(worst.values())
 
 
-def as_object(item_id: str, mesh: Mesh, pieces: tuple[Mesh, ...], world_from_object: NDArray[np.float64], kind: str = "top", source: str = "known") -> SceneObject:
+def as_object(
+    item_id: str, mesh: Mesh, pieces: tuple[Mesh, ...], world_from_object: NDArray[np.float64], kind: str = "top", source: str = "known"
+) -> SceneObject:
     """A SceneObject of a mesh and its pieces without a picture, for simulations that need none."""
     from magic_core.scene import CanonicalView
 

@@ -22,7 +22,7 @@ Heights are those of the middle of the object above the table.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,8 @@ class GoalTest:
     """
 
     settle = 0.0
-    #: How deep in metres the tool may be in a fixed target when it is let go.
-    defaults: dict[str, float] = {}
+    #: The goal values that the test knows, with what they are where the strategy gives none.
+    defaults: ClassVar[dict[str, float]] = {}
 
     def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator) -> None:
         self.strategy = strategy
@@ -90,7 +90,7 @@ def _height(run: Any, name: str) -> float:
 class Hook(GoalTest):
     """Pull the target; see the module's table."""
 
-    defaults = {"distance": 0.2, "drift": 0.5, "max_speed": 0.5, "noise": 1.0}
+    defaults: ClassVar[dict[str, float]] = {"distance": 0.2, "drift": 0.5, "max_speed": 0.5, "noise": 1.0}
 
     def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator) -> None:
         super().__init__(strategy, run, rng)
@@ -98,7 +98,9 @@ class Hook(GoalTest):
         pull = -np.asarray(strategy.target_normal, dtype=float)
         pull[2] = 0.0
         if np.linalg.norm(pull) < 1e-6:
-            raise MagicError(Code.BAD_STRATEGY, "target_normal of a hooking strategy", strategy.target_normal, "a direction along the table")
+            raise MagicError(
+                Code.BAD_STRATEGY, "target_normal of a hooking strategy", strategy.target_normal, "a direction along the table"
+            )
         self.pull = transforms.unit(pull)
         self.sideways = np.cross([0, 0, 1.0], self.pull)
         corners = transforms.apply(target.world_from_object, target.corners)
@@ -144,7 +146,11 @@ class Hook(GoalTest):
         if pulled < distance and not last.any():
             return Judgement(Code.LOST_CONTACT, f"the tool lost the target: {state} (needed: {distance * 1000:.0f} mm)", metrics)
         if abs(drift) >= limit:
-            return Judgement(Code.DRIFT, f"the target slid off sideways: {state} (allowed: below {limit * 1000:.1f} mm, {self.values['drift']:g} of its radius)", metrics)
+            return Judgement(
+                Code.DRIFT,
+                f"the target slid off sideways: {state} (allowed: below {limit * 1000:.1f} mm, {self.values['drift']:g} of its radius)",
+                metrics,
+            )
         if pulled < distance:
             return Judgement(Code.GOAL_NOT_REACHED, f"not pulled far enough: {state} (needed: {distance * 1000:.0f} mm)", metrics)
         if speed >= fastest:
@@ -155,7 +161,7 @@ class Hook(GoalTest):
 class Hang(GoalTest):
     """Let the tool hang on the target; see the module's table."""
 
-    defaults = {"height": 0.2, "max_speed": 0.5, "settle": 2.25}
+    defaults: ClassVar[dict[str, float]] = {"height": 0.2, "max_speed": 0.5, "settle": 2.25}
 
     def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator) -> None:
         super().__init__(strategy, run, rng)
@@ -167,7 +173,9 @@ class Hang(GoalTest):
         touching = run.world.touching(TOOL, TARGET, TOUCH)
         metrics = {"tool_height": height, "final_speed": speed, "touching": float(touching)}
         needed, fastest = self.values["height"], self.values["max_speed"]
-        state = f"{height * 1000:.0f} mm above the table, moving at {speed:.2f} m/s, {'touching' if touching else 'not touching'} the target"
+        state = (
+            f"{height * 1000:.0f} mm above the table, moving at {speed:.2f} m/s, {'touching' if touching else 'not touching'} the target"
+        )
         if not run.released:
             return Judgement(Code.GOAL_NOT_REACHED, f"the tool was never let go: {state}", metrics)
         if height <= needed:
@@ -181,7 +189,7 @@ class Hang(GoalTest):
 class Scoop(GoalTest):
     """Lift the target in the tool; see the module's table."""
 
-    defaults = {"height": 0.2, "max_speed": 0.1, "settle": 1.0}
+    defaults: ClassVar[dict[str, float]] = {"height": 0.2, "max_speed": 0.1, "settle": 1.0}
 
     def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator) -> None:
         super().__init__(strategy, run, rng)
@@ -219,7 +227,9 @@ class Scoop(GoalTest):
         if not touching:
             return Judgement(Code.LOST_CONTACT, f"the target left the tool: {state}", metrics)
         if speed >= fastest or tool_speed >= fastest:
-            return Judgement(Code.UNSTABLE, f"not at rest: {state}, the tool at {tool_speed:.2f} m/s (allowed: below {fastest:g} m/s)", metrics)
+            return Judgement(
+                Code.UNSTABLE, f"not at rest: {state}, the tool at {tool_speed:.2f} m/s (allowed: below {fastest:g} m/s)", metrics
+            )
         return Judgement(Code.OK, f"the target lies in the tool: {state}", metrics)
 
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from magic_interfaces.action import VerifyMotion
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -18,6 +17,7 @@ from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
+from magic_interfaces.action import VerifyMotion
 from magic_verifier.arm_simulation import ArmOptions
 from magic_verifier.floating import Perturbation
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
@@ -44,13 +44,19 @@ class VerifierNode(Node):
         arm = parameter(self, "arm_frequency", 240.0, "Steps per simulated second, arm.", low=120.0, high=2000.0)
         self._settings = {"fg": replace(DEFAULTS["fg"], frequency=fg), "arm": replace(DEFAULTS["arm"], frequency=arm)}
         self._perturbation = Perturbation(
-            position=parameter(self, "noise.position", 0.002, "Standard deviation in m of the target's place in perturbed runs.", low=0.0, high=0.1),
-            turn=parameter(self, "noise.turn", 0.03, "Standard deviation in rad of the target's turn in perturbed runs.", low=0.0, high=3.2),
+            position=parameter(
+                self, "noise.position", 0.002, "Standard deviation in m of the target's place in perturbed runs.", low=0.0, high=0.1
+            ),
+            turn=parameter(
+                self, "noise.turn", 0.03, "Standard deviation in rad of the target's turn in perturbed runs.", low=0.0, high=3.2
+            ),
             friction=parameter(self, "noise.friction", 0.2, "Half range of the friction's scale in perturbed runs.", low=0.0, high=0.9),
             density=parameter(self, "noise.density", 0.2, "Half range of the densities' scale in perturbed runs.", low=0.0, high=0.9),
         )
         self._limits = Limits(
-            overlap=parameter(self, "limits.overlap", 0.0015, "Depth in m that the tool may be in static things before the contact.", low=0.0, high=0.1),
+            overlap=parameter(
+                self, "limits.overlap", 0.0015, "Depth in m that the tool may be in static things before the contact.", low=0.0, high=0.1
+            ),
             press=parameter(self, "limits.press", 0.01, "Depth in m that the tool may be in static things after that.", low=0.0, high=0.1),
             nudge=parameter(self, "limits.nudge", 0.002, "Way in m that the target may be pushed before the contact.", low=0.0, high=0.1),
             slip=parameter(self, "limits.slip", 0.02, "Way in m that the tool may slip in the gripper.", low=0.0, high=0.5),
@@ -160,7 +166,9 @@ class VerifierNode(Node):
             limits=self._limits,
             arm_options=self._arm,
         )
-        self.get_logger().info(f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)")
+        self.get_logger().info(
+            f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
+        )
         film = Image()
         if goal.want_film and verdict.recording is not None and verdict.code != Code.CANCELED:
             try:

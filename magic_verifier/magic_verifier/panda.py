@@ -171,9 +171,16 @@ def _collada_geometry(geometry: ET.Element, pose: NDArray[np.float64], symbols: 
     mesh = geometry.find("mesh")
     if mesh is None:
         return []
-    sources = {s.get("id", ""): _numbers(s.findtext("float_array"), "").reshape(-1, 3) for s in mesh.iterfind("source") if "position" in s.get("id", "")}
+    sources = {
+        s.get("id", ""): _numbers(s.findtext("float_array"), "").reshape(-1, 3)
+        for s in mesh.iterfind("source")
+        if "position" in s.get("id", "")
+    }
     positions = {
-        "#" + v.get("id", ""): sources[i.get("source", "#")[1:]] for v in mesh.iterfind("vertices") for i in v.iterfind("input") if i.get("semantic") == "POSITION"
+        "#" + v.get("id", ""): sources[i.get("source", "#")[1:]]
+        for v in mesh.iterfind("vertices")
+        for i in v.iterfind("input")
+        if i.get("semantic") == "POSITION"
     }
     parts = []
     for triangles in mesh.iterfind("triangles"):

@@ -352,11 +352,23 @@ class World:
             speed = float(np.linalg.norm(self.velocity(name)))
             distance = float(np.linalg.norm(position))
             if not (np.isfinite(distance) and np.isfinite(speed)):
-                raise MagicError(Code.SIMULATION_EXPLODED, f"state of {name} at {self.time:.2f} s", "not a number", "finite positions and velocities")
+                raise MagicError(
+                    Code.SIMULATION_EXPLODED, f"state of {name} at {self.time:.2f} s", "not a number", "finite positions and velocities"
+                )
             if speed > self.settings.max_speed:
-                raise MagicError(Code.SIMULATION_EXPLODED, f"speed of {name} at {self.time:.2f} s", f"{speed:.1f} m/s", f"up to {self.settings.max_speed} m/s")
+                raise MagicError(
+                    Code.SIMULATION_EXPLODED,
+                    f"speed of {name} at {self.time:.2f} s",
+                    f"{speed:.1f} m/s",
+                    f"up to {self.settings.max_speed} m/s",
+                )
             if distance > self.settings.max_distance:
-                raise MagicError(Code.SIMULATION_EXPLODED, f"distance of {name} at {self.time:.2f} s", f"{distance:.1f} m", f"up to {self.settings.max_distance} m")
+                raise MagicError(
+                    Code.SIMULATION_EXPLODED,
+                    f"distance of {name} at {self.time:.2f} s",
+                    f"{distance:.1f} m",
+                    f"up to {self.settings.max_distance} m",
+                )
 
     def touches(self, first: str, second: str, within: float = 0.0) -> list[Touch]:
         """Contact points of the last step between two bodies whose separation is at most ``within`` metres."""
@@ -396,7 +408,9 @@ class World:
 class Probe:
     """How deep a posed body is in fixed ones, by the same collision shapes as the simulation's."""
 
-    def __init__(self, settings: Settings, hulls: list[NDArray[np.float64]], others: dict[str, tuple[list[NDArray[np.float64]], NDArray[np.float64]]]) -> None:
+    def __init__(
+        self, settings: Settings, hulls: list[NDArray[np.float64]], others: dict[str, tuple[list[NDArray[np.float64]], NDArray[np.float64]]]
+    ) -> None:
         """``others``: hulls and world_from_object by name."""
         self._world = World(settings)
         # So short a step that nothing moves: the contacts are those of the pose that was set.

@@ -180,7 +180,10 @@ def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
                 continue
             value, allowed = f"{force:.1f} N", f"less than {limits.early_force:g} N"
         raise MagicError(
-            Code.PRE_CONTACT_COLLISION, f"the tool hit the {name} at {run.time:.2f} s, before the contact phase at {run.contact_time:.2f} s", value, allowed
+            Code.PRE_CONTACT_COLLISION,
+            f"the tool hit the {name} at {run.time:.2f} s, before the contact phase at {run.contact_time:.2f} s",
+            value,
+            allowed,
         )
 
 
@@ -234,7 +237,11 @@ def _run_once(
                 _refuse_early_touch(run, watched, limits)
         run.world.check(names)
         judgement = goal.judge(run)
-        return replace(judgement, metrics={**metrics, **getattr(run, "metrics", dict)(), **judgement.metrics}), recorder.recording(), run.time
+        return (
+            replace(judgement, metrics={**metrics, **getattr(run, "metrics", dict)(), **judgement.metrics}),
+            recorder.recording(),
+            run.time,
+        )
     except MagicError as error:
         if error.code in (Code.CANCELED, Code.SIMULATION_TIMEOUT):
             raise
@@ -307,4 +314,14 @@ def verify(
     message = judged.message
     if len(passed) > 1:
         message += f"; {sum(passed)} of {len(passed)} runs passed"
-    return Verdict(success, judged.code if not success else Code.OK, message, rate, judged.metrics, simulated, elapsed(), recordings[shown], tuple(judgements))
+    return Verdict(
+        success,
+        judged.code if not success else Code.OK,
+        message,
+        rate,
+        judged.metrics,
+        simulated,
+        elapsed(),
+        recordings[shown],
+        tuple(judgements),
+    )

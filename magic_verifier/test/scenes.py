@@ -70,7 +70,15 @@ def hooking(kind, radius=0.025, noise=1.0, friction=0.5):
     def at(x, z=0.0):
         return transforms.make(translation=[0.6 + radius + x, 0, z])
 
-    motion = plan([(at(0.03, 0.1), "", 0), (at(0.03), "approach", 0.7), (at(0.0), "contact", 0.3), (at(-0.28), "goal", 2.8), (at(-0.26), "retreat", 0.2)])
+    motion = plan(
+        [
+            (at(0.03, 0.1), "", 0),
+            (at(0.03), "approach", 0.7),
+            (at(0.0), "contact", 0.3),
+            (at(-0.28), "goal", 2.8),
+            (at(-0.26), "retreat", 0.2),
+        ]
+    )
     return strategy("hook", {"noise": noise}, Physics(friction, 600.0, 100.0)), item("tool", parts), target, motion
 
 
@@ -79,7 +87,14 @@ def ring(radius=0.03, width=0.008, thickness=0.012, count=24):
     for k in range(count):
         angles = (2 * np.pi * k / count, 2 * np.pi * (k + 1) / count)
         parts.append(
-            hull([[(radius + s * width / 2) * np.cos(a), y, (radius + s * width / 2) * np.sin(a)] for a in angles for s in (-1, 1) for y in (-thickness / 2, thickness / 2)])
+            hull(
+                [
+                    [(radius + s * width / 2) * np.cos(a), y, (radius + s * width / 2) * np.sin(a)]
+                    for a in angles
+                    for s in (-1, 1)
+                    for y in (-thickness / 2, thickness / 2)
+                ]
+            )
         )
     return parts
 
@@ -92,10 +107,15 @@ def hanging(aside=0.0, lower=0.0):
     hung = np.array([0.5 + aside, 0.03, 0.4 + 0.006 - 0.026 + 0.0005 - lower])
 
     def at(y, z):
-        return transforms.make(translation=hung + [0, y, z])
+        return transforms.make(translation=hung + np.array([0, y, z]))
 
     motion = plan([(at(-0.1, 0.01), "", 0), (at(0, 0.01), "approach", 1.0), (at(0, 0), "contact", 0.3), (at(0, 0), "release", 0.1)])
-    return strategy("hang", {}, Physics(0.5, 600.0, 600.0, True), normal=(0.0, 0.0, 1.0), releases=True), item("tool", ring()), target, motion
+    return (
+        strategy("hang", {}, Physics(0.5, 600.0, 600.0, True), normal=(0.0, 0.0, 1.0), releases=True),
+        item("tool", ring()),
+        target,
+        motion,
+    )
 
 
 def scooping(bowl_radius=0.05, ball_radius=0.035):
@@ -108,14 +128,18 @@ def scooping(bowl_radius=0.05, ball_radius=0.035):
     polars, arounds = np.linspace(0, edge, 5), np.linspace(0, 2 * np.pi, 13)
     for i in range(4):
         for j in range(12):
-            parts.append(hull([on_bowl(r, p, a) for r in (bowl_radius, bowl_radius + thick) for p in polars[i : i + 2] for a in arounds[j : j + 2]]))
+            parts.append(
+                hull([on_bowl(r, p, a) for r in (bowl_radius, bowl_radius + thick) for p in polars[i : i + 2] for a in arounds[j : j + 2]])
+            )
     rim, back = bowl_radius * np.sin(edge), -bowl_radius * np.cos(edge)
     parts.append(block((back - 0.006, back), (-0.008, 0.008), (rim, rim + 0.15)))
     foot, pipe = 0.45, []
     for k in range(24):
         angles = np.radians([90 * k / 24, 90 * (k + 1) / 24])
         pipe.append(hull([(foot + r * np.sin(a), y, 0.2 - r * np.cos(a)) for a in angles for r in (0.2, 0.22) for y in (-0.1, 0.1)]))
-    ball = item("ball", [from_trimesh(trimesh.creation.icosphere(3, ball_radius))], transforms.make(translation=[foot - 0.1, 0, ball_radius]))
+    ball = item(
+        "ball", [from_trimesh(trimesh.creation.icosphere(3, ball_radius))], transforms.make(translation=[foot - 0.1, 0, ball_radius])
+    )
     start = transforms.make(translation=[foot - 0.16, 0, rim + 0.012])
     turned = transforms.make(translation=[0.15, 0, 0]) @ start
     about = np.array([foot, 0, 0.2])

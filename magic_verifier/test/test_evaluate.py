@@ -21,7 +21,9 @@ STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringu
 OPTIONS = ev.Options("scooping", "fg", "magic", "embedded", "", "", "", 0, 3, None, STRATEGIES)
 
 
-@pytest.mark.parametrize(("good", "count", "low", "high"), [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)])
+@pytest.mark.parametrize(
+    ("good", "count", "low", "high"), [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)]
+)
 def test_wilson_interval(good, count, low, high):
     # Newcombe 1998, table I, method 3.
     assert ev.wilson(good, count) == pytest.approx((low, high), abs=1e-4)
@@ -97,7 +99,10 @@ def test_damaged_meshes_get_pieces_in_bounded_time(damage):
     assert usable_pieces(damage, pieces)
 
 
-@pytest.mark.parametrize("mesh", [Mesh(np.zeros((0, 3)), np.zeros((0, 3))), Mesh(np.eye(3) * 1e-5, np.array([[0, 1, 2]])), Mesh(np.eye(3) * 100, np.array([[0, 1, 2]]))])
+@pytest.mark.parametrize(
+    "mesh",
+    [Mesh(np.zeros((0, 3)), np.zeros((0, 3))), Mesh(np.eye(3) * 1e-5, np.array([[0, 1, 2]])), Mesh(np.eye(3) * 100, np.array([[0, 1, 2]]))],
+)
 def test_meshes_that_cannot_be_simulated_are_refused(mesh):
     with pytest.raises(MagicError) as error:
         convex_pieces(mesh)

@@ -15,8 +15,6 @@ rclpy = pytest.importorskip("rclpy")
 
 from dataclasses import replace
 
-from magic_interfaces.action import VerifyMotion
-from magic_interfaces.msg import SceneObject as SceneObjectMsg
 from rclpy.action import ActionClient
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
@@ -26,6 +24,8 @@ from magic_core import strategy as strategies
 from magic_core.errors import Code
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView
+from magic_interfaces.action import VerifyMotion
+from magic_interfaces.msg import SceneObject as SceneObjectMsg
 from magic_verifier.node import VerifierNode
 
 
@@ -33,7 +33,10 @@ def _save(folder, name, goal):
     strategy, *_ = scenes.hooking("L")
     tetrahedron = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     view = CanonicalView(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), 0.01, np.eye(4))
-    strategies.save(replace(strategy, name=name, tool_mesh=tetrahedron, target_mesh=tetrahedron, tool_view=view, target_view=view, goal=goal), folder / name)
+    strategies.save(
+        replace(strategy, name=name, tool_mesh=tetrahedron, target_mesh=tetrahedron, tool_view=view, target_view=view, goal=goal),
+        folder / name,
+    )
 
 
 @pytest.fixture(scope="module")

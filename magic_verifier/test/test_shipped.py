@@ -9,11 +9,6 @@ import scenes
 
 pytest.importorskip("magic_planner.object_motion")
 
-from magic_planner.arm import ArmPlanner
-from magic_planner.budget import Budget
-from magic_planner.object_motion import plan_tool_motion
-from magic_planner.robot import Robot
-
 from magic_core import strategy as strategies
 from magic_core import transforms
 from magic_core.contact import ContactCandidate
@@ -21,6 +16,10 @@ from magic_core.errors import Code
 from magic_core.motion import MotionPlan
 from magic_core.shapes import make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures
+from magic_planner.arm import ArmPlanner
+from magic_planner.budget import Budget
+from magic_planner.object_motion import plan_tool_motion
+from magic_planner.robot import Robot
 from magic_verifier.arm_simulation import ArmOptions
 from magic_verifier.demonstration import distance_in_view, replay
 from magic_verifier.film import film_strip
@@ -62,7 +61,9 @@ def test_the_arm_does_the_demonstrated_task(name, planner):
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
     verdicts = []
     for attempt in range(3):
-        plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt, budget=Budget(30.0))
+        plan = planner.plan(
+            strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt, budget=Budget(30.0)
+        )
         verdicts.append(verify(strategy, tool, target, obstacles, scenes.TABLE, candidate, plan))
         if verdicts[-1].success:
             break
@@ -95,7 +96,9 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     assert film.std() > 10
 
 
-@pytest.mark.parametrize(("name", "phase", "bound"), [("hooking", "goal", 0.003), ("hanging", "release", 0.003), ("scooping", "contact", 0.005)])
+@pytest.mark.parametrize(
+    ("name", "phase", "bound"), [("hooking", "goal", 0.003), ("hanging", "release", 0.003), ("scooping", "contact", 0.005)]
+)
 def test_a_replay_finds_the_annotated_contact_points(name, phase, bound):
     strategy, tool, target, obstacles, candidate = demonstration(name)
     phases = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles).phases

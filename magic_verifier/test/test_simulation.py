@@ -61,7 +61,11 @@ def test_a_kinematic_pusher_moves_a_box_by_its_way_less_the_gap():
 @pytest.mark.parametrize("shape", ["sphere", "cylinder", "box"])
 def test_things_rest_on_the_table_at_their_own_height_with_their_own_mass(shape):
     make = trimesh.creation
-    mesh = {"sphere": lambda: make.icosphere(3, 0.02), "cylinder": lambda: make.cylinder(0.02, 0.04), "box": lambda: make.box(extents=[0.04] * 3)}[shape]()
+    mesh = {
+        "sphere": lambda: make.icosphere(3, 0.02),
+        "cylinder": lambda: make.cylinder(0.02, 0.04),
+        "box": lambda: make.box(extents=[0.04] * 3),
+    }[shape]()
     world = World(Settings())
     world.add_table(scenes.TABLE, 0.5)
     world.add("thing", usable_pieces("thing", (from_trimesh(mesh),)), transforms.make(translation=[0, 0, 0.02]), DYNAMIC, 1000.0, 0.5)
@@ -72,7 +76,7 @@ def test_things_rest_on_the_table_at_their_own_height_with_their_own_mass(shape)
 
 
 def test_a_ball_of_many_facets_is_simulated_as_a_sphere():
-    centre, radius = sphere_of(reduced(np.asarray(trimesh.creation.icosphere(3, 0.03).vertices) + [1, 2, 3]))
+    centre, radius = sphere_of(reduced(np.asarray(trimesh.creation.icosphere(3, 0.03).vertices) + np.array([1, 2, 3])))
     assert centre == pytest.approx([1, 2, 3], abs=1e-4)
     assert radius == pytest.approx(0.03, rel=0.01)
     assert sphere_of(reduced(np.asarray(trimesh.creation.cylinder(0.03, 0.06).vertices))) is None

@@ -1,5 +1,6 @@
 """The goal tests say yes to what works, and no with the right reason to what does not."""
 
+import itertools
 import time
 from dataclasses import replace
 
@@ -137,7 +138,7 @@ def test_progress_names_the_phases():
     heard = []
     judge(*scenes.hooking("L"), progress=lambda phase, simulated: heard.append((phase, simulated)))
     assert {"approach", "goal"} <= {phase for phase, _ in heard}
-    assert all(a[1] < b[1] for a, b in zip(heard, heard[1:], strict=False))
+    assert all(a[1] < b[1] for a, b in itertools.pairwise(heard))
 
 
 def test_what_cannot_be_judged_has_its_own_codes():
@@ -151,7 +152,11 @@ def test_what_cannot_be_judged_has_its_own_codes():
 def test_flat_tiny_and_sunken_things_are_bad_scenes():
     strategy, tool, target, motion = scenes.hooking("L")
     flat = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]]), np.array([[0, 1, 2]]))
-    for bad in (replace(target, pieces=(flat,)), replace(target, world_from_object=np.full((4, 4), np.nan)), replace(target, world_from_object=np.eye(4))):
+    for bad in (
+        replace(target, pieces=(flat,)),
+        replace(target, world_from_object=np.full((4, 4), np.nan)),
+        replace(target, world_from_object=np.eye(4)),
+    ):
         verdict = judge(strategy, tool, bad, motion)
         assert verdict.code == Code.BAD_SCENE, verdict.message
         assert verdict.seconds < 1.0
