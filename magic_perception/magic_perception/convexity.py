@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +33,56 @@ def normals(points: NDArray[np.float32], eye: NDArray[np.float64], size: int = 7
     return normal
 
 
-def parts(points: NDArray[np.floating], normal: NDArray[np.floating], voxel: float = 0.008, angle: float = 12.0, least: float = 0.12) -> NDArray[np.int64]:
-    """Labels (N,) from 0 of the convexly connected parts of one cluster: points (N, 3) with normals (N, 3), NaN allowed.
+@dataclass(frozen=True)
+class Evidence:
+    """What must speak for two things where a concave seam parts one cluster; lengths in metres, angles in degrees.
+
+    A single thing has concave seams too: a handle meets a mug's side, a ladle's stem its bowl, a post its base.  Two parts
+    are two things only where the seam is long and sharp, both are bulky, and each could lie there alone: one carries
+    the other, or both reach the table.
+
+    seam: least pairs of voxels across the seam.  concave, bend: least share of them that bends inward by more than
+    ``sharp``, and least median bend, where one lies on the other; beside, beside_bend: the same where they stand side by side.
+    breadth, depth: least middle and smallest extent of each.  rest: slack between the top of one and the bottom of the
+    other.  floor: a part that begins below this height stands on the table.  neck: an upper part on the lower one's axis,
+    both round, and narrower than this share of it is its neck.
+    foot: least width of the lowest 25 mm of what stands on another part; a post grows out of its base.
+    """
+
+    seam: int = 24
+    sharp: float = 25.0
+    concave: float = 0.45
+    bend: float = 24.0
+    beside: float = 0.6
+    beside_bend: float = 40.0
+    breadth: float = 0.040
+    depth: float = 0.018
+    rest: float = 0.015
+    floor: float = 0.015
+    neck: float = 0.6
+    foot: float = 0.035
+
+
+def parts(
+    points: NDArray[np.floating],
+    normal: NDArray[np.floating],
+    heights: NDArray[np.floating],
+    voxel: float = 0.008,
+    angle: float = 12.0,
+    least: float = 0.12,
+    evidence: Evidence = Evidence(),
+) -> NDArray[np.int64]:
+    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table.
 
     Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, and
     where at least half of the voxels next to both agree.  Parts with less than ``least`` of all points go to the
-    neighbour they touch most: a handle is no thing of its own.
+    neighbour they touch most: a handle is no thing of its own.  What is left apart is joined again unless there is :class:`Evidence`.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    sound = np.isfinite(normal[:, 0])
+    sound = np.isfinite(normal[:, 0]) & np.isfinite(heights)
     if sound.sum() < 200:
         return np.zeros(len(points), np.int64)
     centre, index = clusters.thin(points[sound], voxel)
@@ -60,9 +100,9 @@ def parts(points: NDArray[np.floating], normal: NDArray[np.floating], voxel: flo
     d /= np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
     opening = np.sum((mean[a] - mean[b]) * d, axis=1)
     bend = np.degrees(np.arccos(np.clip(np.sum(mean[a] * mean[b], axis=1), -1, 1)))
-    convex = (opening > 0) | (bend < angle)
     # A voxel whose normals disagree lies on an edge itself: it tells nothing of convexity.
-    convex &= (length[a] > 0.8) & (length[b] > 0.8)
+    clear = (length[a] > 0.8) & (length[b] > 0.8)
+    convex = ((opening > 0) | (bend < angle)) & clear
     joined = coo_matrix((np.ones(convex.sum()), (a[convex], b[convex])), shape=(n, n)).tocsr()
     joined = joined + joined.T
     near = coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n)).tocsr()
@@ -72,25 +112,111 @@ def parts(points: NDArray[np.floating], normal: NDArray[np.floating], voxel: flo
     keep = convex & (agree >= 0.5 * common)
     graph = coo_matrix((np.ones(keep.sum()), (a[keep], b[keep])), shape=(n, n))
     _, part = connected_components(graph, directed=False)
-    weight = count.astype(float)
-    # Smallest first, into the neighbour with the longest common border.
-    while True:
-        sizes = np.bincount(part, weight)
-        small = [i for i in np.argsort(sizes) if 0 < sizes[i] < least * weight.sum()]
-        if not small:
-            break
-        for i in small:
-            across = part[b[part[a] == i]].tolist() + part[a[part[b] == i]].tolist()
-            across = [x for x in across if x != i]
-            target = max(set(across), key=across.count) if across else int(np.argmax(np.where(np.arange(len(sizes)) == i, -1, sizes)))
-            part[part == i] = target
-            break
-    part = np.unique(part, return_inverse=True)[1]
+    part = _join_small(part, a, b, count.astype(float), least)
+    if part.max() > 0:
+        height = np.bincount(index, heights[sound]) / count
+        part = _join_unproven(part, centre, mean, height, a, b, (opening < 0) & (bend > evidence.sharp), bend, clear, evidence)
     labels = np.zeros(len(points), np.int64)
     labels[sound] = part[index]
-    if (~sound).any():
+    if part.max() > 0 and (~sound).any():
         labels[~sound] = part[tree.query(points[~sound])[1]]
     return labels
+
+
+def _join_small(part: NDArray[np.int64], a: NDArray[np.int64], b: NDArray[np.int64], weight: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+    """Parts of too few points, smallest first, into the neighbour with the longest common border; without one into the largest part."""
+    part = np.unique(part, return_inverse=True)[1]
+    total = int(part.max()) + 1
+    sizes = np.bincount(part, weight)
+    border = np.zeros((total, total))
+    np.add.at(border, (part[a], part[b]), 1.0)
+    border = border + border.T
+    np.fill_diagonal(border, 0)
+    owner = np.arange(total)
+    while True:
+        small = np.nonzero((sizes > 0) & (sizes < least * weight.sum()))[0]
+        if len(small) == 0:
+            break
+        i = int(small[np.argmin(sizes[small])])
+        target = int(np.argmax(border[i])) if border[i].max() > 0 else int(np.argmax(np.where(np.arange(total) == i, -1, sizes)))
+        owner[owner == i] = target
+        sizes[target] += sizes[i]
+        sizes[i] = 0
+        border[target] += border[i]
+        border[:, target] += border[:, i]
+        border[i], border[:, i] = 0, 0
+        border[target, target] = 0
+    return np.unique(owner[part], return_inverse=True)[1]
+
+
+def _join_unproven(
+    part: NDArray[np.int64], centre: NDArray[np.float64], normal: NDArray[np.float64], height: NDArray[np.float64],
+    a: NDArray[np.int64], b: NDArray[np.int64], concave: NDArray[np.bool_], bend: NDArray[np.float64], clear: NDArray[np.bool_], evidence: Evidence,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Parts of voxels joined again, the least proven pair first, until there is evidence between all that touch."""
+    while part.max() > 0:
+        worst: tuple[float, int, int] | None = None
+        touching = np.zeros(int(part.max()) + 1, bool)
+        for i in range(int(part.max()) + 1):
+            for j in range(i):
+                across = ((part[a] == i) & (part[b] == j)) | ((part[a] == j) & (part[b] == i))
+                if not across.any():
+                    continue
+                touching[[i, j]] = True
+                told = across & clear
+                share = float(concave[told].mean()) if told.any() else 0.0
+                angle = float(np.median(bend[told])) if told.any() else 0.0
+                if int(told.sum()) < evidence.seam:
+                    share = 0.0
+                if not _two_things(centre, normal, height, part == i, part == j, share, angle, evidence) and (worst is None or share < worst[0]):
+                    worst = (share, i, j)
+        if worst is None:
+            # A gap in what was seen is no seam: a part that touches nothing belongs to the nearest.
+            lone = np.nonzero(~touching)[0]
+            if len(lone) == 0:
+                break
+            i = int(lone[0])
+            from scipy.spatial import cKDTree
+
+            others = np.nonzero(part != i)[0]
+            distance, nearest = cKDTree(centre[others]).query(centre[part == i])
+            worst = (0.0, i, int(part[others[nearest[np.argmin(distance)]]]))
+        part = np.where(part == worst[1], worst[2], part)
+        part = np.unique(part, return_inverse=True)[1]
+    return part
+
+
+def _two_things(
+    centre: NDArray[np.float64], normal: NDArray[np.float64], height: NDArray[np.float64],
+    first: NDArray[np.bool_], second: NDArray[np.bool_], share: float, angle: float, evidence: Evidence,
+) -> bool:  # fmt: skip
+    from magic_perception.primitives import fit_circle
+
+    if share < evidence.concave or angle < evidence.bend:
+        return False
+    for members in (first, second):
+        local = centre[members] - centre[members].mean(axis=0)
+        along = local @ np.linalg.svd(local, full_matrices=False)[2].T
+        extent = np.sort(np.percentile(along, 97, axis=0) - np.percentile(along, 3, axis=0))
+        if extent[1] < evidence.breadth or extent[0] < evidence.depth:
+            return False
+    lower, upper = (first, second) if np.median(height[first]) < np.median(height[second]) else (second, first)
+    bottom, top = float(np.percentile(height[upper], 2)), float(np.percentile(height[lower], 97))
+    if bottom < top - evidence.rest:
+        return bottom < evidence.floor and float(np.percentile(height[lower], 2)) < evidence.floor and share >= evidence.beside and angle >= evidence.beside_bend
+    foot = centre[upper & (height < bottom + 0.025), :2]
+    if len(foot) < 4 or float(np.ptp(foot @ np.linalg.svd(foot - foot.mean(axis=0), full_matrices=False)[2][0])) < evidence.foot:
+        return False
+    circles = []
+    for members in (lower, upper):
+        side = members & (np.abs(normal[:, 2]) < 0.7)
+        if side.sum() < 12:
+            return True
+        middle, radius = fit_circle(centre[side, :2])
+        circles.append((middle, radius, float(np.percentile(np.abs(np.linalg.norm(centre[side, :2] - middle, axis=1) - radius), 80))))
+    (c0, r0, e0), (c1, r1, e1) = circles
+    neck = e0 < 0.15 * r0 and e1 < 0.2 * r1 and r1 < evidence.neck * r0 and np.linalg.norm(c0 - c1) < 0.2 * r0
+    return not neck
 
 
 def insides(points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -27,7 +27,7 @@ class Parameters:
     resolution: cell of the occupancy grids that outlines come from.
     wall: assumed wall thickness of things that are seen to be hollow from above.
     use_color: refine masks by the colour difference to the table.
-    split: part touching objects at concave edges; off by default: it may part a mug's sides.
+    split: part touching objects where a long concave seam and their forms say that they are two (:class:`magic_perception.convexity.Evidence`).
     method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
     """
 
@@ -46,7 +46,7 @@ class Parameters:
     resolution: float = 0.0015
     wall: float = 0.003
     use_color: bool = True
-    split: bool = False
+    split: bool = True
     method: str = "completed"
     max_objects: int = 24
     seed: int = 0

@@ -92,7 +92,7 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--method", choices=METHODS, default="completed", help="reconstruction")
     parser.add_argument("--max-distance", type=float, default=1.3, help="how far from below the camera objects are looked for, m (default 1.3)")
     parser.add_argument("--camera-pose", help="world_from_camera as x,y,z,qx,qy,qz,qw (world z up); without, the table that is seen is the plane z = 0")
-    parser.add_argument("--split", action="store_true", help="part touching objects at concave seams")
+    parser.add_argument("--no-split", action="store_true", help="do not part touching objects at concave seams")
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
     given = parser.parse_args(args)
     try:
@@ -116,7 +116,7 @@ def main(args: list[str] | None = None) -> None:
             region_low=(-reach, -reach, -0.05) if not given.camera_pose else (-np.inf, -np.inf, -0.05),
             region_high=(reach, reach, 0.6) if not given.camera_pose else (np.inf, np.inf, 0.6),
             method=given.method,
-            split=given.split,
+            split=not given.no_split,
         )
         report = Report()
         scene = perceive([frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report)

@@ -62,7 +62,7 @@ class Perception(Node):
         device = p("device", "cpu", "torch device of the segmenter", read_only=True)
         method = p("method", "completed", "reconstruction", choices=METHODS, read_only=True)
         use_color = p("use_color", True, "refine masks by the colour difference to the table", read_only=True)
-        split = p("split", False, "part touching objects at concave seams (for cluttered tables; it may part the sides of a mug)", read_only=True)
+        split = p("split", True, "part touching objects at concave seams where their forms say that they are two", read_only=True)
         margin = p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1, read_only=True)
         min_height = p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1, read_only=True)
         seed = p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1, read_only=True)

@@ -325,7 +325,6 @@ class DepthSegmenter:
             labels[-1][known_pixels] = -1
         return _sizeable(labels, looks, parameters)
 
-
     @staticmethod
     def _split(looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]) -> NDArray[np.int64]:
         """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
@@ -340,7 +339,7 @@ class DepthSegmenter:
             mine = np.nonzero(instance == label)[0]
             if len(mine) < 1500 or np.percentile(heights[mine], 97) < 0.05:
                 continue
-            part = convexity.parts(cloud[mine], normal[mine])
+            part = convexity.parts(cloud[mine], normal[mine], heights[mine])
             for number in range(1, int(part.max()) + 1):
                 instance[mine[part == number]] = following
                 following += 1

@@ -295,6 +295,42 @@ def test_empty_table_and_bad_frames():
         Parameters(region_low=(0, 0, 0), region_high=(1, -1, 1))
 
 
+# ---------------------------------------------------------------- parting
+
+
+def solids(*boxes):
+    return [Mesh(b.vertices, b.faces) for b in boxes]
+
+
+def box(size, x, y, z=0.0, yaw=0.0):
+    made = trimesh.creation.box(size)
+    made.apply_transform(transforms.from_rpy(0, 0, yaw, [x, y, z + size[2] / 2]))
+    return made
+
+
+@pytest.mark.parametrize("family, seed", [("mug", 0), ("mug", 2), ("mug", 5), ("mug", 7), ("ladle", 0), ("ladle", 1), ("measuring_cup", 1), ("hammer", 0), ("mug_tree", 0)])
+def test_one_thing_is_not_parted(family, seed):
+    mesh = scenes.shape(family, seed, 0.5, 0.0, 0.7 * seed)
+    for names in (("left", "right"), ("left",)):
+        frames = [scenes.capture([mesh], name, i)[0] for i, name in enumerate(names)]
+        whole, parted = (len(perceive(frames, parameters=Parameters(split=split)).objects) for split in (False, True))
+        assert parted == whole
+        assert whole == 1 or len(names) == 1
+
+
+def test_what_lies_on_another_thing_is_parted():
+    scene = [box((0.14, 0.12, 0.06), 0.5, 0.0, yaw=0.3), box((0.08, 0.07, 0.08), 0.5, 0.0, 0.06, yaw=0.5)]
+    frames = [scenes.capture(solids(*scene), name, i)[0] for i, name in enumerate(("left", "right"))]
+    assert len(perceive(frames).objects) == 2
+    assert len(perceive(frames, parameters=Parameters(split=False)).objects) == 1
+
+
+def test_a_neck_is_part_of_its_bottle():
+    bottle = primitives.revolve(np.array([[0.035, 0], [0.035, 0.12], [0.014, 0.13], [0.014, 0.19]]), np.array([0.5, 0.0]))
+    frames = [scenes.capture([bottle], name, i)[0] for i, name in enumerate(("left", "right"))]
+    assert len(perceive(frames).objects) == 1
+
+
 # ---------------------------------------------------------------- time, registration, frames
 
 
