@@ -25,9 +25,10 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_planner import timing
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, convex_shapes, mass_centre, merged, solid_pieces
+from magic_planner.cloud import CloudSettings, cloud_name, unexplained
+from magic_planner.collision import Body, mass_centre, shell, solid_pieces
 from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
-from magic_planner.object_motion import table_plane, tool_contact_frame, waypoint_times
+from magic_planner.object_motion import table_plane, tool_contact_frame, turning, waypoint_times
 from magic_planner.robot import Robot
 
 Array = NDArray[np.float64]
@@ -83,13 +84,19 @@ class Request:
     poses: Array  # (T, 4, 4)
     keys: NDArray[np.int64]  # (K,) indices into times
     met: float  # seconds at which the tool meets the target
-    shapes: list[Any]  # the tool's pieces
-    rough: list[Any]  # fewer and fuller ones, for the tool in the hand
+    shapes: list[Any]  # the tool's surface
+    marks: tuple[tuple[str, float], ...]  # names of the places the tool's motion passes, and when
+    cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
+
+    def surroundings(self, target: bool = True) -> list[str]:
+        """Names of all that is in the collision world besides table and tool; without the target on request."""
+        items = (self.target, *self.obstacles) if target else self.obstacles
+        return [item.id for item in items] + [cloud_name(item) for item in items if item.id in self.cloud]
 
     def place(self, index: int) -> str:
         """A sentence's name for a sample of the task: the waypoint it leads to."""
         now = float(self.times[index])
-        marks = waypoint_times(self.strategy)
+        marks = self.marks
         name = next((n for n, t in marks if t >= now - 1e-6), marks[-1][0])
         return f"waypoint {name!r} (at {now:.2f} s of the tool's motion)"
 
@@ -119,8 +126,15 @@ class Failures:
 class ArmPlanner:
     """Plans arm motions for one robot.  One request at a time; the same request and seed give the same plan."""
 
-    def __init__(self, robot: Robot, settings: ArmSettings | None = None, grasping: GraspSettings | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        settings: ArmSettings | None = None,
+        grasping: GraspSettings | None = None,
+        cloud: CloudSettings | None = None,
+    ) -> None:
         self.robot = robot
+        self.cloud = cloud or CloudSettings()
         self.settings = settings or ArmSettings()
         self.grasping = grasping or GraspSettings()
 
@@ -206,13 +220,14 @@ class ArmPlanner:
         release = next((p.start for p in motion.phases if p.name == "release"), None) if strategy.releases else None
         count = len(motion.times) if release is None else int(np.searchsorted(motion.times, release + 1e-9))
         times, poses = motion.times[:count], motion.world_from_tool[:count]
+        plane = table_plane(table)
         request = Request(
             strategy=strategy,
             tool=tool,
             target=target,
             obstacles=tuple(obstacles),
             motion=motion,
-            plane=table_plane(table),
+            plane=plane,
             start=start,
             seed=seed,
             budget=budget,
@@ -221,8 +236,9 @@ class ArmPlanner:
             poses=poses,
             keys=self._keys(poses),
             met=next((p.start for p in motion.phases if p.name in ("contact", "goal")), float(times[-1])),
-            shapes=convex_shapes(solid_pieces(tool)),
-            rough=convex_shapes(_rough(tool, poses[0], (target, *obstacles))),
+            shapes=shell(solid_pieces(tool)),
+            marks=waypoint_times(strategy),
+            cloud=unexplained((target, *obstacles), tool, plane, self.cloud),
         )
         self._build_world(request)
         robot.open_to(robot.config.opening)
@@ -265,12 +281,11 @@ class ArmPlanner:
     def _keys(self, poses: Array) -> NDArray[np.int64]:
         """Indices of task poses at most key_length and key_angle apart, the first and last among them."""
         keys = [0]
-        for i in range(1, len(poses)):
-            a, b = poses[keys[-1]], poses[i]
-            if np.linalg.norm(b[:3, 3] - a[:3, 3]) > self.settings.key_length or transforms.rotation_angle(a, b) > self.settings.key_angle:
-                keys.append(i - 1 if i - 1 > keys[-1] else i)
-        if keys[-1] != len(poses) - 1:
-            keys.append(len(poses) - 1)
+        while keys[-1] < len(poses) - 1:
+            rest = poses[keys[-1] + 1 : keys[-1] + 65]
+            far = np.linalg.norm(rest[:, :3, 3] - poses[keys[-1], :3, 3], axis=1) > self.settings.key_length
+            far |= turning(poses[keys[-1]], rest) > self.settings.key_angle
+            keys.append(keys[-1] + (max(1, int(far.argmax())) if far.any() else len(rest)))
         return np.array(keys)
 
     def _build_world(self, request: Request) -> None:
@@ -278,7 +293,9 @@ class ArmPlanner:
         robot.clear()
         robot.add_table(request.plane)
         for item in (request.target, *request.obstacles):
-            robot.add(item.id, convex_shapes(solid_pieces(item)), item.world_from_object)
+            robot.add(item.id, shell(solid_pieces(item)), item.world_from_object)
+            if item.id in request.cloud:
+                robot.add_cloud(cloud_name(item), request.cloud[item.id], self.cloud.resolution)
         robot.add(request.tool.id, request.shapes, request.tool.world_from_object)
 
     # ------------------------------------------------------------ grasps and the task
@@ -302,7 +319,12 @@ class ArmPlanner:
         settings = replace(self.grasping, density=request.strategy.physics.tool_density, force=force, standoff=self.settings.standoff)
         rng = np.random.default_rng(request.seed)
         clouds = {
-            item.id: transforms.apply(item.world_from_object, surface(solid_pieces(item), 200, rng)[0])
+            item.id: np.concatenate(
+                [
+                    transforms.apply(item.world_from_object, surface(solid_pieces(item), 200, rng)[0]),
+                    request.cloud.get(item.id, np.zeros((0, 3))),
+                ]
+            )
             for item in (request.target, *request.obstacles)
         }
         static, swept = [], [transforms.apply(transforms.inverse(request.tool.world_from_object), np.concatenate(list(clouds.values())))]
@@ -449,29 +471,31 @@ class ArmPlanner:
         if robot.world.has_object(name):
             robot.world.remove_object(name)
         robot.open_to(grasp.width)
-        robot.attach(name, request.rough, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
-        robot.allow(name, "table", request.target.id, *(o.id for o in request.obstacles), allowed=False)
+        robot.attach(name, request.shapes, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
+        robot.allow(name, "table", *request.surroundings(), allowed=False)
         self._ignore_target(request, False)
 
-    def _lay(self, request: Request, pose: Array, rough: bool = False) -> None:
+    def _lay(self, request: Request, pose: Array) -> None:
         """The world with the tool lying at a pose and the hand open about it; only the fingers may touch it."""
         robot, name = self.robot, request.tool.id
         robot.detach()
         robot.open_to(robot.config.opening)
-        robot.add(name, request.rough if rough else request.shapes, pose)
+        robot.add(name, request.shapes, pose)
         robot.allow(name, *robot.finger_links)
-        robot.allow(name, "table", request.target.id, *(o.id for o in request.obstacles))
+        robot.allow(name, "table", *request.surroundings())
         self._ignore_target(request, False)
 
     def _ignore_target(self, request: Request, ignored: bool) -> None:
         links = list(self.robot.planner.user_link_names)
         self.robot.allow(request.target.id, *links, allowed=ignored)
+        if request.target.id in request.cloud:
+            self.robot.allow(cloud_name(request.target), *links, allowed=ignored)
 
     def _check_task(self, request: Request, branch: Branch) -> None:
         robot = self.robot
         self._hold(request, branch.grasp)
         # The tool's own contacts are the task; physics judges them.  The arm's are not allowed.
-        robot.allow(request.tool.id, "table", request.target.id, *(o.id for o in request.obstacles))
+        robot.allow(request.tool.id, "table", *request.surroundings())
         met = int(np.searchsorted(request.times[request.keys], request.met + 1e-9))
         fixed = request.strategy.physics.target_is_fixed
         before = len(branch.path) if fixed else max(1, met)
@@ -562,7 +586,7 @@ class ArmPlanner:
             ways.append((back[::-1], q))
         self._hold(request, branch.grasp)
         # The tool leaves what it lies on.
-        robot.allow(request.tool.id, "table", request.target.id, *(o.id for o in request.obstacles))
+        robot.allow(request.tool.id, "table", *request.surroundings())
         for back, q in ways:
             for height in (settings.lift, settings.lift / 2):
                 up = self._straight(tip, height * request.plane[:3], q)
@@ -586,18 +610,9 @@ class ArmPlanner:
     # ------------------------------------------------------------ free motion
 
     def _come(self, request: Request, goal: Array) -> Array:
-        for rough in (True, False):
-            self._lay(request, request.tool.world_from_object, rough)
-            self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
-            if not (rough and (self.robot.collides(goal) or self.robot.collides(request.start))):
-                break
+        self._lay(request, request.tool.world_from_object)
+        self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
         return self._free(request, request.start, goal, "approach")
-
-    def _surround(self, request: Request, rough: bool) -> None:
-        """The target and the obstacles in the world, in their own pieces or in fewer and fuller ones."""
-        for item in (request.target, *request.obstacles):
-            pieces = solid_pieces(item)
-            self.robot.add(item.id, convex_shapes(merged(pieces, 6) if rough else pieces), item.world_from_object)
 
     def _carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
         self._hold(request, branch.grasp)
@@ -614,17 +629,6 @@ class ArmPlanner:
 
     def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
         """A collision-free joint path (n, J): straight where that is free, else by RRT-Connect and shortened."""
-        robot = self.robot
-        # Far from things their exact form does not matter, and a check of few pieces is quicker.
-        self._surround(request, True)
-        if robot.collides(start) or robot.collides(goal):
-            self._surround(request, False)
-        try:
-            return self._free_here(request, start, goal, stage)
-        finally:
-            self._surround(request, False)
-
-    def _free_here(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
         import mplib
 
         robot = self.robot
@@ -825,15 +829,6 @@ class StageError(Exception):
         super().__init__(str(error))
         self.stage = stage
         self.error = error
-
-
-def _rough(tool: SceneObject, start: Array, around: Sequence[SceneObject]) -> tuple[Mesh, ...]:
-    """The tool in few pieces, as long as these are clear of everything where the task starts and the exact ones are."""
-    exact = solid_pieces(tool)
-    few = merged(exact)
-    body = Body.from_pieces(tool.id, few)
-    body.move(start)
-    return exact if any(body.touches(Body.from_object(item)) for item in around) else few
 
 
 def _alike(a: Array, b: Array) -> bool:

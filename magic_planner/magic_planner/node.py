@@ -59,6 +59,7 @@ class PlannerNode(Node):
     def _load_arm(self) -> Any:
         """Declare the arm's parameters and load it, so that the first goal does not pay for it; raises BAD_REQUEST."""
         from magic_planner.arm import ArmPlanner, ArmSettings
+        from magic_planner.cloud import CloudSettings
         from magic_planner.grasps import GraspSettings
         from magic_planner.robot import PANDA_ACCELERATION, PANDA_HOME, Robot, RobotConfig
 
@@ -94,7 +95,14 @@ class PlannerNode(Node):
             dwell=parameter(self, "dwell", 0.5, "Seconds for the fingers to close or open.", low=0.0, high=10.0),
             time_step=parameter(self, "time_step", 0.02, "Seconds between the points of the trajectory.", low=0.002, high=0.2),
         )
-        planner = ArmPlanner(Robot(config), settings, grasping)
+        cloud = CloudSettings(
+            use=parameter(self, "use_cloud", True, "Avoid measured points that no reconstructed shape accounts for."),
+            resolution=parameter(self, "cloud.resolution", 0.01, "Metres, edge of a voxel of the cloud.", low=0.002, high=0.1),
+            margin=parameter(
+                self, "cloud.margin", 0.01, "Metres around shapes, tool and table in which points are left to these.", low=0.0, high=0.2
+            ),
+        )
+        planner = ArmPlanner(Robot(config), settings, grasping, cloud)
         planner.warm_up()
         self.get_logger().info(f"arm {config.urdf or 'panda'} ready after {time.monotonic() - started:.2f} s")
         return planner

@@ -218,10 +218,20 @@ def refined_times(
 ) -> NDArray[np.float64]:
     """The given times (T,) and as many between them as keep each step of poses (T, 4, 4) within length and angle."""
     moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turned = np.array([transforms.rotation_angle(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)])
+    turned = turning(poses[:-1], poses[1:])
     parts = np.maximum(1, np.ceil(np.maximum(moved / length, turned / angle) - 1e-9)).astype(int)
     inner = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(times[:-1], times[1:], parts, strict=True)]
     return np.concatenate([times[:1], *inner])
+
+
+def turning(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles (N,) in radians between the rotations of transforms (N, 4, 4) or (4, 4) and (N, 4, 4)."""
+    relative = np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]
+    skew = np.stack(
+        [relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0], relative[..., 1, 0] - relative[..., 0, 1]],
+        axis=-1,
+    )
+    return np.arctan2(np.linalg.norm(skew, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1)
 
 
 def waypoint_times(strategy: Strategy) -> tuple[tuple[str, float], ...]:

@@ -208,7 +208,7 @@ class Robot:
         self.planner.acm.clear()
 
     def add(self, name: str, shapes: Iterable[Any], world_from_object: NDArray[np.float64]) -> None:
-        """Put an object of FCL shapes (:func:`magic_planner.collision.convex_shapes`) into the world, or put it elsewhere."""
+        """Put an object of FCL shapes (:func:`magic_planner.collision.shell`) into the world, or put it elsewhere."""
         from mplib.collision_detection import fcl
 
         if self.world.has_object(name):
@@ -228,9 +228,11 @@ class Robot:
         self.allow(name, self.chain.base_link)
 
     def add_cloud(self, name: str, points: NDArray[np.float64], resolution: float) -> None:
-        """Put a point cloud (N, 3) into the world as an octree."""
+        """Put a point cloud (N, 3), world metres, into the world as an octree with voxels of edge ``resolution``."""
+        if self.world.has_object(name):
+            self.world.remove_object(name)
         if len(points):
-            self.world.add_point_cloud(name, np.asarray(points, dtype=float), resolution)
+            self.world.add_point_cloud(name, np.ascontiguousarray(points, dtype=float), resolution)
 
     def allow(self, first: str, *others: str, allowed: bool = True) -> None:
         """Let two things touch, or forbid it again."""

@@ -9,7 +9,7 @@ import pytest
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, hull, mass_centre, merged
+from magic_planner.collision import Body, hull, mass_centre
 from magic_planner.grasps import GraspSettings, antipodal, collision_free, in_the_way, propose
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -54,14 +54,11 @@ def test_slanted_faces_count_only_as_far_as_the_normals_agree():
     assert sides == [False, True]
 
 
-def test_the_mass_of_pieces_and_their_merging():
+def test_the_mass_of_pieces_and_the_outward_faces_of_hulls():
     pieces = [scenes.box([0.1, 0.1, 0.1], [0.05 + 0.1 * k, 0, 0]) for k in range(12)]
     volume, centre = mass_centre(pieces)
     assert volume == pytest.approx(0.012)
     np.testing.assert_allclose(centre, [0.6, 0, 0], atol=1e-9)
-    few = merged(pieces, 4)
-    assert len(few) <= 4
-    assert sum(mass_centre([p])[0] for p in few) == pytest.approx(0.012)
     vertices, faces = hull(pieces[0].vertices)
     corners = vertices[faces]
     assert np.all(
