@@ -12,25 +12,29 @@ from magic_perception import clusters
 
 
 def normals(points: NDArray[np.float32], eye: NDArray[np.float64], size: int = 7) -> NDArray[np.float32]:
-    """Unit normals (H, W, 3) of an organised cloud (H, W, 3), towards the eye, from differences of smoothed points; NaN at gaps and jumps."""
+    """Unit normals (H, W, 3) of an organised cloud (H, W, 3), towards the eye, from differences of smoothed points; NaN at gaps and jumps.
+
+    Computed at every second pixel; four pixels share one.
+    """
+    height, width = points.shape[:2]
     valid = np.isfinite(points[..., 0])
-    weight = cv2.blur(valid.astype(np.float32), (size, size))
-    smooth = cv2.blur(np.where(valid[..., None], points, 0).astype(np.float32), (size, size)) / np.maximum(weight, 1e-6)[..., None]
-    smooth[weight < 0.6] = np.nan
-    step = max(2, size // 2)
-    du = np.full_like(smooth, np.nan)
-    dv = np.full_like(smooth, np.nan)
-    du[:, step:-step] = smooth[:, 2 * step :] - smooth[:, : -2 * step]
-    dv[step:-step] = smooth[2 * step :] - smooth[: -2 * step]
-    normal = np.cross(du, dv)
+    weight = cv2.blur(valid.astype(np.float32), (size, size))[::2, ::2]
+    smooth = cv2.blur(np.where(valid[..., None], points, np.float32(0)), (size, size))[::2, ::2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        away = np.sum(normal * (points - eye.astype(np.float32)), axis=-1) > 0
+        x, y, z = (np.where(weight < 0.6, np.float32(np.nan), smooth[..., axis] / weight) for axis in range(3))
+        du, dv = ([np.full_like(x, np.nan) for _ in range(3)] for _ in range(2))
+        for axis, field in enumerate((x, y, z)):
+            du[axis][:, 2:-2] = field[:, 4:] - field[:, :-4]
+            dv[axis][2:-2] = field[4:] - field[:-4]
+        normal = [du[1] * dv[2] - du[2] * dv[1], du[2] * dv[0] - du[0] * dv[2], du[0] * dv[1] - du[1] * dv[0]]
+        length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        ex, ey, ez = eye.astype(np.float32)
+        away = normal[0] * (x - ex) + normal[1] * (y - ey) + normal[2] * (z - ez) > 0
         # Across a jump in depth there is no surface.
-        jump = np.maximum(np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1)) > 0.05
-    normal[away] *= -1
-    normal[jump] = np.nan
-    return normal
+        jump = (du[0] ** 2 + du[1] ** 2 + du[2] ** 2 > 0.05**2) | (dv[0] ** 2 + dv[1] ** 2 + dv[2] ** 2 > 0.05**2)
+        scale = np.where(jump, np.float32(np.nan), np.where(away, -1, 1) / length)
+        result = np.stack([n * scale for n in normal], axis=-1).astype(np.float32)
+    return np.repeat(np.repeat(result, 2, axis=0)[:height], 2, axis=1)[:, :width]
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,8 @@ class Evidence:
 
     seam: int = 24
     sharp: float = 25.0
-    concave: float = 0.45
-    bend: float = 24.0
+    concave: float = 0.4
+    bend: float = 20.0
     beside: float = 0.6
     beside_bend: float = 40.0
     breadth: float = 0.040

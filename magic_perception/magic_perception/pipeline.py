@@ -18,7 +18,7 @@ from magic_core.views import find_view
 from magic_perception import clusters
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
-from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, find_table, look
+from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
 
 
 @dataclass
@@ -66,7 +66,7 @@ def perceive(
     world_from_table = _frame_on(table, np.eye(4))
     if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and abs(table.heights(np.zeros(3))) < parameters.snap_height + 0.0:
         world_from_table = np.eye(4)
-    looks = [look(frame, plane, world_from_table, parameters) for frame, plane in zip(frames, own, strict=True)]
+    looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(frames, own, strict=True)), parameters.workers)
     report.seconds["table"] = time.perf_counter() - start
 
     start = time.perf_counter()
@@ -75,19 +75,26 @@ def perceive(
     report.labels = labels
     report.seconds["segment"] = time.perf_counter() - start
 
-    objects = []
-    for label in range(1, max((int(image.max()) for image in labels), default=0) + 1):
-        start = time.perf_counter()
+    start = time.perf_counter()
+
+    def build(label: int) -> tuple[SceneObject, str, int] | MagicError:
         try:
-            item, shape = _build(label, f"object_{len(objects) + 1}", looks, labels, world_from_table, parameters, report)
+            return _build(label, looks, labels, world_from_table, parameters)
         except MagicError as error:
-            report.notes.append(f"cluster {label} left out: {error.message}")
+            return error
+
+    objects = []
+    found = range(1, max((int(image.max()) for image in labels), default=0) + 1)
+    for label, built in zip(found, each(build, list(found), parameters.workers), strict=True):
+        if isinstance(built, MagicError):
+            report.notes.append(f"cluster {label} left out: {built.message}")
             for image in labels:
                 image[image == label] = 0
             continue
-        report.shapes[item.id] = shape
-        report.seconds["objects"] = report.seconds.get("objects", 0.0) + time.perf_counter() - start
+        item = replace(built[0], id=f"object_{len(objects) + 1}")
+        report.shapes[item.id], report.pixels[item.id] = built[1:]
         objects.append(item)
+    report.seconds["objects"] = time.perf_counter() - start
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
     stamp = max(frame.stamp for frame in frames)
     return Scene((*objects, *known), plane, stamp)
@@ -95,42 +102,40 @@ def perceive(
 
 def _build(
     label: int,
-    name: str,
     looks: list[Looked],
     labels: list[NDArray[np.int32]],
     world_from_table: NDArray[np.float64],
     parameters: Parameters,
-    report: Report,
-) -> tuple[SceneObject, str]:
+) -> tuple[SceneObject, str, int]:
+    """The object with that label, how its shape was found, and its pixels in the camera that saw most of it."""
     table_from_world = transforms.inverse(world_from_table)
     sights, clouds, paints, counts = [], [], [], []
     for looked, image in zip(looks, labels, strict=True):
         mask = image == label
-        counts.append(int(mask.sum()))
+        counts.append(int(np.count_nonzero(mask)))
         if counts[-1] < 20:
             continue
-        sigma = float(np.median(looked.sigma[mask]))
+        x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+        cut = (slice(y, y + h), slice(x, x + w))
+        sigma = float(np.median(looked.sigma[cut][mask[cut]][::7]))
         hidden = (image != 0) & ~mask
         sights.append(
             Sight(looked.frame.intrinsics, table_from_world @ looked.frame.world_from_camera, mask, hidden, looked.frame.depth, looked.heights, sigma)
         )
-        seen = mask & np.isfinite(looked.heights)
-        clouds.append(looked.points[seen])
-        paints.append(looked.frame.color[seen])
+        seen = mask[cut] & np.isfinite(looked.heights[cut])
+        clouds.append(looked.points[cut][seen])
+        paints.append(looked.frame.color[cut][seen])
     if not sights:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "pixels of the object", max(counts), "at least 20 in one camera")
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
-    keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.004)
+    keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
-    start = time.perf_counter()
     built = reconstruct(sights, parameters)
-    report.seconds["reconstruct"] = report.seconds.get("reconstruct", 0.0) + time.perf_counter() - start
     best = int(np.argmax(counts))
-    item = _as_object(name, built, points, colors, world_from_table)
+    item = _as_object(f"cluster_{label}", built, points, colors, world_from_table)
     cut = _cut_by_border(labels[best] == label)
     item = replace(item, mask=labels[best] == label, camera=looks[best].frame.camera, confidence=built.confidence * (0.6 if cut else 1.0))
-    report.pixels[name] = counts[best]
-    return item, built.shape
+    return item, built.shape, counts[best]
 
 
 def _cut_by_border(mask: NDArray[np.bool_]) -> bool:

@@ -86,7 +86,7 @@ def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64
 
 def convex_hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The corners (K, 2), counter-clockwise, of the hull of points (N, 2), by the monotone chain; fewer than 3 if they lie on a line."""
-    if len(points) > 100:
+    if len(points) > 30:
         hull = shapely.convex_hull(shapely.multipoints(points))
         points = np.asarray(hull.exterior.coords) if hull.geom_type == "Polygon" else np.asarray(hull.coords)
     ordered = sorted(set(map(tuple, points.tolist())))
@@ -107,7 +107,7 @@ def convex_hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def area_of(ring: NDArray[np.float64]) -> float:
     """Signed area of a ring (K, 2), positive where counter-clockwise."""
     x, y = ring[:, 0], ring[:, 1]
-    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
+    return float(np.dot(x[:-1], y[1:]) - np.dot(y[:-1], x[1:]) + x[-1] * y[0] - y[-1] * x[0]) / 2
 
 
 def convex_parts(polygon: Polygon, tolerance: float = 0.0) -> list[NDArray[np.float64]]:
@@ -149,7 +149,7 @@ def convex_parts(polygon: Polygon, tolerance: float = 0.0) -> list[NDArray[np.fl
                 continue
             area = area_of(hull)
             excess = area - filled[i] - filled[j]
-            perimeter = float(np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum())
+            perimeter = float(np.sqrt(np.sum(np.diff(hull, axis=0, append=hull[:1]) ** 2, axis=1)).sum())
             if excess <= 1e-10 + tolerance * perimeter / 2:
                 owner[j] = i
                 rings[i], areas[i], filled[i] = hull, area, filled[i] + filled[j]

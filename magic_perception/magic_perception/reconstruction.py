@@ -17,6 +17,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -49,6 +50,14 @@ class Sight:
     heights: NDArray[np.float32]
     sigma: float
 
+    @cached_property
+    def _soft(self) -> NDArray[np.float32]:
+        return self.mask.astype(np.float32)
+
+    @cached_property
+    def _blind(self) -> NDArray[np.uint8]:
+        return self.hidden.astype(np.uint8)
+
     @property
     def eye(self) -> NDArray[np.float64]:
         """(3,): where the camera is."""
@@ -69,8 +78,8 @@ class Sight:
         def at(field: NDArray, how: int, beyond: float) -> NDArray:
             return cv2.remap(field, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond).ravel()[:count].reshape(shape)
 
-        blind = at(self.hidden.astype(np.uint8), cv2.INTER_NEAREST, 1.0) > 0
-        inside = np.where(blind, np.float32(1), at(self.mask.astype(np.float32), cv2.INTER_LINEAR, 1.0))
+        blind = at(self._blind, cv2.INTER_NEAREST, 1.0) > 0
+        inside = np.where(blind, np.float32(1), at(self._soft, cv2.INTER_LINEAR, 1.0))
         return inside, blind, camera[..., 2].astype(np.float32), at(self.depth, cv2.INTER_NEAREST, float("nan"))
 
 
@@ -247,7 +256,7 @@ def _extruded(parts: list[Polygon], height: float, shape: str, confidence: float
 def _primitive(points: NDArray[np.float64], height: float, noise: float) -> Reconstruction | None:
     if height < 0.012 or height > 0.3:
         return None
-    sample = points[:: max(1, len(points) // 3000)]
+    sample = points[:: max(1, len(points) // 1500)]
     sample = sample[sample[:, 2] > min(0.004, 0.1 * height)]
     if len(sample) < 60:
         return None
@@ -459,27 +468,28 @@ def _round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: 
     index = index[rng.permutation(len(index))[:5000]]
     sample, eye = points[index], eyes[index]
     band = max(0.003, 2 * noise)
-    best, support = None, 0
     slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
     members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
     members = [m for m in members if len(m) > 20]
     if not members:
         return None
-    for _ in range(160):
-        m = members[rng.integers(len(members))]
-        p = sample[rng.choice(m, 3, replace=False), :2]
-        a = 2 * (p[1:] - p[0])
-        if abs(np.linalg.det(a)) < 1e-7:
-            continue
-        centre = np.linalg.solve(a, np.sum(p[1:] ** 2, axis=1) - p[0] @ p[0])
-        radius = np.linalg.norm(p[0] - centre)
-        if not 0.01 < radius < 0.12:
-            continue
-        count = int(np.sum(np.abs(np.linalg.norm(sample[:, :2] - centre, axis=1) - radius) < band * 1.5))
-        if count > support:
-            best, support = (centre, radius), count
-    if best is None:
+    # Circles through three points of one level, all hypotheses at once.
+    picked = np.stack([sample[members[i][rng.integers(len(members[i]), size=3)], :2] for i in rng.integers(len(members), size=160)])
+    a = 2 * (picked[:, 1:] - picked[:, :1])
+    rhs = np.sum(picked[:, 1:] ** 2, axis=2) - np.sum(picked[:, :1] ** 2, axis=2)
+    det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    sound = np.abs(det) > 1e-7
+    a, rhs, det, first = a[sound], rhs[sound], det[sound], picked[sound, 0]
+    centres = np.column_stack([rhs[:, 0] * a[:, 1, 1] - rhs[:, 1] * a[:, 0, 1], a[:, 0, 0] * rhs[:, 1] - a[:, 1, 0] * rhs[:, 0]]) / det[:, None]
+    radii = np.hypot(*(first - centres).T)
+    sound = (radii > 0.01) & (radii < 0.12)
+    centres, radii = centres[sound], radii[sound]
+    if len(radii) == 0:
         return None
+    few = sample[:1200]
+    rho = np.hypot(few[:, 0] - centres[:, :1], few[:, 1] - centres[:, 1:])
+    i = int(np.argmax(np.count_nonzero(np.abs(rho - radii[:, None]) < band * 1.5, axis=1)))
+    best = (centres[i], radii[i])
     origin = best[0]
     # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
     out, ray = sample[:, :2] - origin, eye[:, :2] - sample[:, :2]

@@ -7,8 +7,10 @@ table, helped by the table's own colour where depth is too coarse (a 4 mm hook) 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -23,6 +25,8 @@ from magic_perception.parameters import Parameters
 from magic_perception.table import Plane, fit_plane
 
 SEGMENTERS = ("depth", "sam2", "sam")
+
+T, R = TypeVar("T"), TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,14 @@ class Segmenter(Protocol):
         """Labels (H, W) int32 for each look: 0 none, i >= 1 the same thing in all cameras, -1 a known object."""
 
 
+def each(function: Callable[[T], R], items: list[T], workers: int) -> list[R]:
+    """``function`` of each item, in their order, by several threads: OpenCV, NumPy and Open3D work outside of Python's lock."""
+    if workers < 2 or len(items) < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(min(workers, len(items))) as pool:
+        return list(pool.map(function, items))
+
+
 def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean of values over a size x size window, counting only where weights are, and the share of the window that counts."""
     share = cv2.blur(weights, (size, size), borderType=cv2.BORDER_CONSTANT)
@@ -66,7 +78,12 @@ def find_table(frames: list[RgbdFrame], parameters: Parameters) -> tuple[Plane, 
     """
     clouds = []
     for frame in frames:
-        points = transforms.apply(frame.world_from_camera, frame.intrinsics.unproject(frame.depth)[::4, ::4].reshape(-1, 3))
+        k = frame.intrinsics
+        v, u = np.mgrid[0 : k.height : 4, 0 : k.width : 4]
+        z = frame.depth[::4, ::4].astype(float)
+        seen = np.isfinite(z)
+        u, v, z = u[seen], v[seen], z[seen]
+        points = transforms.apply(frame.world_from_camera, np.column_stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z]))
         low, high = np.asarray(parameters.region_low) - [0, 0, 0.05], np.asarray(parameters.region_high)
         with np.errstate(invalid="ignore"):
             keep = np.all((points > low) & (points < high), axis=1)
@@ -97,33 +114,45 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
     frame = RgbdFrame(frame.color, frame.depth, frame.intrinsics, pose, frame.camera, frame.stamp)
     k = frame.intrinsics
     table_from_camera = transforms.inverse(world_from_table) @ pose
-    v, u = np.mgrid[0 : k.height, 0 : k.width].astype(np.float32)
     z = frame.depth.astype(np.float32)
-    rays = np.stack([(u - np.float32(k.cx)) / np.float32(k.fx), (v - np.float32(k.cy)) / np.float32(k.fy), np.ones_like(u)], axis=-1)
-    points = (rays * z[..., None]) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
-    row = table_from_camera[2].astype(np.float32)
-    raw = z * (rays @ row[:3]) + row[3]
-    low, high = np.asarray(parameters.region_low, np.float32), np.asarray(parameters.region_high, np.float32)
-    with np.errstate(invalid="ignore"):
-        # Without depth a pixel counts as inside where its ray meets the table there.
-        reach = -row[3] / np.minimum(rays @ row[:3], -1e-3)
-        ground = (rays * reach[..., None]) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
-        where = np.where(np.isfinite(points[..., 2:]), points, ground)
-        inside = np.all((where > low) & (where < high), axis=-1) & (reach < 5.0)
+    across = ((np.arange(k.width) - k.cx) / k.fx).astype(np.float32)[None, :]
+    down = ((np.arange(k.height) - k.cy) / k.fy).astype(np.float32)[:, None]
+
+    def along(row: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(H, W): the dot product of ``row`` (3,) and each pixel's ray (x, y, 1)."""
+        x, y, one = row.astype(np.float32)
+        return across * x + (down * y + one)
+
+    row = table_from_camera[2]
+    fall = along(row[:3])
+    raw = z * fall + np.float32(row[3])
     valid = np.isfinite(raw)
-    zero = np.where(valid, raw, 0).astype(np.float32)
-    # Bias of depth over the table, which varies slowly over the picture.
+    points = np.empty((*z.shape, 3), np.float32)
+    # Without depth a pixel counts as inside where its ray meets the table there.
+    reach = np.float32(-row[3]) / np.minimum(fall, np.float32(-1e-3))
+    inside = reach < 5.0
+    with np.errstate(invalid="ignore"):
+        for axis in range(3):
+            ray, start = along(pose[axis, :3]), np.float32(pose[axis, 3])
+            points[..., axis] = z * ray + start
+            low, high = np.float32(parameters.region_low[axis]), np.float32(parameters.region_high[axis])
+            if np.isfinite(low) or np.isfinite(high):
+                where = np.where(valid, points[..., axis], reach * ray + start)
+                inside &= (where > low) & (where < high)
+    zero = np.where(valid, raw, np.float32(0))
+    # Bias of depth over the table, which varies slowly over the picture: a quarter of its resolution will do.
     near = (valid & (np.abs(zero) < 0.008)).astype(np.float32)
-    bias, share = masked_mean(zero, near, 81)
-    bias = np.where(share > 0.15, bias, 0)
-    raw = (raw - bias).astype(np.float32)
-    zero = np.where(valid, raw, 0).astype(np.float32)
+    small = (max(1, k.width // 4), max(1, k.height // 4))
+    count, total = (cv2.blur(cv2.resize(x, small, interpolation=cv2.INTER_AREA), (21, 21), borderType=cv2.BORDER_CONSTANT) for x in (near, near * zero))
+    bias = np.where(count > 0.15, total / np.maximum(count, 1e-6), 0).astype(np.float32)
+    raw = raw - cv2.resize(bias, (k.width, k.height))
+    zero = np.where(valid, raw, np.float32(0))
     # Smooth over nearby pixels of like height only: an edge of 10 mm must not smear.
     smooth, share = masked_mean(zero, valid.astype(np.float32), 3)
     heights = np.where(valid & (np.abs(smooth - zero) < 0.01), smooth, raw).astype(np.float32)
     flat = valid & (np.abs(zero) < 0.01) & inside
     with np.errstate(invalid="ignore"):
-        unit = np.abs(heights[flat]) / z[flat] ** 2 if flat.sum() > 100 else np.array([0.002])
+        unit = (np.abs(heights[flat]) / z[flat] ** 2)[::5] if flat.sum() > 500 else np.array([0.002])
         sigma = (1.4826 * np.median(unit) * z**2).astype(np.float32)
     return Looked(frame, points, raw, heights, inside, np.maximum(np.nan_to_num(sigma, nan=0.002), 3e-4))
 
@@ -146,6 +175,11 @@ def open_by_two(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cv2.dilate(cv2.erode(mask.astype(np.uint8), kernel, anchor=(0, 0)), kernel, anchor=(1, 1)) > 0
 
 
+def _total(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The sum over three channels, which numpy's own sum does slowly along a short axis."""
+    return values[..., 0] + values[..., 1] + values[..., 2]
+
+
 def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
     """How far each pixel's colour is from the table's around it, in squared standard deviations, and the threshold of notice.
 
@@ -162,9 +196,13 @@ def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np
         whole = small[weights > 0]
         mean[far], variance[far] = whole.mean(axis=0), whole.var(axis=0)
     size = lab.shape[1::-1]
-    mean, variance = cv2.resize(mean, size), cv2.resize(variance, size)
     # Floor: 3 grey levels of noise in lightness, 2 in colour.
-    distance = np.sum((lab.astype(np.float32) - mean) ** 2 / (variance + np.array([9.0, 4.0, 4.0], np.float32)), axis=-1)
+    weight = cv2.resize(1 / (variance + np.array([9.0, 4.0, 4.0], np.float32)), size)
+    offset = lab.astype(np.float32)
+    offset -= cv2.resize(mean, size)
+    offset *= offset
+    offset *= weight
+    distance = _total(offset)
     sample = distance[table]
     threshold = max(25.0, float(np.percentile(sample[::7], 99.7))) if len(sample) > 500 else np.inf
     return distance, threshold
@@ -237,27 +275,37 @@ def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_
     """
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     small = mask.astype(np.uint8)
-    band = (cv2.dilate(small, kernel) > 0) & ~(cv2.erode(small, kernel) > 0) & looked.inside
+    wide = cv2.dilate(small, kernel)
+    band = (wide > 0) & ~(cv2.erode(small, kernel) > 0) & looked.inside
     if not band.any():
         return mask
-    lab = cv2.cvtColor(looked.frame.color, cv2.COLOR_RGB2LAB).astype(np.float32)
     inner = (cv2.erode(small, np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
     # A thread of two pixels has no inside: its own pixels stand for it.
     thin = mask & (cv2.dilate(inner, np.ones((7, 7), np.uint8)) == 0)
     inner[thin] = 1.0
-    own, share = masked_mean(lab, inner, 13)
-    ground, ground_share = masked_mean(lab, (table & ~(cv2.dilate(small, np.ones((5, 5), np.uint8)) > 0)).astype(np.float32), 31)
-    difference = own - ground
-    length = np.sum(difference**2, axis=-1)
-    part = np.sum((lab - ground) * difference, axis=-1) / np.maximum(length, 1.0)
-    # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
-    rest = np.sum((lab - ground - part[..., None] * difference) ** 2, axis=-1)
-    told = band & ((rest < 9.0**2) | ~mask) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
-    # Grow only into what depth does not contradict, and by what touches the mask.
-    h = looked.heights
-    with np.errstate(invalid="ignore"):
-        possible = ~np.isfinite(h) | (h > -0.006)
-    result = np.where(told, (part > 0.5) & (mask | possible), mask)
+    free = (table & ~(cv2.dilate(small, np.ones((5, 5), np.uint8)) > 0)).astype(np.float32)
+    result = mask.copy()
+    # Each thing in its own window; the means look at most 15 pixels around, so that the windows change nothing.
+    _, _, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
+    for x, y, w, h, _ in stats[1:]:
+        margin = 16
+        r0, r1, c0, c1 = max(y - margin, 0), min(y + h + margin, mask.shape[0]), max(x - margin, 0), min(x + w + margin, mask.shape[1])
+        cut = (slice(r0, r1), slice(c0, c1))
+        lab = cv2.cvtColor(np.ascontiguousarray(looked.frame.color[cut]), cv2.COLOR_RGB2LAB).astype(np.float32)
+        own, share = masked_mean(lab, inner[cut], 13)
+        ground, ground_share = masked_mean(lab, free[cut], 31)
+        difference = own - ground
+        length = _total(difference**2)
+        offset = lab - ground
+        part = _total(offset * difference) / np.maximum(length, 1.0)
+        # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
+        rest = _total((offset - part[..., None] * difference) ** 2)
+        told = band[cut] & ((rest < 9.0**2) | ~mask[cut]) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
+        told[: y - r0], told[y - r0 + h :], told[:, : x - c0], told[:, x - c0 + w :] = False, False, False, False
+        # Grow only into what depth does not contradict, and by what touches the mask.
+        with np.errstate(invalid="ignore"):
+            possible = ~(looked.heights[cut] <= -0.006)
+        result[cut] = np.where(told, (part > 0.5) & (mask[cut] | possible), result[cut])
     count, labels = cv2.connectedComponents(result.astype(np.uint8), connectivity=8)
     touched = np.zeros(count, bool)
     touched[np.unique(labels[mask & result])] = True
@@ -306,7 +354,7 @@ class DepthSegmenter:
 
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`Segmenter`."""
-        masks = [foreground(looked, parameters) for looked in looks]
+        masks = each(lambda looked: foreground(looked, parameters), looks, parameters.workers)
         fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
         masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
         solid = [mask & np.isfinite(looked.heights) for mask, looked in zip(masks, looks, strict=True)]
@@ -328,17 +376,27 @@ class DepthSegmenter:
     @staticmethod
     def _split(looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]) -> NDArray[np.int64]:
         """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
-        if not any((looked.heights[s] > 0.05).sum() > 1500 for looked, s in zip(looks, solid, strict=True)):
-            return instance
-        normal = np.concatenate(
-            [convexity.normals(looked.points, looked.frame.world_from_camera[:3, 3])[s] for looked, s in zip(looks, solid, strict=True)]
-        )
         heights = np.concatenate([looked.heights[s] for looked, s in zip(looks, solid, strict=True)])
         following = int(instance.max(initial=-1)) + 1
-        for label in range(following):
-            mine = np.nonzero(instance == label)[0]
-            if len(mine) < 1500 or np.percentile(heights[mine], 97) < 0.05:
-                continue
+        members = [np.nonzero(instance == label)[0] for label in range(following)]
+        tall = [mine for mine in members if len(mine) >= 1500 and np.percentile(heights[mine], 97) >= 0.05]
+        if not tall:
+            return instance
+        flags = np.zeros(len(cloud), bool)
+        flags[np.concatenate(tall)] = True
+        normal = np.full((len(cloud), 3), np.nan, np.float32)
+        start = 0
+        for looked, s in zip(looks, solid, strict=True):
+            image = np.zeros(s.shape, np.uint8)
+            image[s] = flags[start : start + int(s.sum())]
+            x, y, w, h = cv2.boundingRect(image)
+            if w and h:
+                cut = (slice(max(y - 8, 0), y + h + 8), slice(max(x - 8, 0), x + w + 8))
+                field = np.full((*s.shape, 3), np.nan, np.float32)
+                field[cut] = convexity.normals(looked.points[cut], looked.frame.world_from_camera[:3, 3])
+                normal[start : start + int(s.sum())] = field[s]
+            start += int(s.sum())
+        for mine in tall:
             part = convexity.parts(cloud[mine], normal[mine], heights[mine])
             for number in range(1, int(part.max()) + 1):
                 instance[mine[part == number]] = following

@@ -53,9 +53,9 @@ def fit_plane(
     if len(points) < 100:
         raise MagicError(Code.NO_TABLE, "points for the table plane", len(points), "at least 100 with depth in the region of interest")
     rng = np.random.default_rng(seed)
-    if len(points) > sample:
-        points = points[rng.choice(len(points), sample, replace=False)]
-    corners = points[rng.integers(0, len(points), (iterations, 3))]
+    points = points[rng.permutation(len(points))[:sample]]
+    few = points[:1500]  # enough to rank hypotheses; the best is fitted to all
+    corners = few[rng.integers(0, len(few), (iterations, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     # Three points closer together than the noise say nothing of the normal.
@@ -71,7 +71,7 @@ def fit_plane(
         normals, offsets = normals * sign[:, None], offsets * sign
     if len(normals) == 0:
         raise MagicError(Code.NO_TABLE, "table plane", "no upright plane", f"a plane within {max_tilt} degrees of level")
-    support = np.sum(np.abs(points @ normals.T + offsets) < band, axis=0)
+    support = np.count_nonzero(np.abs(normals @ few.T + offsets[:, None]) < band, axis=1)
     best = int(np.argmax(support))
     coefficients = np.append(normals[best], offsets[best])
     for width in (band, band * 0.6, band * 0.6):
@@ -79,7 +79,8 @@ def fit_plane(
         if near.sum() < 50:
             break
         centre = points[near].mean(axis=0)
-        normal = np.linalg.svd(points[near] - centre, full_matrices=False)[2][2]
+        local = points[near] - centre
+        normal = np.linalg.eigh(local.T @ local)[1][:, 0]
         normal = normal if normal @ coefficients[:3] > 0 else -normal
         coefficients = np.append(normal, -normal @ centre)
     inliers = float(np.mean(np.abs(points @ coefficients[:3] + coefficients[3]) < band))

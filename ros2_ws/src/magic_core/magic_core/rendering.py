@@ -52,15 +52,15 @@ class Raycaster:
 
     def cast(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Cast:
         """Cast rays: origins and unit directions, each (H, W, 3) in world coordinates."""
-        rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).astype(np.float32)
+        rays = _rays(origins, directions)
         hits = self._scene.cast_rays(self._o3d.core.Tensor(rays))
         distance = hits["t_hit"].numpy()
         ids = hits["geometry_ids"].numpy().astype(np.int64)
         hit = np.isfinite(distance)
         ids = np.where(hit, ids, -1).astype(np.int32)
         normals = hits["primitive_normals"].numpy()
-        facing = np.sum(normals * rays[..., 3:], axis=-1, keepdims=True) > 0
-        normals = np.where(facing, -normals, normals)
+        facing = np.einsum("...i,...i->...", normals, rays[..., 3:]) > 0
+        normals[facing] *= -1
         color = np.zeros((*distance.shape, 3), dtype=np.uint8)
         primitives = hits["primitive_ids"].numpy()
         uv = hits["primitive_uvs"].numpy()
@@ -78,8 +78,7 @@ class Raycaster:
 
     def hits(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which rays, origins and directions each (..., 3) in world coordinates, meet any mesh: (...); quicker than :meth:`cast`."""
-        rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).astype(np.float32)
-        return self._scene.test_occlusions(self._o3d.core.Tensor(np.ascontiguousarray(rays))).numpy().astype(bool)
+        return self._scene.test_occlusions(self._o3d.core.Tensor(_rays(origins, directions))).numpy().astype(bool)
 
     def occluded(self, origins: NDArray[np.float64], direction: ArrayLike) -> NDArray[np.bool_]:
         """Whether anything lies on the way from points (N, 3) in one unit direction (3,): shadows."""
@@ -102,13 +101,20 @@ class Raycaster:
         size is (H, W); also returns depth (H, W) from the view plane, negative before it, NaN off the meshes.
         """
         height, width = size
-        v, u = np.mgrid[0:height, 0:width].astype(float)
-        plane = np.stack(
-            [(u - (width - 1) / 2) * metres_per_pixel, (v - (height - 1) / 2) * metres_per_pixel, np.full_like(u, -reach)], axis=-1
-        )
-        cast = self.cast(transforms.apply(world_from_view, plane), world_from_view[:3, 2])
+        u = (np.arange(width) - (width - 1) / 2) * metres_per_pixel
+        v = (np.arange(height) - (height - 1) / 2) * metres_per_pixel
+        x, y, z = world_from_view[:3, :3].T
+        start = world_from_view[:3, 3] - reach * z
+        cast = self.cast((u[:, None] * x)[None] + (v[:, None] * y + start)[:, None], z)
         depth = np.where(np.isfinite(cast.distance), cast.distance - reach, np.nan).astype(np.float32)
         return cast, depth
+
+
+def _rays(origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(..., 6): origins and directions side by side, as Open3D takes them."""
+    rays = np.empty((*np.broadcast_shapes(np.shape(origins), np.shape(directions))[:-1], 6), dtype=np.float32)
+    rays[..., :3], rays[..., 3:] = origins, directions
+    return rays
 
 
 def shade(cast: Cast, light: ArrayLike = (0.3, 0.2, 1.0), ambient: float = 0.45, background: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.uint8]:
@@ -141,6 +147,11 @@ def canonical_view(
     object_from_view = transforms.make(rotation, rotation @ ((low + high) / 2))
     metres_per_pixel = max(float((high - low)[:2].max()), 1e-6) / (fill * size)
     reach = float(high[2] - low[2]) / 2 + 0.01
-    cast, depth = Raycaster([mesh]).orthographic(object_from_view, (size, size), metres_per_pixel, reach)
+    # The object is centred: rays are needed only in the rectangle that it fills, two pixels of margin around it.
+    pad = np.maximum((size - 2 * np.ceil((high - low)[:2] / metres_per_pixel / 2).astype(int) - 4) // 2, 0)
+    cast, depth = Raycaster([mesh]).orthographic(object_from_view, (size - 2 * pad[1], size - 2 * pad[0]), metres_per_pixel, reach)
     image = shade(cast, light=-z + 0.4 * np.cross(y, z) - 0.3 * y)
-    return CanonicalView(image, cast.ids >= 0, metres_per_pixel, object_from_view, kind, depth, confidence)
+    border = ((pad[1], pad[1]), (pad[0], pad[0]))
+    return CanonicalView(
+        np.pad(image, (*border, (0, 0))), np.pad(cast.ids >= 0, border), metres_per_pixel, object_from_view, kind, np.pad(depth, border, constant_values=np.nan), confidence
+    )  # fmt: skip

@@ -26,7 +26,8 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
     silhouette shows a hole best, else the one that is least convex (a handle), else the widest; up is +z, and what
     sticks out lies to the right.  ``section``: the upright cut through the long horizontal axis of its plan, filled; the wider
     end (the bowl) lies to the right.  ``None`` decides: ``side`` for what stands and shows a hole or a handle from the
-    side but not from above, else ``top``.  ``pieces`` are used for the cut where the mesh is not watertight.
+    side but not from above, else ``top``.  ``pieces`` are used for the cut where the mesh is not watertight; one alone says
+    that the object is convex.
 
     ``confidence``: how far the chosen picture tells more than the alternatives; 1 where a hole decides it.
     Raises ``BAD_MESH`` for an empty mesh, ``BAD_REQUEST_IMAGE`` for an unknown kind.
@@ -45,6 +46,8 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
     width = float(np.linalg.norm(mesh.extents[:2]))
     if mesh.extents[2] < 0.3 * width:  # it lies on the table
         return _top(mesh, size, float(np.clip(1.0 - mesh.extents[2] / max(width, 1e-9), 0.5, 1.0)))
+    if pieces is not None and len(pieces) == 1:  # convex: no side tells more than another
+        return _top(mesh, size, 0.5)
     direction, told, confidence = _best_side(mesh)
     from_above = _tells(_silhouettes(Raycaster([mesh]), mesh, np.array([[0, 0, -1.0]]), np.array([0, 1.0, 0]))[0][0])
     if told > 1.2 * from_above and told > 0.03:
@@ -58,9 +61,10 @@ def _top(mesh: Mesh, size: int, confidence: float) -> CanonicalView:
 
 def _silhouettes(caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """The masks (D, P, P) of a mesh seen along directions (D, 3), and their metres per pixel (D,)."""
-    grid = np.stack(np.meshgrid(np.arange(_PROBE), np.arange(_PROBE)), axis=-1) - (_PROBE - 1) / 2
-    origins, scales = [], []
-    for direction in directions:
+    steps = np.arange(_PROBE) - (_PROBE - 1) / 2
+    rays = np.empty((len(directions), _PROBE, _PROBE, 6), np.float32)
+    scales = []
+    for ray, direction in zip(rays, directions, strict=True):
         y = transforms.unit(-(up - (up @ direction) * direction))
         rotation = np.column_stack([np.cross(y, direction), y, direction])
         local = mesh.vertices @ rotation
@@ -68,9 +72,12 @@ def _silhouettes(caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64],
         scale = max(float((high - low)[:2].max()), 1e-6) / (0.9 * _PROBE)
         middle = (low + high) / 2
         middle[2] = low[2] - 0.01
-        origins.append((np.concatenate([grid * scale, np.zeros((_PROBE, _PROBE, 1))], axis=-1) + middle) @ rotation.T)
+        across, down = steps * scale + middle[0], steps * scale + middle[1]
+        for axis in range(3):
+            ray[..., axis] = (rotation[axis, 0] * across + rotation[axis, 2] * middle[2])[None, :] + (rotation[axis, 1] * down)[:, None]
+        ray[..., 3:] = direction
         scales.append(scale)
-    return caster.hits(np.stack(origins), directions[:, None, None, :]), np.array(scales)
+    return caster.hits(rays[..., :3], rays[..., 3:]), np.array(scales)
 
 
 def holes_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
