@@ -9,7 +9,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        (f"share/{PACKAGE}/config", [f"config/{PACKAGE}.param.yaml"]),
+        (f"share/{PACKAGE}/config", ["config/verifier.param.yaml"]),
     ],
     install_requires=["setuptools"],
     zip_safe=False,

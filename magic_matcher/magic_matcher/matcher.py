@@ -16,6 +16,8 @@ from rclpy.node import Node
 from magic_core import conversions, qos, strategy
 from magic_core import node as nodes
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.strategy import Strategy
 from magic_matcher import features, matching
@@ -67,6 +69,14 @@ class MatcherNode(Node):
                 self._matcher.prepare(features.from_strategy(self._strategy(name)))
             except MagicError as error:
                 self.get_logger().warning(f"strategy {name} cannot be matched: {error}")
+        try:
+            # One match of a demonstration with itself, and one picture of a mesh, load what requests need beyond that.
+            found = self._strategy(names[0])
+            self._matcher.match(found, [matching.Tool("warm_up", found.tool_view)], found.target_view, 1)
+            corner = Mesh(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+            canonical_view(corner, np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]), "top")
+        except (IndexError, MagicError) as error:  # a request will be answered with the reason
+            self.get_logger().debug(f"warm-up: {error}")
         self.get_logger().info(f"strategies in {root}: {', '.join(names) or 'none'}")
 
     def _strategy(self, name: str) -> Strategy:

@@ -17,7 +17,7 @@ from visualization_msgs.msg import MarkerArray
 
 from magic_core import conversions as cv
 from magic_core import transforms
-from magic_core.camera import RgbdFrame
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
@@ -82,6 +82,7 @@ class Perception(Node):
                     raise MagicError(Code.BAD_REQUEST, f"parameter extrinsics.{camera}", numbers, "x y z and a unit quaternion x y z w")
                 self.given[camera] = transforms.from_quaternion(numbers[:3], numbers[3:])
         self.segmenter = make_segmenter(name, weights, device)
+        self.warm_up()
         self.streams = {camera: Stream(camera, tolerance, count) for camera in self.cameras}
         self.count = count
         self.buffer = TransformBuffer()
@@ -124,6 +125,21 @@ class Perception(Node):
         self.create_timer(1.0, self.on_report, callback_group=report)
         self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
 
+    def warm_up(self) -> None:
+        """Look at a small made-up scene, so that the first real one does not pay for loading the libraries."""
+        from magic_core import sensor, shapes
+
+        begin = time.monotonic()
+        try:
+            tool = shapes.make("l_hook", 1).mesh
+            tool = tool.transformed(transforms.make(translation=[0.5, 0.0, -tool.bounds[0, 2]]))
+            small = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
+            frame = sensor.capture([tool], small, sensor.looking_at([0.2, 0.0, 0.6], [0.5, 0.0, 0.0]), 0, camera="warm_up")
+            pc.markers(perceive([frame], (), self.parameters, self.segmenter, Report()))
+        except Exception as error:  # what is wrong will be told when real images come
+            self.get_logger().debug(f"warm-up: {describe(self, error)[1]}")
+        self.get_logger().debug(f"warmed up in {time.monotonic() - begin:.2f} s")
+
     # ------------------------------------------------------------ input
 
     def on_image(self, camera: str, what: str, msg: Image) -> None:
@@ -158,6 +174,8 @@ class Perception(Node):
                 intrinsics = cv.intrinsics_from_msg(msg)
                 if of_depth:
                     stream.depth_intrinsics = intrinsics
+                    stream.last[what] = now
+                    stream.counts[what] = stream.counts.get(what, 0) + 1
                     stream.clear(what)
                 else:
                     stream.info(intrinsics, now)
@@ -341,18 +359,21 @@ class Perception(Node):
             if what in stream.problems:
                 problem = stream.problems[what]
                 return pc.status(name, DiagnosticStatus.ERROR, f"[{int(problem.code)} {problem.code.name}] {problem.message}", problem.code, values)
-        for what in ("color", "depth", "camera_info"):
+        # What has never come explains more than what has stopped.
+        inputs = ("color", "depth", "camera_info", *(("depth_camera_info",) if "depth_camera_info" in self.topics[camera] else ()))
+        for what in sorted(inputs, key=lambda w: w in stream.last):
             silent = now - stream.last.get(what, self.started)
-            limit = self.patience if what != "camera_info" else math.inf
+            limit = math.inf if what.endswith("camera_info") else self.patience
             if what not in stream.last or silent > limit:
                 topic = self.topics[camera][what]
                 publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
-                other = [i.topic_type for i in publishers if i.topic_type != ("sensor_msgs/msg/CameraInfo" if what == "camera_info" else "sensor_msgs/msg/Image")]
+                expected = "sensor_msgs/msg/CameraInfo" if what.endswith("camera_info") else "sensor_msgs/msg/Image"
+                other = [i.topic_type for i in publishers if i.topic_type != expected]
                 if other:
                     why = f"published as {other[0]}"
                 else:
                     why = f"{len(publishers)} publishers" + (f", silent for {silent:.1f} s" if what in stream.last else ", nothing received")
-                code = Code.NO_CAMERA_INFO if what == "camera_info" else (Code.STALE_DATA if what in stream.last else Code.NO_FRAMES)
+                code = Code.NO_CAMERA_INFO if what.endswith("camera_info") else (Code.STALE_DATA if what in stream.last else Code.NO_FRAMES)
                 return pc.status(name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values)
         return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from magic_core import conversions as convert
@@ -31,9 +33,10 @@ class VerifierNode(Node):
     """Runs planned motions in physics, one at a time; a goal during another one is answered BUSY at once.
 
     Action server: ``verify_motion`` (magic_interfaces/action/VerifyMotion).  The goal
-    carries everything; the node keeps no state between goals.
+    carries everything.  The last verdict is kept: the same goal again, with ``want_film``
+    this time, is answered from what was recorded, as the same goal has the same verdict.
 
-    Parameters: see ``config/magic_verifier.param.yaml``.
+    Parameters: see ``config/verifier.param.yaml``.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -72,6 +75,7 @@ class VerifierNode(Node):
         )
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
         self._busy = threading.Lock()
+        self._last: tuple[bytes, Verdict] | None = None
         self._server = ActionServer(
             self,
             VerifyMotion,
@@ -148,6 +152,10 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
+        key = _key(goal)
+        if goal.want_film and self._last is not None and self._last[0] == key:
+            verdict = self._last[1]
+            return self._with_film(verdict, tool, target, obstacles, table)
         verdict = verify(
             strategy,
             tool,
@@ -169,14 +177,18 @@ class VerifierNode(Node):
         self.get_logger().info(
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
         )
-        film = Image()
-        if goal.want_film and verdict.recording is not None and verdict.code != Code.CANCELED:
-            try:
-                film = self._film(verdict, tool, target, obstacles, table)
-            except Exception as error:  # a picture that cannot be drawn changes no verdict
-                _, message = describe(self, error)
-                verdict = replace(verdict, message=f"{verdict.message}; no film: {message}")
-        return verdict, film
+        if verdict.code not in (Code.CANCELED, Code.SIMULATION_TIMEOUT):  # these depend on more than the goal
+            self._last = key, verdict
+        return self._with_film(verdict, tool, target, obstacles, table) if goal.want_film else (verdict, Image())
+
+    def _with_film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> tuple[Verdict, Image]:
+        if verdict.recording is None or verdict.code == Code.CANCELED:
+            return verdict, Image()
+        try:
+            return verdict, self._film(verdict, tool, target, obstacles, table)
+        except Exception as error:  # a picture that cannot be drawn changes no verdict
+            _, message = describe(self, error)
+            return replace(verdict, message=f"{verdict.message}; no film: {message}"), Image()
 
     def _film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> Image:
         from magic_verifier.film import film_strip
@@ -184,6 +196,16 @@ class VerifierNode(Node):
         caption = f"{verdict.code.name}: {verdict.message}"
         strip = film_strip(verdict.recording, tool, target, obstacles, table, frames=self._film_frames, caption=caption)
         return convert.image_to_msg(strip, "rgb8")
+
+
+def _key(goal: VerifyMotion.Goal) -> bytes:
+    """What of a goal its verdict depends on: all but the film and the time it may take."""
+    film, timeout = goal.want_film, goal.timeout
+    goal.want_film, goal.timeout = False, 0.0
+    try:
+        return hashlib.sha256(serialize_message(goal)).digest()
+    finally:
+        goal.want_film, goal.timeout = film, timeout
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView
 from magic_interfaces.action import VerifyMotion
 from magic_interfaces.msg import SceneObject as SceneObjectMsg
+from magic_verifier import node as verifier
 from magic_verifier.node import VerifierNode
 
 
@@ -39,12 +40,17 @@ def _save(folder, name, goal):
     )
 
 
+SIMULATED: list[int] = []
+
+
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory):
     """A verifier, an action client and the executor that spins both."""
     folder = tmp_path_factory.mktemp("strategies")
     _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
     _save(folder, "juggling", strategies.Goal("juggle"))
+    simulate = verifier.verify
+    verifier.verify = lambda *a, **k: SIMULATED.append(1) or simulate(*a, **k)
     rclpy.init()
     node = VerifierNode(parameter_overrides=[Parameter("strategies", value=str(folder))])
     peer = rclpy.create_node("peer")
@@ -56,6 +62,7 @@ def graph(tmp_path_factory):
     thread.start()
     assert client.wait_for_server(timeout_sec=20)
     yield client
+    verifier.verify = simulate
     executor.shutdown(timeout_sec=5)
     thread.join(timeout=5)
     client.destroy()
@@ -104,6 +111,18 @@ def test_a_good_motion_passes_with_metrics_film_and_feedback(graph):
     assert film.std() > 5
     assert "goal" in heard
     assert 0 < result.seconds < 20
+
+
+def test_the_film_of_the_last_goal_needs_no_second_simulation(graph):
+    first = ask(graph, goal_message(seed=5))
+    assert not len(first.film.data)
+    before = len(SIMULATED)
+    again = ask(graph, goal_message(seed=5, want_film=True, timeout=20.0))
+    assert len(SIMULATED) == before
+    assert len(again.film.data)
+    assert (again.code, again.message, again.metric_values) == (first.code, first.message, first.metric_values)
+    ask(graph, goal_message(seed=6, want_film=True))
+    assert len(SIMULATED) == before + 1
 
 
 def test_a_bad_motion_fails_with_its_reason(graph):

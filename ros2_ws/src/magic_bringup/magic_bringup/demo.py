@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from magic_bringup.graph import Graph, peak_memory
 #: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
 START_TIMEOUT = 120.0
 #: How long to wait for objects beyond the bag's own length, s.  The bag is played in a loop: a camera would go on, too.
-PATIENCE = 20.0
+#: Generous, as a busy machine takes its time; the shorter one holds once perception has said what is wrong.
+PATIENCE, PATIENCE_AFTER_ERROR = 60.0, 8.0
 #: Between the advertisement and the first message of the replay, s, so that the subscriptions have met their publishers.
 PLAYER_DELAY = 0.7
 
@@ -105,11 +106,25 @@ def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
     return tuple(t.name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)), (info.end - info.start) * 1e-9
 
 
+def perceive_seconds(heard: Mapping[str, float], topics: Collection[str], objects_at: float, replay_at: float) -> float:
+    """Seconds from the first whole set of one camera's ``topics`` to ``objects_at``; ``heard``: topic -> moment of its first message."""
+    cameras: dict[str, list[str]] = {}
+    for topic in topics:
+        match = CAMERA_TOPIC.match(topic)
+        if match:
+            cameras.setdefault(match["camera"], []).append(topic)
+    whole = [max(heard[t] for t in own) for own in cameras.values() if all(t in heard for t in own)]
+    before = [at for at in (*whole, *heard.values()) if at < objects_at]
+    begin = min([at for at in whole if at < objects_at] or before or [min(replay_at, objects_at)])
+    return objects_at - begin
+
+
 class Watcher:
     """The demo's own node: hears images and objects as they pass, and runs the action.  Spins in a thread of its own."""
 
     def __init__(self, topics: Sequence[str], say: Any) -> None:
         import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
         from magic_core import qos
         from magic_interfaces.action import RunStrategy
         from magic_interfaces.msg import SceneObjectArray
@@ -126,14 +141,18 @@ class Watcher:
         self.node = Node("demo")
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.changed = threading.Condition()
+        self._topics = tuple(topics)
         self.first: dict[str, tuple[float, bytes]] = {}
         self.scene: Any = None
         self.objects_at: float | None = None
+        self.complained_at: float | None = None
+        self.replay_at = time.monotonic()
         self.trajectory: Any = None
         self._last = ""
         self.node.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED)
         self.node.create_subscription(JointTrajectory, "verified_trajectory", self._on_trajectory, qos.LATCHED)
         self.node.create_subscription(MultiDOFJointTrajectory, "verified_tool_trajectory", self._on_trajectory, qos.LATCHED)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE)
         self._camera_subs = {}
         from sensor_msgs.msg import CameraInfo, Image
 
@@ -159,6 +178,15 @@ class Watcher:
                 self.objects_at = time.monotonic()
             self.changed.notify_all()
 
+    def _on_diagnostics(self, message: Any) -> None:
+        """Note since when perception has had frames but no objects; waiting for the first frames is no complaint."""
+        for status in message.status:
+            if status.name == "perception: scene":
+                code = next((v.value for v in status.values if v.key == "code"), "")
+                wrong = status.level != b"\x00" and code not in (Code.OK.name, Code.NO_FRAMES.name, str(int(Code.OK)), str(int(Code.NO_FRAMES)))
+                with self.changed:
+                    self.complained_at = (self.complained_at or time.monotonic()) if wrong else None
+
     def _on_trajectory(self, message: Any) -> None:
         with self.changed:
             self.trajectory = message
@@ -177,10 +205,14 @@ class Watcher:
         return {t: deserialize_message(data, Image) for t, (_, data) in self.first.items() if t.endswith("image_raw")}
 
     def perceive_seconds(self) -> float:
-        """From the first moment at which every camera had sent colour, depth and their camera_info, to the first objects seen by a camera."""
-        if self.objects_at is None or not self.first:
+        """From the first moment at which a camera had sent colour, depth and camera_info, to the first objects seen by a camera; 0 without any.
+
+        Where they came before this node had heard a whole set, which best-effort messages do not
+        exclude: from the first that it had heard, or else from the start of the replay.
+        """
+        if self.objects_at is None:
             return 0.0
-        return max(0.0, self.objects_at - max(at for at, _ in self.first.values()))
+        return perceive_seconds({t: at for t, (at, _) in self.first.items()}, set(self._topics), self.objects_at, self.replay_at)
 
     def ready(self) -> list[str]:
         """What of the graph is still missing."""
@@ -320,14 +352,17 @@ class Demo:
         self.say(f"replaying {options.bag}")
         player = graph.start("bag_player", "magic_bringup", "bag_player", str(options.bag), "--loop", "--delay", str(PLAYER_DELAY))
 
+        watcher.replay_at = time.monotonic() + PLAYER_DELAY
+
         def seen() -> bool:
-            return watcher.objects_at is not None or player.status is not None
+            waited = time.monotonic() - watcher.complained_at if watcher.complained_at is not None else 0.0
+            return watcher.objects_at is not None or player.status is not None or waited > PATIENCE_AFTER_ERROR
 
         self._wait(graph, watcher, seen, PLAYER_DELAY + self._length + PATIENCE)
         if player.status is not None:
             raise MagicError(Code.BAD_BAG, f"the bag cannot be played: {player.tail(1)}")
         if watcher.objects_at is None:
-            self.say(f"no objects within {self._length + PATIENCE:.1f} s")
+            self.say(f"no objects within {time.monotonic() - watcher.replay_at:.1f} s")
         else:
             ids = ", ".join(o.id for o in watcher.scene.objects)
             self.say(f"perceive: objects after {watcher.perceive_seconds():.2f} s: {ids}")

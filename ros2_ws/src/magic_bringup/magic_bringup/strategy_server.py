@@ -57,7 +57,7 @@ class StrategyServer(Node):
         self._top_k = parameter(self, "top_k", 3, "candidates to try where the goal does not say", low=1, high=50, read_only=True)
         self._attempts = parameter(self, "attempts", 3, "grasps to try for one contact (variant arm)", low=1, high=50, read_only=True)
         self._repetitions = parameter(self, "repetitions", 1, "simulations of one motion; above 1: perturbed ones", low=1, high=1000, read_only=True)
-        self._film = parameter(self, "film", True, "return the film strip of the last simulation, which is run once more for it", read_only=True)
+        self._film = parameter(self, "film", True, "return the film strip of the last simulation", read_only=True)
         self._timeout = parameter(self, "timeout", 120.0, "s for a whole run where the goal does not say", **seconds, read_only=True)
         self._presence = parameter(self, "server_timeout", 5.0, "s to wait for a server that is not there", **seconds, read_only=True)
         self._objects_timeout = parameter(self, "objects_timeout", 10.0, "s to wait for objects", **seconds, read_only=True)
@@ -408,21 +408,22 @@ class _Stages:
         return pipeline.Verdict(code, message, max(1, node._repetitions))
 
     def film(self, outcome_code: Code) -> Image | None:
-        """The film strip of the last simulation, which is run once more for it: with the same seed it goes the same way.
+        """The film strip of the last simulation: the verifier draws it from what it recorded when it gets the same goal again.
 
-        Drawing costs more than simulating, and only one of a run's simulations is looked at.
+        Drawing may cost more than simulating, and only one of a run's simulations is looked at.
         """
         node, goal = self._node, self._last_goal
         if goal is None or outcome_code in pipeline.FATAL:
             return None
-        goal.want_film, goal.repetitions = True, 1
+        goal.want_film = True
         try:
             result = node._verifier.call(goal, node._verify_timeout, self._token, node._presence, node._grace)
         except MagicError as error:
             node.get_logger().warning(f"no film: {error.message}")
             return None
-        if result.code != self._last_code and node._repetitions <= 1:
-            node.get_logger().warning(f"the simulation repeated for the film ended with {result.code} instead of {self._last_code}: {result.message}")
+        if result.code != self._last_code:  # another client came in between, and the repetition took too long, for one
+            node.get_logger().warning(f"no film: asked for it, the verifier answered {result.code} instead of {self._last_code}: {result.message}")
+            return None
         return result.film if len(result.film.data) else None
 
     def _obstacles(self, trial: pipeline.Trial, matches: pipeline.Matches) -> list[SceneObject]:
