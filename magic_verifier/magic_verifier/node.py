@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 import time
 from dataclasses import replace
@@ -12,7 +11,6 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from magic_core import conversions as convert
@@ -75,7 +73,7 @@ class VerifierNode(Node):
         )
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
         self._busy = threading.Lock()
-        self._last: tuple[bytes, Verdict] | None = None
+        self._last: tuple[VerifyMotion.Goal, Verdict] | None = None
         self._server = ActionServer(
             self,
             VerifyMotion,
@@ -152,10 +150,8 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
-        key = _key(goal)
-        if goal.want_film and self._last is not None and self._last[0] == key:
-            verdict = self._last[1]
-            return self._with_film(verdict, tool, target, obstacles, table)
+        if goal.want_film and self._last is not None and _same(goal, self._last[0]):
+            return self._with_film(self._last[1], tool, target, obstacles, table)
         verdict = verify(
             strategy,
             tool,
@@ -178,7 +174,7 @@ class VerifierNode(Node):
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
         )
         if verdict.code not in (Code.CANCELED, Code.SIMULATION_TIMEOUT):  # these depend on more than the goal
-            self._last = key, verdict
+            self._last = goal, verdict
         return self._with_film(verdict, tool, target, obstacles, table) if goal.want_film else (verdict, Image())
 
     def _with_film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> tuple[Verdict, Image]:
@@ -198,14 +194,14 @@ class VerifierNode(Node):
         return convert.image_to_msg(strip, "rgb8")
 
 
-def _key(goal: VerifyMotion.Goal) -> bytes:
-    """What of a goal its verdict depends on: all but the film and the time it may take."""
-    film, timeout = goal.want_film, goal.timeout
-    goal.want_film, goal.timeout = False, 0.0
+def _same(goal: VerifyMotion.Goal, other: VerifyMotion.Goal) -> bool:
+    """Whether two goals have the same verdict: alike in all but the film and the time they may take."""
+    kept = other.want_film, other.timeout
+    other.want_film, other.timeout = goal.want_film, goal.timeout
     try:
-        return hashlib.sha256(serialize_message(goal)).digest()
+        return goal == other
     finally:
-        goal.want_film, goal.timeout = film, timeout
+        other.want_film, other.timeout = kept
 
 
 def main() -> None:
