@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 from dataclasses import replace
@@ -73,7 +74,7 @@ class VerifierNode(Node):
         )
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
         self._busy = threading.Lock()
-        self._last: tuple[VerifyMotion.Goal, Verdict] | None = None
+        self._last: tuple[bytes, Verdict] | None = None
         self._server = ActionServer(
             self,
             VerifyMotion,
@@ -150,7 +151,8 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
-        if goal.want_film and self._last is not None and _same(goal, self._last[0]):
+        key = _key(goal)
+        if goal.want_film and self._last is not None and self._last[0] == key:
             return self._with_film(self._last[1], tool, target, obstacles, table)
         verdict = verify(
             strategy,
@@ -174,7 +176,7 @@ class VerifierNode(Node):
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
         )
         if verdict.code not in (Code.CANCELED, Code.SIMULATION_TIMEOUT):  # these depend on more than the goal
-            self._last = goal, verdict
+            self._last = key, verdict
         return self._with_film(verdict, tool, target, obstacles, table) if goal.want_film else (verdict, Image())
 
     def _with_film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> tuple[Verdict, Image]:
@@ -194,14 +196,31 @@ class VerifierNode(Node):
         return convert.image_to_msg(strip, "rgb8")
 
 
-def _same(goal: VerifyMotion.Goal, other: VerifyMotion.Goal) -> bool:
-    """Whether two goals have the same verdict: alike in all but the film and the time they may take."""
-    kept = other.want_film, other.timeout
-    other.want_film, other.timeout = goal.want_film, goal.timeout
-    try:
-        return goal == other
-    finally:
-        other.want_film, other.timeout = kept
+def _key(goal: VerifyMotion.Goal) -> bytes:
+    """What of a goal its verdict depends on: all but the film and the time it may take.
+
+    Neither serialised messages (their padding is undefined) nor ``==`` (not a number is
+    not itself, and stands for times that there are not) tell whether two goals are alike.
+    """
+    digest = hashlib.sha256()
+
+    def take(value: Any) -> None:
+        if hasattr(value, "get_fields_and_field_types"):
+            for name in value.get_fields_and_field_types():
+                if value is not goal or name not in ("want_film", "timeout"):
+                    take(getattr(value, name))
+        elif hasattr(value, "tobytes"):  # array.array and numpy.ndarray
+            data = value.tobytes()
+            digest.update(b"%d:" % len(data) + data)
+        elif isinstance(value, (list, tuple)):
+            digest.update(b"%d[" % len(value))
+            for item in value:
+                take(item)
+        else:
+            digest.update(repr(value).encode() + b";")
+
+    take(goal)
+    return digest.digest()
 
 
 def main() -> None:
