@@ -74,7 +74,7 @@ class VerifierNode(Node):
         )
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
         self._busy = threading.Lock()
-        self._last: tuple[bytes, Verdict] | None = None
+        self._last: tuple[VerifyMotion.Goal, Verdict] | None = None
         self._server = ActionServer(
             self,
             VerifyMotion,
@@ -151,8 +151,7 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
-        key = _key(goal)
-        if goal.want_film and self._last is not None and self._last[0] == key:
+        if goal.want_film and self._last is not None and _key(goal) == _key(self._last[0]):
             return self._with_film(self._last[1], tool, target, obstacles, table)
         verdict = verify(
             strategy,
@@ -176,7 +175,7 @@ class VerifierNode(Node):
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
         )
         if verdict.code not in (Code.CANCELED, Code.SIMULATION_TIMEOUT):  # these depend on more than the goal
-            self._last = key, verdict
+            self._last = goal, verdict
         return self._with_film(verdict, tool, target, obstacles, table) if goal.want_film else (verdict, Image())
 
     def _with_film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> tuple[Verdict, Image]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import signal
@@ -25,6 +26,7 @@ from magic_core.motion import VARIANTS
 
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, peak_memory
+from magic_bringup.pipeline import split_metrics
 
 #: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
 START_TIMEOUT = 120.0
@@ -82,6 +84,7 @@ def empty_summary(options: Options) -> dict[str, Any]:
 def candidate_summary(report: Any) -> dict[str, Any]:
     """One CandidateReport as plain data."""
     c = report.candidate
+    reason, metrics = split_metrics(report.message)
     return {
         "tool_id": c.tool_id,
         "score": round(c.score, 6),
@@ -92,7 +95,9 @@ def candidate_summary(report: Any) -> dict[str, Any]:
         "reflection": report.reflection,
         "stage": report.stage,
         "code": int(report.code),
-        "reason": f"{Code(report.code).name}: {report.message}" if report.message else Code(report.code).name,
+        "reason": f"{Code(report.code).name}: {reason}" if reason else Code(report.code).name,
+        # JSON knows no infinity.
+        "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
     }
 
 
@@ -243,7 +248,7 @@ class Watcher:
         return Pending(self, self.client.send_goal_async(goal, feedback_callback=self._on_feedback))
 
     def _on_feedback(self, message: Any) -> None:
-        line = f"{message.feedback.stage}: {message.feedback.message}"
+        line = f"{message.feedback.stage}: {split_metrics(message.feedback.message)[0]}"
         if line != self._last:
             self._last = line
             self._say(line)
@@ -375,7 +380,7 @@ class Demo:
             raise MagicError(Code.SERVER_TIMEOUT, f"the strategy_server (run_strategy) did not answer within {options.timeout + 30:g} s")
         result = self.record.result = pending.result
         summary = self.record.summary
-        summary.update(code=int(result.code), message=result.message, simulations=int(result.simulations))
+        summary.update(code=int(result.code), message=split_metrics(result.message)[0], simulations=int(result.simulations))
         summary["features"] = result.features or options.features
         summary["candidates"] = [candidate_summary(r) for r in result.candidates]
         times = result.times

@@ -11,6 +11,7 @@ the run; every trial before it leaves a :class:`Report` with its reason.
 from __future__ import annotations
 
 import heapq
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -150,6 +151,23 @@ class Outcome:
     seconds: dict[str, float] = field(default_factory=dict)
     features: str = ""
     heatmap: Any = None
+
+
+def with_metrics(message: str, metrics: Sequence[tuple[str, float]]) -> str:
+    """A verdict's sentence with what was measured behind it, in brackets: ``sentence [name value, name value]``."""
+    return message + (f" [{', '.join(f'{name} {value:.4g}' for name, value in metrics)}]" if metrics else "")
+
+
+def split_metrics(message: str) -> tuple[str, dict[str, float]]:
+    """The sentence and the measurements that :func:`with_metrics` joined; a message without them is all sentence."""
+    match = re.fullmatch(r"(.*) \[(\w+ [^\s,\]]+(?:, \w+ [^\s,\]]+)*)\]", message, re.DOTALL)
+    if match is None:
+        return message, {}
+    try:
+        pairs = [item.split(" ") for item in match[2].split(", ")]
+        return match[1], {name: float(value) for name, value in pairs}
+    except ValueError:
+        return message, {}
 
 
 class Stages(Protocol):

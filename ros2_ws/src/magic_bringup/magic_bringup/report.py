@@ -41,7 +41,10 @@ STYLE = """
 main{max-width:1180px;margin:0 auto;padding:28px 20px 60px}h1{font-size:26px;margin:0 0 4px}h2{font-size:18px;margin:0 0 12px}
 p{margin:4px 0 12px}.soft{color:var(--soft)}section,header{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:20px 22px;margin:0 0 18px}
 .badge{display:inline-block;padding:4px 12px;border-radius:999px;color:#fff;font-weight:600;font-size:14px}.good{background:var(--good)}.bad{background:var(--bad)}
-.row{display:flex;flex-wrap:wrap;gap:16px}figure{margin:0;flex:1 1 240px;min-width:0}figure img{width:100%;border-radius:8px;display:block;background:#0b0d11}
+.row{display:flex;flex-wrap:wrap;gap:16px}.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:16px}figure{margin:0;flex:1 1 240px;min-width:0}
+.metrics{display:grid;grid-template-columns:repeat(auto-fill,minmax(180px,1fr));gap:2px 18px;margin-top:6px;font-size:12.5px;color:var(--soft)}
+.metrics span{display:flex;justify-content:space-between;gap:8px;border-bottom:1px dotted var(--line)}.metrics b{font-weight:500;color:var(--ink);font-variant-numeric:tabular-nums}
+figure img{width:100%;border-radius:8px;display:block;background:#0b0d11}
 figcaption{font-size:13px;color:var(--soft);margin-top:6px}table{border-collapse:collapse;width:100%;font-size:14px}th,td{text-align:left;padding:7px 10px;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--soft);font-weight:600;white-space:nowrap}td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}tr.kept td{background:#eaf6f0}
 .bar{display:flex;height:26px;border-radius:8px;overflow:hidden;background:var(--line);margin:6px 0 10px}.bar div{color:#fff;font-size:12px;line-height:26px;padding-left:6px;white-space:nowrap;overflow:hidden}
@@ -126,7 +129,7 @@ def contact_picture(view: CanonicalView, contact: Contact, base: Image | None = 
     else:
         tangent = PICTURE * np.array([-normal[1], normal[0]])
         cv2.line(picture, fixed(at - tangent), fixed(at + tangent), CIRCLE, 2, cv2.LINE_AA, 4)
-    head = at + 60 * normal
+    head = at + 46 * normal
     for start, end in ((at, head), (head, head - 12 * normal + 7 * normal[::-1] * [1, -1]), (head, head - 12 * normal - 7 * normal[::-1] * [1, -1])):
         cv2.line(picture, fixed(start), fixed(end), NORMAL, 2, cv2.LINE_AA, 4)
     cv2.circle(picture, fixed(at), 16 * 6, (255, 255, 255), -1, cv2.LINE_AA, 4)
@@ -339,7 +342,7 @@ def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -
             target = scene.find(result.target_id)
             figures.append(_figure(contact_picture(target_view(target, strategy), candidate.target), f"{result.target_id}: its contact; r = {1000 * candidate.target.radius:.1f} mm"))
     note = "Point: the contact. Arrow: its outward normal. Circle: the circle of curvature."
-    return _section("From the demonstrated contact to the new one", f'<div class="row">{"".join(figures)}</div>', note)
+    return _section("From the demonstrated contact to the new one", f'<div class="cards">{"".join(figures)}</div>', note)
 
 
 def _meshes(scene: Scene, result: Any) -> str:
@@ -372,9 +375,29 @@ def _candidates(summary: dict[str, Any]) -> str:
         rows += (
             f'<tr class="{"kept" if c["code"] == 0 else ""}"><td class="n">{index}</td><td>{html.escape(c["tool_id"])}</td><td class="n">{c["score"]:.3f}</td>'
             f'<td class="n">{c["s_dino"]:.3f}</td><td class="n">{c["s_curv"]:.3f}</td><td class="n">{np.degrees(c["rotation"]):.0f}&deg;</td>'
-            f'<td>{face}</td><td>{c["stage"]}</td><td>{html.escape(c["reason"])}</td></tr>'
+            f'<td>{face}</td><td>{c["stage"]}</td><td>{html.escape(c["reason"])}{_metrics(c.get("metrics") or {})}</td></tr>'
         )
     return _section("Candidates, in the order in which they were tried", f"<table>{head}{rows}</table>")
+
+
+#: Units of what verifiers measure, by the name's last word; what is not here has none.
+UNITS = {"distance": "m", "drift": "m", "height": "m", "highest": "m", "overlap": "m", "contact": "m", "slip": "m", "shift": "m", "width": "m", "radius": "m",
+         "speed": "m/s", "turn": "rad", "error": "rad"}  # fmt: skip
+
+
+def _metrics(metrics: dict[str, float | None]) -> str:
+    """What was measured, in columns, lengths in mm."""
+    cells = ""
+    for name, value in metrics.items():
+        unit = UNITS.get(name.rsplit("_", 1)[-1], "")
+        if value is None:
+            shown = "not finite"
+        elif unit == "m":
+            shown = f"{1000 * value:.1f} mm"
+        else:
+            shown = f"{value:.3g} {unit}".strip()
+        cells += f"<span>{html.escape(name.replace('_', ' '))}<b>{shown}</b></span>"
+    return f'<div class="metrics">{cells}</div>' if cells else ""
 
 
 def _costs(summary: dict[str, Any]) -> str:

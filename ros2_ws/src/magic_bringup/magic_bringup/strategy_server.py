@@ -403,8 +403,7 @@ class _Stages:
         code = code_of(result.code)
         if code == Code.OK and not result.success:
             code = Code.GOAL_NOT_REACHED
-        values = ", ".join(f"{n} {v:.4g}" for n, v in zip(result.metric_names, result.metric_values))
-        message = result.message + (f" [{values}]" if values else "")
+        message = pipeline.with_metrics(result.message, list(zip(result.metric_names, result.metric_values)))
         return pipeline.Verdict(code, message, max(1, node._repetitions))
 
     def film(self, outcome_code: Code) -> Image | None:

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+from magic_bringup import pipeline
 from magic_bringup.pipeline import Agenda, Matches, Planned, Progress, Request, Run, Settings, Verdict, check, reflections_of
 from magic_core.errors import Code, MagicError
 
@@ -188,3 +189,16 @@ def test_agenda_is_empty_in_the_end():
     turn, trial = agenda.next()
     agenda.failed(turn, trial, Code.NO_IK)
     assert agenda.next() is None
+
+
+@pytest.mark.parametrize(
+    "sentence, metrics",
+    [
+        ("pulled 286 mm", [("pulled_distance", 0.2863), ("final_speed", 2.889e-05)]),
+        ("the tool hit the target: '10.0 N' (allowed: less than 5 N)", [("overlap", 0.0), ("grip_width", float("inf"))]),
+        ("objects holds 1 objects ['rod'] (allowed: two)", []),
+        ("one of ['fg', 'arm']", []),
+    ],
+)
+def test_measurements_are_told_apart_from_the_sentence(sentence, metrics):
+    assert pipeline.split_metrics(pipeline.with_metrics(sentence, metrics)) == (sentence, dict(metrics))
