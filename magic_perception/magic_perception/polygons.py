@@ -87,8 +87,9 @@ def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64
 def convex_hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The corners (K, 2), counter-clockwise, of the hull of points (N, 2), by the monotone chain; fewer than 3 if they lie on a line."""
     if len(points) > 30:
-        hull = shapely.convex_hull(shapely.multipoints(points))
-        points = np.asarray(hull.exterior.coords) if hull.geom_type == "Polygon" else np.asarray(hull.coords)
+        # OpenCV's hull works on 32-bit floats: it picks the candidates, of which the chain then takes the true corners.
+        local = (points - points.mean(axis=0)).astype(np.float32)
+        points = points[cv2.convexHull(local, returnPoints=False)[:, 0]]
     ordered = sorted(set(map(tuple, points.tolist())))
     if len(ordered) < 3:
         return np.array(ordered)

@@ -16,7 +16,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -537,12 +537,89 @@ def _round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: 
     return _Body(axis, np.column_stack([radii, levels]), bool(hollow))
 
 
+def _fit_to_silhouettes(body: _Body, sights: list[Sight], reach: float = 0.008) -> _Body:
+    """The body moved and scaled to the masks' edges, which the colour image puts to a pixel, where depth rounds them off.
+
+    At each level the two tangent rays of every camera tell the radius on the camera's left and right; where both are
+    seen, half of their difference moves the axis sideways.  A side without an edge near (a handle) says nothing.  The
+    far rim's upper edge tells the height.
+    """
+    axis, profile = body.axis, body.profile
+    levels = profile[:, 1]
+    inner = (levels > 0.1 * levels[-1]) & (levels < 0.97 * levels[-1])
+    steps = np.arange(-reach, reach + 2.5e-4, 5e-4)
+
+    def crossing(values: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The offset (N,) at which rows of mask values (N, S) fall below a half once and for all; NaN where they do not."""
+        below = values < 0.5
+        index = below.argmax(axis=1)
+        rows = np.arange(len(values))
+        sound = below.any(axis=1) & (index > 0) & ~(~below & (np.arange(values.shape[1]) > index[:, None])).any(axis=1)
+        before, after = values[rows, np.maximum(index - 1, 0)], values[rows, index]
+        share = np.clip((before - 0.5) / np.maximum(before - after, 1e-6), 0, 1)
+        return np.where(sound, steps[np.maximum(index - 1, 0)] + share * 5e-4, np.nan)
+
+    for _ in range(2):
+        radii = body.radius(levels)
+        sides, moves = [], []
+        for sight in sights:
+            away = axis - sight.eye[:2]
+            distance = max(float(np.linalg.norm(away)), 1e-6)
+            away = away / distance
+            right = np.array([away[1], -away[0]])
+            found = []
+            for sign in (-1, 1):
+                rho = radii[:, None] + steps
+                sine = np.clip(rho / distance, 0, 0.9)
+                tangent = axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * right)
+                inside, blind, _, _ = sight.sample(np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2))
+                edge = crossing(inside)
+                edge[blind.any(axis=1) | ~inner] = np.nan
+                found.append(edge)
+            middle = np.nanmedian(np.concatenate(found)) if np.isfinite(np.concatenate(found)).any() else 0.0
+            # Where a handle begins its edge is taken for the body's.
+            found = [np.where(np.abs(edge - middle) < 0.003, edge, np.nan) for edge in found]
+            sides += found
+            both = np.isfinite(found[0]) & np.isfinite(found[1])
+            if both.sum() >= 2:
+                moves.append((right, float(np.median((found[1] - found[0])[both]) / 2)))
+        if moves:
+            matrix = np.array([right for right, _ in moves] + [[0.05, 0], [0, 0.05]])
+            axis = axis + np.linalg.lstsq(matrix, np.array([move for _, move in moves] + [0, 0]), rcond=None)[0]
+        edges = np.stack(sides)
+        told = np.isfinite(edges)
+        if told.sum() >= 4:
+            # A line, so that the mask's ragged edge does not ruffle the profile.
+            where = np.broadcast_to(levels / levels[-1], edges.shape)[told]
+            slope, offset = np.polyfit(where, edges[told], 1) if np.ptp(where) > 0.4 else (0.0, float(np.median(edges[told])))
+            radii = np.maximum(radii + offset + slope * levels / levels[-1], 0.004)
+            profile = np.column_stack([radii, levels])
+        body = replace(body, axis=axis, profile=profile)
+    tops = []
+    for sight in sights:
+        away = axis - sight.eye[:2]
+        bearing = np.arctan2(away[1], away[0]) + np.linspace(-0.5, 0.5, 9)
+        rim = axis + profile[-1, 0] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+        heights = profile[-1, 1] + steps
+        spots = np.concatenate([np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2)
+        inside, blind, _, _ = sight.sample(spots)
+        edge = crossing(inside)
+        edge[blind.any(axis=1)] = np.nan
+        tops += edge[np.isfinite(edge)].tolist()
+    if len(tops) >= 5:
+        profile = profile.copy()
+        profile[:, 1] *= 1 + float(np.median(tops)) / profile[-1, 1]
+        body = replace(body, profile=profile)
+    return body
+
+
 def _standing_round(sights: list[Sight], points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction | None:
     body = _round_body(points, eyes, height, noise, parameters.seed)
     if body is None:
         return None
     if height > body.profile[-1, 1] + 0.012:
         return None
+    body = _fit_to_silhouettes(body, sights)
     # Of a band some part of the table inside shows to some camera.
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     spots = np.array([[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)])
@@ -682,73 +759,176 @@ def _handle(sights: list[Sight], out: NDArray[np.float64], body: _Body, paramete
     return bars, pieces
 
 
+def _silhouette(sight: Sight, middle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The thing's mask carried on to the upright plane through ``middle`` (2,) that faces the camera.
+
+    Returns the horizontal unit vectors (2,) away from the camera and to its right, and points (N, 2) on the silhouette's
+    left and right edges, row by row: distance to the right of ``middle``, height.
+    """
+    away = middle - sight.eye[:2]
+    away = away / max(np.linalg.norm(away), 1e-9)
+    right = np.array([away[1], -away[0]])
+    rows = np.nonzero(sight.mask.any(axis=1))[0]
+    first = sight.mask[rows].argmax(axis=1)
+    last = sight.mask.shape[1] - 1 - sight.mask[rows, ::-1].argmax(axis=1)
+    k = sight.intrinsics
+    edges = []
+    for u in (first - 0.5, last + 0.5):
+        rays = np.column_stack([(u - k.cx) / k.fx, (rows - k.cy) / k.fy, np.ones(len(rows))]) @ sight.table_from_camera[:3, :3].T
+        scale = ((middle - sight.eye[:2]) @ away) / np.maximum(rays[:, :2] @ away, 1e-6)
+        points = sight.eye + rays * scale[:, None]
+        edges.append(np.column_stack([(points[:, :2] - middle) @ right, points[:, 2]]))
+    return away, right, np.concatenate(edges)
+
+
+def _middle(sights: list[Sight], fronts: list[NDArray[np.float64]], start: NDArray[np.float64], height: float) -> NDArray[np.float64]:
+    """The upright axis (2,) of a standing thing: where the cameras' silhouettes have their middles, and, along each camera's
+    direction, where the seen fronts bend back to the silhouette's edges as the arcs of an ellipse do."""
+    middle = start
+    for _ in range(3):
+        matrix, value = [], []
+        for sight, points in zip(sights, fronts, strict=True):
+            away, right, edges = _silhouette(sight, middle)
+            band = edges[(edges[:, 1] > 0.15 * height) & (edges[:, 1] < 0.85 * height), 0]
+            if len(band) < 6 or len(points) < 30:
+                continue
+            low, high = np.median(band[: len(band) // 2]), np.median(band[len(band) // 2 :])
+            matrix.append(right)
+            value.append(right @ middle + (low + high) / 2)
+            part = points[(points[:, 2] > 0.15 * height) & (points[:, 2] < 0.85 * height)]
+            across = ((part[:, :2] - middle) @ right - (low + high) / 2) / max((high - low) / 2, 1e-3)
+            inner = np.abs(across) < 0.92
+            bulge = np.sqrt(1 - across[inner] ** 2)
+            far, depth = np.linalg.lstsq(np.column_stack([np.ones(len(bulge)), -bulge]), (part[inner, :2] - middle) @ away, rcond=None)[0]
+            # A flat front does not tell how thick the thing is: then as thick as a third of its width, at most as it is wide.
+            half = (high - low) / 2
+            depth = float(np.clip(depth, 0.33 * half, half))
+            far = float(np.median((part[inner, :2] - middle) @ away + depth * bulge))
+            matrix.append(0.4 * away)
+            value.append(0.4 * (away @ middle + far))
+        if not matrix:
+            return middle
+        matrix += [0.01 * np.array([1.0, 0]), 0.01 * np.array([0, 1.0])]
+        value += (0.01 * middle).tolist()
+        middle = np.linalg.lstsq(np.array(matrix), np.array(value), rcond=None)[0]
+    return middle
+
+
 def _layers(sights: list[Sight], points: NDArray[np.float64], height: float, parameters: Parameters) -> Reconstruction:
-    """A standing thing of any form: outlines of layers, each at least what lies above it, stacked."""
-    eye = np.mean([s.eye for s in sights], axis=0)
-    centre = points[:, :2].mean(axis=0)
-    view = centre - eye[:2]
-    view = view / max(np.linalg.norm(view), 1e-9)
-    side = np.array([-view[1], view[0]])
-    band = points[(points[:, 2] > 0.1 * height) & (points[:, 2] < 0.9 * height)]
-    band = band if len(band) > 50 else points
-    lateral, depth = band[:, :2] @ side, band[:, :2] @ view
-    left, right = np.percentile(lateral, [1, 99])
-    edge = [np.median(depth[lateral < left + 0.005]), np.median(depth[lateral > right - 0.005])]
-    middle = side * (left + right) / 2 + view * float(np.mean(edge))
-    mirrored = np.column_stack([2 * middle - points[:, :2], points[:, 2]])
+    """A standing thing of any form: convex outlines of layers, joined.
+
+    A layer holds what was seen of it, away from the mask's edge, where depth is not to be trusted, and the same turned by
+    half a turn about the upright axis, where no camera saw through that; the silhouettes bound its width.
+    """
+    fronts = []
+    for sight in sights:
+        inner = cv2.erode(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        cloud = surface(replace(sight, mask=inner))
+        fronts.append(cloud[cloud[:, 2] > -0.005])
+    seen = np.concatenate(fronts)
+    if len(seen) < 50:
+        seen = points
+    height = max(height, float(np.percentile(seen[:, 2], 99.5)))
+    middle = _middle(sights, fronts, np.median(seen[:, :2], axis=0), height)
+    mirrored = np.column_stack([2 * middle - seen[:, :2], seen[:, 2]])
     inside = np.ones(len(mirrored), bool)
     for sight in sights:
         shown, _, z, measured = sight.sample(mirrored)
         with np.errstate(invalid="ignore"):
             inside &= ~((shown < 0.3) | (measured > z + 0.015))
-    if inside.mean() > 0.8:
-        everything = np.concatenate([points, mirrored[inside]])
-        confidence = 0.7
-    else:
-        everything = points
-        confidence = 0.5
-    count = int(np.clip(height / 0.008, 3, 20))
+    confidence = 0.7 if inside.mean() > 0.8 else 0.5
+    everything = np.concatenate([seen, mirrored[inside]])
+    views = [_silhouette(sight, middle) for sight in sights]
+    count = int(np.clip(height / 0.008, 3, 24))
     levels = np.linspace(0, height, count + 1)
-    shapes: list[shapely.Geometry] = []
-    above: shapely.Geometry = Polygon()
-    for low, high in zip(levels[::-1][1:], levels[::-1][:-1], strict=True):
-        here = everything[(everything[:, 2] >= low - 0.003) & (everything[:, 2] <= high + 0.003), :2]
-        shape = above
-        if len(here) > 10:
-            hull = polygons.convex_hull(here)
-            if len(hull) > 2:
-                shape = Polygon(hull)
-                # Nothing hangs in the air: a layer carries what stands on it, unless it was seen to be narrower.
-                if not above.is_empty and shape.area < 0.6 * above.area:
-                    shape = above
-        if shape.is_empty:
-            continue
-        shapes.append(shape.simplify(0.0006))
-        above = shape
-    if not shapes:
+    turns = np.arange(_SIDES) * 2 * np.pi / _SIDES
+    rings: list[NDArray[np.float64] | None] = []
+    for z in levels:
+        half = height / count / 2 + 0.002
+        here = everything[np.abs(everything[:, 2] - np.clip(z, half, height - half)) < half, :2]
+        for away, right, edges in views:
+            row = edges[np.abs(edges[:, 1] - np.clip(z, half, height - half)) < half, 0]
+            if len(row) > 1 and len(here):
+                across = (here - middle) @ right
+                here = here[(across > row.min() - 0.001) & (across < row.max() + 0.001)]
+                if inside.mean() > 0.5:  # the edges themselves lie about beside the axis
+                    here = np.vstack([here, middle + right * row.min(), middle + right * row.max()])
+        rings.append(_ring(here, turns) if len(here) > 8 else None)
+    known = [i for i, ring in enumerate(rings) if ring is not None]
+    if not known:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "layers of one object", "empty", "points that span an area")
-    step = height / count
-    stack: list[tuple[shapely.Geometry, float, float]] = []
-    z = height
-    for shape in shapes:
-        if stack and stack[-1][0].symmetric_difference(shape).area < 0.06 * shape.area:
-            old, _, upper = stack[-1]
-            stack[-1] = (old if old.area > shape.area else shape, z - step, upper)
-        else:
-            stack.append((shape, z - step, z))
-        z -= step
-    pieces = [polygons.prism(polygons.convex_hull(np.asarray(s.exterior.coords)), max(low, 0.0), high) for s, low, high in stack if s.geom_type == "Polygon"]
-    if not pieces:
-        raise MagicError(Code.RECONSTRUCTION_FAILED, "layers of one object", "empty", "points that span an area")
-    mesh = concatenate(pieces)
-    if len(pieces) > 1:
-        try:
-            import trimesh
+    loft = np.stack([rings[min(known, key=lambda j: abs(j - i))] for i in range(len(levels))])
+    solid = np.concatenate([loft, np.repeat(levels[:, None, None], _SIDES, axis=1)], axis=2)
+    return Reconstruction(_lofted(solid), tuple(_loft_pieces(solid)), "layers", confidence)
 
-            # Layers overlap by a micrometre so that the union is one solid.
-            solids = [Mesh(p.vertices + [0, 0, 0] + np.where(p.vertices[:, 2:] == p.vertices[:, 2].max(), [0, 0, 1e-6], 0.0), p.faces).to_trimesh() for p in pieces]
-            joined = trimesh.boolean.union(solids, engine="manifold")
-            mesh = Mesh(joined.vertices, joined.faces)
-        except Exception:  # see _standing_round
-            pass
-    return Reconstruction(mesh, tuple(pieces), "layers", confidence)
+
+#: Corners of a layer's outline.
+_SIDES = 40
+
+
+def _ring(points: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The convex hull of points (N, 2) as a ring (len(turns), 2), its corners in fixed directions from the centroid; without the outermost 1 %."""
+    centre = np.median(points, axis=0)
+    reach = np.linalg.norm(points - centre, axis=1)
+    hull = polygons.convex_hull(points[reach <= np.percentile(reach, 99)])
+    if len(hull) < 3:
+        return None
+    outline = Polygon(hull)
+    if outline.area < 1e-6:
+        return None
+    centre = np.asarray(outline.centroid.coords[0])
+    local = hull - centre
+    following = np.roll(local, -1, axis=0)
+    edge = following - local
+    # Ray t d meets the line through a corner along its edge: the least t over edges that face the direction.
+    direction = np.column_stack([np.cos(turns), np.sin(turns)])
+    normal = np.column_stack([edge[:, 1], -edge[:, 0]])
+    facing = direction @ normal.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(facing > 1e-12, np.sum(normal * local, axis=1) / facing, np.inf)
+    return centre + direction * t.min(axis=1)[:, None]
+
+
+def _lofted(rings: NDArray[np.float64]) -> Mesh:
+    """The closed solid through rings (L, K, 3), counter-clockwise, from the bottom up."""
+    levels, k = rings.shape[:2]
+    i = np.arange(k)
+    j = (i + 1) % k
+    faces = []
+    for row in range(levels - 1):
+        a, b = row * k, (row + 1) * k
+        faces += [np.column_stack([a + i, a + j, b + j]), np.column_stack([a + i, b + j, b + i])]
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(axis=0, keepdims=True), rings[-1].mean(axis=0, keepdims=True)])
+    last = (levels - 1) * k
+    faces.append(np.column_stack([np.full(k, levels * k), j, i]))
+    faces.append(np.column_stack([np.full(k, levels * k + 1), last + i, last + j]))
+    return Mesh(vertices, np.concatenate(faces))
+
+
+def _loft_pieces(rings: NDArray[np.float64], tolerance: float = 0.004) -> list[Mesh]:
+    """Convex hulls of runs of rings (L, K, 3): a run grows upwards as long as its hull keeps within ``tolerance`` metres of the rings in it."""
+    pieces = []
+    start = 0
+    flat = rings[..., :2]
+    area = np.array([polygons.area_of(ring) for ring in flat])
+    perimeter = np.array([np.linalg.norm(ring - np.roll(ring, 1, axis=0), axis=1).sum() for ring in flat])
+    while start < len(rings) - 1:
+        stop = start + 1
+        while stop + 1 < len(rings):
+            fits = True
+            a, b = flat[start], flat[stop + 1]
+            for row in range(start + 1, stop + 1):
+                # The hull's section between the run's ends holds at least their blend.
+                share = (row - start) / (stop + 1 - start)
+                blend = polygons.area_of(polygons.convex_hull(np.concatenate([(1 - share) * a + share * b, flat[row]])))
+                if blend - area[row] > tolerance * perimeter[row] / 2:
+                    fits = False
+                    break
+            if not fits:
+                break
+            stop += 1
+        hull = _hull(rings[start : stop + 1].reshape(-1, 3))
+        if hull is not None:
+            pieces.append(hull)
+        start = stop
+    return pieces
