@@ -28,10 +28,18 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
+from magic_verifier.posing import PoseEntry, posed, read_poses
 
 TASKS = ("scooping", "hanging", "hooking")
 VARIANTS = ("fg", "arm", "fg_no_selection")
-METHODS = ("magic",)
+#: ``magic``: all of it.  ``no_verification``: the best-scored candidate is carried out, unseen by the verifier (which then only
+#: judges it).  ``no_two_step``: without the second curvature estimate and the convexity search.  ``global_only``: the best places
+#: of the global stage, neither refined nor ranked by curvature.
+METHODS = ("magic", "no_verification", "no_two_step", "global_only")
+#: Sideways velocity noise of hooking in target radii, the released code's own test.
+HOOK_NOISE = 1.0
+#: The released code asks a shorter pull of a watch (m).
+WATCH_DISTANCE = 0.1
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 #: Tools of each task: family and seeds; none of them is the tool of a demonstration.
 SPOONS = (("spoon", 11), ("spoon", 12), ("ladle", 11), ("ladle", 12), ("measuring_cup", 11), ("measuring_cup", 12))
@@ -39,6 +47,10 @@ HOOKS = (("scissors", 1), ("hanger", 1), ("caliper", 1), ("watch", 1))
 BALLS = (0.015, 0.035, 0.045)
 CYLINDERS = (0.015, 0.020, 0.025, 0.030, 0.035)
 MUGS = 134
+#: Sets of targets that ``--targets`` takes by name instead of a folder: seeds of the family.
+TARGET_SETS = {"mug_tree": tuple(range(3))}
+#: How far (m) from the post of a mug tree things are hung on its first peg, at least.
+PEG_REACH = 0.05
 #: Where tools lie when the arm takes them, and how long planning may take (s) and how many grasps are tried.
 TOOL_PLACE = (0.45, -0.32)
 PLANNING_TIME = 10.0
@@ -69,6 +81,7 @@ class Options:
     top_k: int
     noise: float | None
     strategies: str
+    scale: float = 1.0
 
 
 # ---------------------------------------------------------------- objects
@@ -77,7 +90,7 @@ class Options:
 def tool_names(options: Options) -> list[str]:
     """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``."""
     if options.objects:
-        return _meshes(options.objects)
+        return _meshes(options.objects, options.scale)
     if options.task == "scooping":
         return [f"{family}:{seed}" for family, seed in SPOONS]
     if options.task == "hanging":
@@ -87,6 +100,8 @@ def tool_names(options: Options) -> list[str]:
 
 def target_names(options: Options) -> list[str]:
     """Names of the targets: ``family:number``, ``demonstration``, or the paths of meshes under ``targets``."""
+    if options.targets in TARGET_SETS:
+        return [f"{options.targets}:{seed}" for seed in TARGET_SETS[options.targets]]
     if options.targets:
         return _meshes(options.targets)
     if options.task == "scooping":
@@ -94,12 +109,19 @@ def target_names(options: Options) -> list[str]:
     return ["demonstration"] if options.task == "hanging" else [f"cylinder:{radius:g}" for radius in CYLINDERS]
 
 
-def _meshes(folder: str) -> list[str]:
+def _meshes(folder: str, scale: float = 1.0) -> list[str]:
+    """Names ``folder//path@scale`` of the meshes under a folder."""
     root = Path(folder)
-    found = sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in (".obj", ".ply", ".stl", ".off"))
+    found = sorted(p.relative_to(root).as_posix() for p in root.rglob("*") if p.suffix.lower() in (".obj", ".ply", ".stl", ".off"))
     if not found:
-        raise MagicError(Code.BAD_REQUEST, "folder of meshes", folder, "a folder with obj, ply, stl or off files")
-    return found
+        raise MagicError(
+            Code.BAD_REQUEST, "folder of meshes", folder, f"a folder with obj, ply, stl or off files, or a set: {', '.join(TARGET_SETS)}"
+        )
+    poses = read_poses(root)
+    unknown = sorted(set(poses) - set(found) - {"default"})
+    if unknown:
+        raise MagicError(Code.BAD_REQUEST, f"{root / 'poses.yaml'}: mesh", unknown[0], found[:20])
+    return [f"{root}//{name}@{scale!r}" for name in found]
 
 
 def cases(options: Options) -> list[Case]:
@@ -113,12 +135,12 @@ def cases(options: Options) -> list[Case]:
 
 
 def _short(name: str) -> str:
-    return Path(name).stem if "/" in name else name
+    return name.rpartition("//")[2].rpartition("@")[0].rpartition(".")[0] if "//" in name else name
 
 
 def tool_object(name: str, index: int, kind: str) -> SceneObject:
     """The tool as an object that lies or stands on the table."""
-    mesh, pieces, shape = _load(name)
+    mesh, pieces, shape, _ = _load(name, kind)
     low, _ = mesh.bounds
     pose = transforms.make(translation=[*TOOL_PLACE, 0.0005 - float(low[2])])
     object_id = f"tool_{index + 1}"
@@ -129,18 +151,30 @@ def tool_object(name: str, index: int, kind: str) -> SceneObject:
     return SceneObject(object_id, mesh, pieces, pose, find_view(mesh, pieces, kind), source="known")
 
 
-def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneObject, ...]]:
-    """The target at the place of the demonstration's, on the table, and the fixtures around it."""
+@dataclass(frozen=True)
+class Meeting:
+    """Where on a target tools are to act: point, outward normal and view direction, each (3,), and the radius of curvature (m)."""
+
+    point: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    radius: float
+
+
+def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneObject, ...], Meeting | None]:
+    """The target at the place of the demonstration's, on the table, the fixtures around it, and where tools are to act
+    on it (object frame) where that is given rather than found in the target's silhouette."""
     from magic_core.shapes import make
     from magic_core.shapes.fixtures import demonstrated_pose, fixtures
 
     environment = strategy.environment
     pose = demonstrated_pose(environment)
+    meeting = None
     if name == "demonstration":
         entry = environment["target"]
         target = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("target", pose)
     else:
-        mesh, pieces, shape = _load(name)
+        mesh, pieces, shape, meeting = _load(name, None)
         pose = transforms.make(translation=[*pose[:2, 3], -float(mesh.bounds[0][2])])
         if shape is not None:
             target = shape.as_object("target", pose)
@@ -152,20 +186,57 @@ def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneOb
     # The contact point is where the silhouette reaches farthest along the target's normal.
     reach = corners @ strategy.target_normal
     contact = corners[reach > reach.max() - 1e-4].mean(axis=0)
-    return target, tuple(fixtures(environment, contact))
+    return target, tuple(fixtures(environment, contact)), meeting
+
+
+def met_at(meeting: Meeting, target: SceneObject, kind: str) -> Any:
+    """The matcher's Target for a given place: seen along the meeting's direction, the contact frame at its point."""
+    from magic_core.contact import Contact
+    from magic_core.rendering import canonical_view
+    from magic_matcher.matching import Target
+
+    along = transforms.unit(meeting.direction)
+    normal = transforms.unit(meeting.normal - (meeting.normal @ along) * along)
+    view = canonical_view(target.mesh, along, [0, 0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0, 0], kind)
+    frame = transforms.frame(meeting.point, normal, along)
+    picture = transforms.unit(normal @ view.object_from_view[:3, :2])
+    contact = Contact(view.pixels(meeting.point), picture, meeting.radius, False, 3.5 * meeting.radius, frame)
+    return Target(target.id, view, contact)
+
+
+def _peg(shape: Any) -> Meeting:
+    """The first peg of a mug tree, approached along it from its free end."""
+    region = shape.region("peg_1")
+    along = transforms.unit(region.points[0] - region.points[-1])
+    distance = np.linalg.norm(region.points[:, :2], axis=1)
+    fits = np.flatnonzero(distance >= PEG_REACH)
+    index = int(fits[0]) if len(fits) else len(region.points) - 1
+    return Meeting(region.points[index], region.normals[index], along, float(shape.parameters["peg_radius"]))
 
 
 @lru_cache(maxsize=256)
-def _load(name: str) -> tuple[Any, Any, Any]:
+def _load(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | None]:
+    """Mesh and pieces in the object frame, the Shape they came from (None: a file), and where to act on it if that is given."""
     from magic_core import shapes
 
-    if "/" in name:
+    if "//" in name:
         from magic_core.mesh import load
         from magic_verifier.decomposition import convex_pieces
 
-        mesh = load(name)
-        return mesh, convex_pieces(mesh), None
+        folder, _, rest = name.partition("//")
+        path, _, scale = rest.rpartition("@")
+        poses = read_poses(Path(folder))
+        entry = poses.get(path, poses.get("default", PoseEntry()))
+        entry = replace(entry, scale=entry.scale * float(scale))
+        mesh, object_from_mesh = posed(load(Path(folder) / path), kind, entry)
+        meeting = None
+        if entry.contact is not None:
+            point, normal, direction = entry.contact
+            turn = object_from_mesh[:3, :3]
+            meeting = Meeting(transforms.apply(object_from_mesh, entry.scale * point), turn @ normal, turn @ direction, 0.006)
+        return mesh, convex_pieces(mesh), None, meeting
     family, number = name.split(":")
+    meeting = None
     if family == "mug":
         shape = _mugs()[int(number)]
     elif family in ("sphere", "cylinder"):
@@ -175,7 +246,8 @@ def _load(name: str) -> tuple[Any, Any, Any]:
         shape = shapes.make(family, 0, **size)
     else:
         shape = shapes.make(family, int(number))
-    return shape.mesh, shape.pieces, shape
+        meeting = _peg(shape) if family == "mug_tree" else None
+    return shape.mesh, shape.pieces, shape, meeting
 
 
 @lru_cache(maxsize=1)
@@ -188,20 +260,33 @@ def _mugs() -> list[Any]:
 # ---------------------------------------------------------------- one case
 
 
-@lru_cache(maxsize=4)
-def _strategy(options: Options) -> Strategy:
+@lru_cache(maxsize=16)
+def _strategy(options: Options, tool: str = "") -> Strategy:
+    """The strategy with the goal test that it is evaluated by (see :func:`tested`)."""
     strategy = strategies.find(options.task, options.strategies or None)
-    if options.noise is not None and strategy.goal.test == "hook":
-        strategy = replace(strategy, goal=replace(strategy.goal, values={**strategy.goal.values, "noise": options.noise}))
-    return strategy
+    values = {**strategy.goal.values, **tested(options, tool)}
+    return replace(strategy, goal=replace(strategy.goal, values=values))
+
+
+def tested(options: Options, tool: str = "") -> dict[str, float]:
+    """The goal values that the evaluation sets itself for a tool: the released code's test of hooking."""
+    if options.task != "hooking":
+        return {}
+    values = {"noise": HOOK_NOISE if options.noise is None else options.noise}
+    if "watch" in tool.rpartition("//")[2]:
+        values["distance"] = WATCH_DISTANCE
+    return values
 
 
 @lru_cache(maxsize=4)
-def _matcher(features: str, weights: str) -> Any:
+def _matcher(features: str, weights: str, method: str) -> Any:
     from magic_matcher.features import load
     from magic_matcher.matching import Matcher
 
-    return Matcher(load(features, weights))
+    backend = load(features, weights)
+    if method == "global_only":
+        return Matcher(backend, weight=0.0, two_step=False)
+    return Matcher(backend, two_step=method != "no_two_step")
 
 
 @lru_cache(maxsize=1)
@@ -218,6 +303,8 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     """Match, plan and verify one case; the answer is plain data for ``results.json``."""
     import torch
 
+    from magic_matcher.matching import Tool, tool_view
+
     torch.set_num_threads(1)
     seconds = {"match": 0.0, "plan": 0.0, "verify": 0.0}
     tried: list[dict[str, Any]] = []
@@ -232,19 +319,28 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     try:
         strategy = _strategy(options)
         tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
-        target, obstacles = scene_for(strategy, case.target)
-        matcher = _matcher(options.features, options.weights)
-        matcher.prepare(_reference(strategy))
+        target, obstacles, meeting = scene_for(strategy, case.target)
+        matcher = _matcher(options.features, options.weights, options.method)
+        reference = _reference(strategy)
+        matcher.prepare(reference)
+        met = met_at(meeting, target, strategy.view) if meeting is not None else None
+        top_k = 1 if options.method == "no_verification" else options.top_k
         started = time.perf_counter()
-        found = matcher.match(strategy, tools, target, options.top_k)
+        if met is None:
+            found = matcher.match(strategy, tools, target, top_k)
+        else:
+            drawn = [Tool(tool.id, tool_view(tool, strategy.view)) for tool in tools]
+            found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.radius, started)
         seconds["match"] = time.perf_counter() - started
         answer["features"] = found.features
         by_id = {tool.id: (tool, name) for tool, name in zip(tools, case.tools, strict=True)}
         last = None
-        for candidate in found.candidates:
+        only_best = options.method == "no_verification"
+        for candidate in found.candidates[: 1 if only_best else None]:
             tool, name = by_id[candidate.tool_id]
-            for reflection in strategy.reflections if candidate.flipped else ("keep",):
-                entry, last, solved = _try(options, strategy, candidate, reflection, tool, target, obstacles, seconds, answer)
+            reflections = strategy.reflections if candidate.flipped else ("keep",)
+            for reflection in reflections[: 1 if only_best else None]:
+                entry, last, solved = _try(options, _strategy(options, name), candidate, reflection, tool, target, obstacles, seconds, answer)
                 tried.append({"tool": _short(name), "score": float(candidate.score), "reflection": reflection, **entry})
                 if solved:
                     answer["success"] = True
@@ -288,7 +384,7 @@ def _try(
 
     entry: dict[str, Any] = {"code": "", "message": ""}
     last = None
-    for attempt in range(ARM_ATTEMPTS if options.variant == "arm" else 1):
+    for attempt in range(ARM_ATTEMPTS if options.variant == "arm" and options.method != "no_verification" else 1):
         started = time.perf_counter()
         try:
             motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles)
@@ -367,6 +463,9 @@ def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
         "variant": options.variant,
         "method": options.method,
         "features": options.features,
+        "objects": options.objects or "the project's own",
+        "targets": options.targets or "the project's own",
+        "test": _test_sentence(options),
         "cases": len(done),
         "successes": good,
         "success_rate": good / len(done) if done else 0.0,
@@ -375,6 +474,19 @@ def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
         "simulations": sum(c["simulations"] for c in done),
         "mean_seconds": {s: float(np.mean([c["seconds"].get(s, 0.0) for c in done])) if done else 0.0 for s in stages},
     }
+
+
+def _test_sentence(options: Options) -> str:
+    """What success means here, in words and numbers."""
+    strategy = _strategy(options)
+    values = ", ".join(f"{key} {value:g}" for key, value in sorted(strategy.goal.values.items()))
+    own = ""
+    if options.task == "hooking":
+        noise = strategy.goal.values["noise"]
+        kicks = f"the target's sideways velocity is kicked by N(0, {noise:g} r) at every step" if noise > 0 else "no velocity noise"
+        same = " as in the released code" if noise == HOOK_NOISE else ", unlike the released code's test"
+        own = f"; {kicks}{same}; a watch must pull {WATCH_DISTANCE:g} m"
+    return f"goal test {strategy.goal.test} ({values}){own}"
 
 
 def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path: Path, columns: int = 4, most: int = 80) -> None:
@@ -469,17 +581,20 @@ def main(args: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="evaluate", description="Success rate of a task over a set of objects, in simulation.")
     parser.add_argument("--task", required=True, choices=TASKS)
     parser.add_argument("--variant", default="fg", choices=VARIANTS)
-    parser.add_argument("--method", default="magic", choices=METHODS)
+    parser.add_argument("--method", default="magic", choices=METHODS, help="magic, or an ablation of it")
     parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded or dinov2")
     parser.add_argument("--weights", default="", help="hub name or folder of the backend's weights")
-    parser.add_argument("--objects", default="", help="folder of tool meshes in metres, instead of the project's own set")
-    parser.add_argument("--targets", default="", help="folder of target meshes in metres, instead of the project's own set")
+    parser.add_argument("--objects", default="", help="folder of tool meshes, with or without poses.yaml, instead of the project's own set")
+    parser.add_argument("--scale", type=float, default=1.0, help="factor on the meshes of --objects")
+    parser.add_argument(
+        "--targets", default="", help=f"folder of target meshes, or a set ({', '.join(TARGET_SETS)}), instead of the project's own"
+    )
     parser.add_argument("--limit", type=int, default=0, help="only the first so many cases")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
     parser.add_argument("--top-k", type=int, default=3, help="candidates tried for a case")
     parser.add_argument(
-        "--noise", type=float, default=None, help="hooking: sideways velocity noise in target radii; by default the strategy's"
+        "--noise", type=float, default=None, help=f"hooking: sideways velocity noise in target radii; {HOOK_NOISE:g} by default"
     )
     parser.add_argument("--strategies", default="", help="folder of strategies; by default the installed ones")
     parser.add_argument("--no-films", action="store_true", help="draw no contact sheets")
@@ -497,6 +612,7 @@ def main(args: list[str] | None = None) -> None:
         given.top_k,
         given.noise,
         given.strategies,
+        given.scale,
     )
     try:
         evaluate(options, Path(given.out), given.limit, given.jobs, not given.no_films, lambda text: print(text, flush=True))

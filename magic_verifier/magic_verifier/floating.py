@@ -248,22 +248,44 @@ class FloatingRun:
             if depth > 0 and ((known := worst.get((name, early))) is None or depth > known.depth):
                 worst[(name, early)] = Intrusion(name, depth, time, early)
 
-        heights = np.einsum("tij,nj->tni", poses[:, :3, :3], setup.tool.corners) + poses[:, None, :3, 3]
-        below = -((heights @ setup.table[:3]) + setup.table[3]).min(axis=1)
+        corners = setup.tool.corners
+        heights = (setup.table[:3] @ poses[:, :3, :3]) @ corners.T  # (T, N): along the table's normal
+        below = -(heights.min(axis=1) + poses[:, :3, 3] @ setup.table[:3] + setup.table[3])
         for time, depth in zip(times, below, strict=True):
             note(TABLE, float(depth), float(time))
         others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}
         if setup.target_kind == STATIC:
             others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
-        if others:
+        near = _near(corners, poses, others)
+        if near.any():
             probe = Probe(setup.settings, list(setup.tool.hulls), others)
-            for index, (time, pose) in enumerate(zip(times, to_poses(poses), strict=True)):
+            for index, (time, pose) in enumerate(zip(times[near], to_poses(poses[near]), strict=True)):
                 if index % 32 == 0:
                     check(0.0)
                 name, depth = probe.deepest(pose)
                 if name:
                     note(name, depth, float(time))
         return tuple(worst.values())
+
+
+def _near(
+    corners: NDArray[np.float64], poses: NDArray[np.float64], others: dict[str, tuple[list[NDArray[np.float64]], NDArray[np.float64]]]
+) -> NDArray[np.bool_]:
+    """At which of the poses (T, 4, 4) the axis-aligned box of corners (N, 3) meets that of one of the bodies: (T,)."""
+    boxes = []
+    for hulls, world_from_object in others.values():
+        points = transforms.apply(world_from_object, np.concatenate(hulls))
+        boxes.append((points.min(axis=0), points.max(axis=0)))
+    near = np.zeros(len(poses), dtype=bool)
+    if not boxes:
+        return near
+    meets = np.ones((len(boxes), len(poses)), dtype=bool)
+    for axis in range(3):
+        along = poses[:, axis, :3] @ corners.T + poses[:, axis, 3:]
+        low, high = along.min(axis=1), along.max(axis=1)
+        for row, (box_low, box_high) in zip(meets, boxes, strict=True):
+            row &= (low <= box_high[axis]) & (high >= box_low[axis])
+    return meets.any(axis=0)
 
 
 def as_object(

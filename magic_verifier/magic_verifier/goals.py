@@ -195,20 +195,21 @@ class Scoop(GoalTest):
         super().__init__(strategy, run, rng)
         self.settle = self.values["settle"]
         self._highest = 0.0
-        self._touching: list[bool] = []
+        self._touching = False
 
     def observe(self, run: Any) -> None:
-        if run.world.steps % OBSERVE_EVERY == 0:
-            self._highest = max(self._highest, _height(run, TARGET))
-            self._touching.append(run.world.touching(TOOL, TARGET, TOUCH))
+        if run.world.steps % OBSERVE_EVERY:
+            return
+        self._highest = max(self._highest, float(run.world.position(TARGET)[2]))
+        # The ball rocks a little in the bowl: touched within the last tenth of a second counts.
+        if run.time >= run.duration + self.settle - 0.1:
+            self._touching = self._touching or run.world.touching(TOOL, TARGET, TOUCH)
 
     def judge(self, run: Any) -> Judgement:
         height = _height(run, TARGET)
         speed = float(np.linalg.norm(run.world.velocity(TARGET)))
         tool_speed = float(np.linalg.norm(run.world.velocity(TOOL)))
-        # The ball rocks a little in the bowl: touched within the last tenth of a second counts.
-        recent = self._touching[-max(1, int(0.1 * run.setup.settings.frequency / OBSERVE_EVERY)) :]
-        touching = any(recent)
+        touching = self._touching
         metrics = {
             "target_height": height,
             "highest": self._highest,

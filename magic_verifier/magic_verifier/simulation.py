@@ -54,9 +54,9 @@ class Settings:
     """
 
     frequency: float = 240.0
-    position_iterations: int = 16
-    velocity_iterations: int = 2
-    contact_offset: float = 0.002
+    position_iterations: int = 8
+    velocity_iterations: int = 1
+    contact_offset: float = 0.001
     rest_offset: float = 0.0
     restitution: float = 0.0
     max_depenetration_speed: float = 0.5

@@ -28,7 +28,7 @@ from magic_verifier.simulation import DYNAMIC, Settings
 #: Deadline and cancel request are looked at, and the state checked, every so many steps.
 CHECK_EVERY = 12
 #: Solver settings of the variants: a grip needs more iterations than a floating tool.
-DEFAULTS = {"fg": Settings(), "arm": Settings(position_iterations=25)}
+DEFAULTS = {"fg": Settings(), "arm": Settings(position_iterations=25, velocity_iterations=2, contact_offset=0.002)}
 #: Poses are recorded at this rate (Hz).
 RECORD_RATE = 30.0
 

@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
 pytest.importorskip("magic_matcher.matching")
 pytest.importorskip("magic_planner.object_motion")
 
+from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_core.shapes import make
 from magic_verifier import evaluate as ev
+from magic_verifier import posing
 from magic_verifier.decomposition import convex_pieces
 from magic_verifier.simulation import sphere_of, usable_pieces
 
@@ -107,3 +111,112 @@ def test_meshes_that_cannot_be_simulated_are_refused(mesh):
     with pytest.raises(MagicError) as error:
         convex_pieces(mesh)
     assert error.value.code == Code.BAD_MESH
+
+
+# ---------------------------------------------------------------- what is tested, and how
+
+
+def test_hooking_is_judged_by_the_released_codes_own_test():
+    hooking = replace(OPTIONS, task="hooking")
+    assert ev._strategy(hooking).goal.values["noise"] == 1.0
+    assert ev._strategy(hooking, "caliper:1").goal.values["distance"] == 0.2
+    assert ev._strategy(hooking, "watch:1").goal.values["distance"] == 0.1
+    assert ev._strategy(replace(hooking, noise=0.0)).goal.values["noise"] == 0.0
+    assert "as in the released code" in ev.summarise(hooking, [])["test"]
+    assert "unlike" in ev.summarise(replace(hooking, noise=0.5), [])["test"]
+
+
+@pytest.mark.parametrize("method", ev.METHODS)
+def test_every_method_runs_a_case(method):
+    options = replace(OPTIONS, task="hooking", variant="fg_no_selection", method=method)
+    answer = ev.run_case(options, ev.cases(options)[1])
+    assert answer["reason"] in Code.__members__, answer
+    assert answer["candidates"]
+    if method == "no_verification":
+        assert answer["simulations"] <= 1
+
+
+def test_a_mug_is_hung_on_a_mug_tree():
+    options = replace(OPTIONS, task="hanging", targets="mug_tree")
+    assert len(ev.cases(options)) == 3 * 134
+    answer = ev.run_case(options, ev.cases(options)[0])
+    assert answer["success"], answer
+
+
+# ---------------------------------------------------------------- folders of meshes
+
+
+def _folder(tmp_path, poses=None, turn=None):
+    """A folder with one mug, turned on its side, and perhaps poses.yaml."""
+    mug = make("mug", 1).mesh
+    (tmp_path / "mugs").mkdir()
+    mug.transformed(np.eye(4) if turn is None else turn).save(tmp_path / "mugs" / "mine.obj")
+    if poses is not None:
+        (tmp_path / "poses.yaml").write_text(yaml.safe_dump(poses))
+    return mug
+
+
+def test_a_mug_from_a_file_is_set_upright_and_hung(tmp_path):
+    turn = transforms.from_rpy(np.pi / 2, 0, 0)
+    _folder(tmp_path, turn=turn)
+    options = replace(OPTIONS, task="hanging", objects=str(tmp_path))
+    (case,) = ev.cases(options)
+    assert case.name == "mugs/mine"
+    tool = ev.tool_object(case.tools[0], 0, "side")
+    assert tool.mesh.extents == pytest.approx(make("mug", 1).mesh.extents, abs=1e-3)
+    answer = ev.run_case(options, case)
+    assert answer["success"], answer
+
+
+def test_poses_yaml_says_how_a_mesh_stands_and_how_large_it_is(tmp_path):
+    turn = transforms.from_rpy(0, np.pi / 2, 0)
+    contact = {"point": [0.0, 0.0, 0.02], "normal": [0, 0, 1], "direction": [1, 0, 0]}
+    entry = {"orientation": transforms.quaternion_xyzw(turn).tolist(), "scale": 0.5, "contact": contact}
+    mug = _folder(tmp_path, {"mugs/mine.obj": entry})
+    (name,) = ev.tool_names(replace(OPTIONS, task="hanging", objects=str(tmp_path), scale=2.0))
+    mesh, pieces, _, meeting = ev._load(name, "side")
+    assert mesh.extents == pytest.approx(np.abs(turn[:3, :3]) @ mug.extents, abs=1e-4)
+    assert np.abs(mesh.bounds.sum(axis=0)).max() < 1e-9
+    assert pieces
+    assert meeting.direction == pytest.approx(turn[:3, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [
+        {"mugs/mine.obj": {"scale": -1}},
+        {"mugs/mine.obj": {"scael": 1}},
+        {"mugs/mine.obj": {"orientation": [0, 0, 0]}},
+        {"mugs/mine.obj": {"contact": {"point": [0, 0, 0], "normal": [1, 0, 0], "direction": [2, 0, 0]}}},
+        {"mugs/other.obj": {"scale": 1}},
+        ["mugs/mine.obj"],
+    ],
+)
+def test_a_wrong_poses_yaml_is_refused_by_name(tmp_path, poses):
+    _folder(tmp_path, poses)
+    with pytest.raises(MagicError) as error:
+        ev.cases(replace(OPTIONS, task="hanging", objects=str(tmp_path)))
+    assert error.value.code == Code.BAD_REQUEST
+    assert "poses.yaml" in error.value.message
+
+
+@pytest.mark.parametrize(("family", "kind"), [("mug", "side"), ("spoon", "section"), ("measuring_cup", "section"), ("caliper", "top")])
+def test_the_canonical_pose_of_a_shape_that_is_upright_is_its_own(family, kind):
+    assert posing.canonical_turn(make(family, 2).mesh, kind) == pytest.approx(np.eye(4))
+
+
+@pytest.mark.parametrize(("family", "kind"), [("mug", "side"), ("spoon", "section"), ("hanger", "top")])
+def test_the_canonical_pose_of_a_turned_shape_brings_its_top_up(family, kind):
+    turn = transforms.from_rpy(0.7, 0.5, 0.3)
+    found = posing.canonical_turn(make(family, 3).mesh.transformed(turn), kind)
+    up = (found @ turn)[2, :3]
+    assert (abs(up[2]) if kind == "top" else up[2]) > np.cos(np.deg2rad(12))
+
+
+def test_a_cup_holds_what_is_inside_it():
+    cup = trimesh.creation.annulus(0.03, 0.034, 0.08)
+    bottom = trimesh.creation.cylinder(0.034, 0.004)
+    bottom.apply_translation([0, 0, -0.038])
+    mesh = trimesh.util.concatenate([cup, bottom])
+    assert posing.capacity(Mesh(mesh.vertices, mesh.faces)) == pytest.approx(np.pi * 0.03**2 * 0.076, rel=0.08)
+    assert posing.capacity(Mesh(cup.vertices, cup.faces)) == 0.0  # open below
