@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import threading
 import time
@@ -11,6 +12,7 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from magic_core import qos
 from magic_core import strategy as strategies
+from magic_core.conversions import time_from_msg
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
@@ -20,10 +22,11 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from magic_bringup import markers, pipeline
+from magic_bringup import execution, markers, pipeline
 from magic_bringup.remote import RemoteAction, RemoteService, Token
 
 #: Where perception's own explanation is looked for when no objects come.
@@ -45,6 +48,8 @@ class StrategyServer(Node):
         verified_trajectory (JointTrajectory, latched, variant arm), verified_tool_trajectory (MultiDOFJointTrajectory,
         latched, variant fg), strategy/markers (MarkerArray, latched), /diagnostics at 1 Hz.
         A trajectory is published only after the verifier has answered OK for it.
+        With ``execute``: ``execute_topic`` (JointTrajectory, not latched), what a joint_trajectory_controller of ros2_control
+        takes.  It gets a verified trajectory of the arm, and only while the arm stands at its start; fingers are not commanded.
 
     One goal runs at a time; a second one is answered BUSY.  Cancel is heeded between
     the stages and inside them: it is forwarded to the running plan or verify goal.
@@ -65,6 +70,10 @@ class StrategyServer(Node):
         self._plan_timeout = parameter(self, "plan_timeout", 30.0, "s for one plan", **seconds, read_only=True)
         self._verify_timeout = parameter(self, "verify_timeout", 60.0, "s for one verification", **seconds, read_only=True)
         self._grace = parameter(self, "grace", 5.0, "s that an answer may come late before its server counts as dead", **seconds, read_only=True)
+        execute = parameter(self, "execute", False, "hand verified trajectories to the arm's controller", read_only=True)
+        topic = parameter(self, "execute_topic", "joint_trajectory_controller/joint_trajectory", "topic of the controller (JointTrajectory)", read_only=True)
+        self._start_tolerance = parameter(self, "start_tolerance", 0.02, "rad that a joint may be off the trajectory's start to execute it", low=0.0, high=0.5, read_only=True)
+        self._state_age = parameter(self, "state_age", 0.5, "s that joint_states may be old to execute a trajectory", low=0.01, high=10.0, read_only=True)
 
         group = ReentrantCallbackGroup()
         self._lock = threading.Lock()
@@ -72,6 +81,7 @@ class StrategyServer(Node):
         self._goals: dict[bytes, Token] = {}
         self._scene: SceneObjectArray | None = None
         self._joints: JointState | None = None
+        self._joints_came = -math.inf
         self._complaints: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._waiting: list[str] | None = None
 
@@ -85,6 +95,8 @@ class StrategyServer(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.RELIABLE)
         self._arm_pub = self.create_publisher(JointTrajectory, "verified_trajectory", qos.LATCHED)
         self._tool_pub = self.create_publisher(MultiDOFJointTrajectory, "verified_tool_trajectory", qos.LATCHED)
+        # Not latched: a controller that starts later must not find an order.
+        self._controller = self.create_publisher(JointTrajectory, topic, qos.RELIABLE) if execute else None
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self.create_timer(1.0, self._tick, callback_group=group)
         self._server = ActionServer(
@@ -105,7 +117,7 @@ class StrategyServer(Node):
         self._poke()
 
     def _on_joints(self, message: JointState) -> None:
-        self._joints = message
+        self._joints, self._joints_came = message, time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -236,6 +248,8 @@ class StrategyServer(Node):
         # First what somebody waits for, then the pictures.
         if outcome.verified and outcome.code == Code.OK and not token.canceled:
             self._publish(outcome.plan)
+            sentence, metrics = pipeline.split_metrics(result.message)
+            result.message = pipeline.with_metrics(sentence + self._execute_on_arm(outcome.plan), list(metrics.items()))
         if stages.scene is not None and stages.matches is not None:
             plan = outcome.plan or next((r.plan for r in reversed(outcome.reports) if r.plan is not None), None)
             self._marker_pub.publish(
@@ -254,6 +268,31 @@ class StrategyServer(Node):
             self._arm_pub.publish(plan.arm_trajectory)
         else:
             self._tool_pub.publish(plan.tool_trajectory)
+
+    def _execute_on_arm(self, plan: MotionPlan) -> str:
+        """Hand a verified plan to the arm's controller, where that is wanted; returns what is to be added to the message."""
+        if self._controller is None or plan.variant != MotionPlan.ARM:
+            return ""
+        try:
+            trajectory, state, topic = plan.arm_trajectory, self._joints, self._controller.topic_name
+            age = math.inf
+            if state is not None:
+                by_stamp = self.get_clock().now().nanoseconds * 1e-9 - time_from_msg(state.header.stamp)
+                age = max(time.monotonic() - self._joints_came, by_stamp, key=abs)
+            first = trajectory.points[0].positions if trajectory.points else []
+            names, positions = (state.name, state.position) if state is not None else ((), ())
+            execution.check_start(trajectory.joint_names, first, names, positions, age, self._start_tolerance, self._state_age)
+            if self._controller.get_subscription_count() == 0:
+                raise MagicError(Code.SERVER_UNAVAILABLE, f"subscribers of {topic}", 0, "a controller that takes the trajectory")
+            order = copy.copy(trajectory)
+            order.header = Header(frame_id=trajectory.header.frame_id)  # a stamp of 0: begin at once
+            self._controller.publish(order)
+        except Exception as error:
+            _, message = describe(self, error)
+            self.get_logger().error(f"not executed: {message}")
+            return f"; not executed: {message}"
+        self.get_logger().warning(f"executing: trajectory of {len(trajectory.points)} points sent to {topic}")
+        return f"; sent to {topic}"
 
     def destroy_node(self) -> None:
         """Let a run in progress end, so that its thread does not hold up the process."""

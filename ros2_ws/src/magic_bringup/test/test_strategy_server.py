@@ -75,6 +75,17 @@ class Bench:
         with self.heard:
             assert self.heard.wait_for(condition, timeout)
 
+    def until(self, condition, timeout=DEADLINE):
+        """Wait for what gives no event here."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    def wait_for_match(self, publisher):
+        """Wait until somebody listens to a publisher."""
+        self.until(lambda: publisher.get_subscription_count() > 0)
+
     def send(self, **goal):
         goal = {"strategy": "fake", "variant": "fg", "target_id": "object_2", **goal}
         future = self.client.send_goal_async(RunStrategy.Goal(**goal), feedback_callback=lambda m: self.feedback.append(m.feedback))
