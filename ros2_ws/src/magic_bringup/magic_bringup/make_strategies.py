@@ -117,7 +117,7 @@ def hooking() -> Strategy:
         tool_mesh=tool.mesh,
         target_mesh=target.mesh,
         waypoints=waypoints,
-        # The demonstration had no kicks; a round ball, other than a standing cylinder, would not bear them.
+        # The demonstration had no kicks; a ball, other than a standing cylinder, does not bear them (it passes with 1 of 5 seeds).
         goal=Goal("hook", {"distance": 0.2, "max_speed": 0.5, "noise": 0.0}),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
         environment={
@@ -184,9 +184,9 @@ def hanging() -> Strategy:
     )
 
 
-#: The quarter pipe of the scooping demonstration and of the scooping scenes. It ends at 75 degrees: a full quarter is so high
-#: that the wrist, which follows the handle over it, runs into it; by 60 degrees small balls fall off the spoon.
-ARC = {"radius": TURN_RADIUS, "width": 0.16, "back": 0.02, "extent": np.deg2rad(75)}
+#: The quarter pipe of the scooping demonstration and of the scooping scenes. It ends at 80 degrees: a full quarter is so high
+#: that the wrist, which follows the handle over it, runs into it; at 75 degrees small balls (r 15 mm) fall off more spoons, at 60 all.
+ARC = {"radius": TURN_RADIUS, "width": 0.16, "back": 0.02, "extent": np.deg2rad(80)}
 #: Direction of the slide (rad about world z; 0: towards the robot, -x) and where the target's contact point is when it begins.
 SLIDE_YAW = np.pi / 2
 SCOOP_FROM = np.array([0.52, 0.195, 0.0])
