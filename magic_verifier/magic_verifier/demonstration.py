@@ -74,6 +74,9 @@ def replay(
         keep = times <= start + 1e-9
         times, world_from_tool = np.append(times[keep], start + 1.0), np.concatenate([world_from_tool[keep], world_from_tool[keep][-1:]])
     setup = make_setup(replace(tool, world_from_object=world_from_tool[0]), target, obstacles, table, strategy.physics, settings)
+    if not releases:
+        # A few millimetres are what is asked for: the flats of convex pieces would be seen in them.
+        setup = replace(setup, tool=replace(setup.tool, mesh=tool.mesh))
     run = FloatingRun(setup, MotionPlan("fg", ToolMotion(times, world_from_tool, phases)))
     watched = "release" if releases else watched
     if watched not in {p.name for p in phases}:

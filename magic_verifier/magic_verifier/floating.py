@@ -42,11 +42,13 @@ class Perturbation:
 
 @dataclass(frozen=True)
 class Body:
-    """An object ready for physics: hull corners in its own frame and its pose."""
+    """An object ready for physics: hull corners in its own frame and its pose; ``mesh``, where it is given, is the exact
+    surface that it collides by instead, as long as it is not free."""
 
     id: str
     hulls: tuple[NDArray[np.float64], ...]
     world_from_object: NDArray[np.float64]
+    mesh: Mesh | None = None
 
     @property
     def corners(self) -> NDArray[np.float64]:
@@ -142,7 +144,8 @@ def fill_world(setup: Setup, tool_kind: str) -> World:
     for obstacle in setup.obstacles:
         world.add(obstacle.id, list(obstacle.hulls), obstacle.world_from_object, STATIC, 1000.0, physics.friction)
     world.add(TARGET, list(setup.target.hulls), setup.target.world_from_object, setup.target_kind, physics.target_density, physics.friction)
-    world.add(TOOL, list(setup.tool.hulls), setup.tool.world_from_object, tool_kind, physics.tool_density, physics.friction)
+    tool = setup.tool
+    world.add(TOOL, list(tool.hulls), tool.world_from_object, tool_kind, physics.tool_density, physics.friction, tool.mesh)
     return world
 
 

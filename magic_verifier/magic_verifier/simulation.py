@@ -90,8 +90,9 @@ def extremes(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     z = 1 - 2 * k / count
     angle = np.pi * (1 + 5**0.5) * k
     directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
-    chunk = max(1, 4_000_000 // len(points))
-    chosen = [np.argmax(points @ directions[i : i + chunk].T, axis=0) for i in range(0, count, chunk)]
+    chunk = max(1, 1_000_000 // len(points))
+    along = np.ascontiguousarray(points.T)
+    chosen = [np.argmax(directions[i : i + chunk] @ along, axis=1) for i in range(0, count, chunk)]
     return points[np.unique(np.concatenate(chosen))]
 
 
@@ -268,8 +269,12 @@ class World:
         kind: str,
         density: float,
         friction: float,
+        mesh: Mesh | None = None,
     ) -> None:
-        """Add a body of convex hulls (see :func:`usable_pieces`), corners (N, 3) in its own frame; density in kg/m^3."""
+        """Add a body of convex hulls (see :func:`usable_pieces`), corners (N, 3) in its own frame; density in kg/m^3.
+
+        ``mesh``: its exact surface, which a body that is not free may collide by instead of its hulls.
+        """
         physx = self._sapien.physx
         if not (np.isfinite(density) and 0 < density < 1e5):
             raise MagicError(Code.BAD_SCENE, f"density of {name}", density, "above 0 and below 100000 kg/m^3")
@@ -277,6 +282,19 @@ class World:
             raise MagicError(Code.BAD_SCENE, f"pose of {name}", "not finite", "finite numbers")
         component = physx.PhysxRigidStaticComponent() if kind == STATIC else physx.PhysxRigidDynamicComponent()
         material = self.material(friction)
+        if mesh is not None and kind == DYNAMIC:
+            raise MagicError(Code.BAD_SCENE, f"shape of {name}", "an exact surface", "convex pieces for a body that is free")
+        if mesh is not None:
+            shape = physx.PhysxCollisionShapeTriangleMesh(
+                vertices=np.ascontiguousarray(mesh.vertices, dtype=np.float32),
+                triangles=np.ascontiguousarray(mesh.faces, dtype=np.uint32),
+                scale=np.ones(3, np.float32),
+                material=material,
+            )
+            shape.contact_offset = self.settings.contact_offset
+            shape.rest_offset = self.settings.rest_offset
+            component.attach(shape)
+            hulls = []
         balls = [sphere_of(corners) for corners in hulls]
         for corners, ball in zip(hulls, balls, strict=True):
             if ball is not None:
@@ -298,7 +316,7 @@ class World:
             component.solver_velocity_iterations = self.settings.velocity_iterations
             component.sleep_threshold = 0.0
             component.linear_damping = self.settings.linear_damping
-            component.angular_damping = self.settings.rolling_damping if all(balls) else self.settings.angular_damping
+            component.angular_damping = self.settings.rolling_damping if balls and all(balls) else self.settings.angular_damping
             component.max_depenetration_velocity = self.settings.max_depenetration_speed
             component.kinematic = kind == KINEMATIC
         self._register(name, component, world_from_object)

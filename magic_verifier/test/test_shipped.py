@@ -97,7 +97,7 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
 
 
 @pytest.mark.parametrize(
-    ("name", "phase", "bound"), [("hooking", "goal", 0.003), ("hanging", "release", 0.003), ("scooping", "contact", 0.005)]
+    ("name", "phase", "bound"), [("hooking", "goal", 0.003), ("hanging", "release", 0.003), ("scooping", "contact", 0.003)]
 )
 def test_a_replay_finds_the_annotated_contact_points(name, phase, bound):
     strategy, tool, target, obstacles, candidate = demonstration(name)
