@@ -250,24 +250,35 @@ class ArmPlanner:
         failures = Failures()
         grasps = self._grasps(request, tool_contact_frame(candidate, reflection))
         chosen: list[Array] = []  # grasps of the attempts before, in order
+        spare: list[list[Branch]] = []  # those that close where one of these does, only from another side
         tried = 0
-        for lot in range(0, len(grasps), self.settings.grasps):
-            budget.check("task")
-            feedback("task", f"following the task with grasps {lot} to {min(lot + self.settings.grasps, len(grasps)) - 1}")
-            branches = self._branches(request, grasps[lot : lot + self.settings.grasps], failures)
-            for group in _by_grasp(self._clear(request, branches, failures)):
-                if tried >= self.settings.tries:
-                    raise failures.error()
-                if any(_alike(group[0].grasp.tool_from_tcp, other) for other in chosen):
+        for lot in [*range(0, len(grasps), self.settings.grasps), -1]:
+            if lot >= 0:
+                budget.check("task")
+                feedback("task", f"following the task with grasps {lot} to {min(lot + self.settings.grasps, len(grasps)) - 1}")
+                branches = self._branches(request, grasps[lot : lot + self.settings.grasps], failures)
+                groups = _by_grasp(self._clear(request, branches, failures))
+            else:
+                groups = spare
+            for group in groups:
+                frame = group[0].grasp.tool_from_tcp
+                if groups is not spare and any(_same_place(frame, other, robot.closing) for other in chosen):
+                    spare.append(group)
+                    continue
+                if any(_alike(frame, other) for other in chosen):
                     continue
                 for branch in group[:3]:
+                    if tried >= self.settings.tries:
+                        raise failures.error()
                     tried += 1
                     try:
                         plan = self._complete(request, branch, len(chosen) < attempt)
                     except StageError as failure:
                         failures.add(failure.stage, failure.error)
+                        if failure.stage == "approach" and failure.error.code == Code.PATH_IN_COLLISION:
+                            break  # the same hand comes to the same grasp in the group's other branches
                         continue
-                    chosen.append(group[0].grasp.tool_from_tcp)
+                    chosen.append(frame)
                     if plan is not None:
                         return plan
                     tried -= 1
@@ -342,7 +353,13 @@ class ArmPlanner:
         for index in sorted({0, min(met, last), last}):
             checks.append((request.poses[index], [target, *others] if fixed or index <= met else others))
         free, blocked = collision_free(
-            self.robot, grasps, request.tool, checks, self.settings.grasps * self.settings.rounds, request.budget
+            self.robot,
+            grasps,
+            request.tool,
+            checks,
+            self.settings.grasps * self.settings.rounds,
+            request.budget,
+            way=self.settings.standoff / 2,
         )
         if not free:
             name = max(blocked, key=lambda k: blocked[k])
@@ -536,13 +553,14 @@ class ArmPlanner:
 
     # ------------------------------------------------------------ picking up
 
-    def _straight(self, start: Array, shift: Array, q: Array) -> Array | None:
-        """Joint path from q along a straight move of the hand by ``shift`` (3,) metres, base axes; None where it cannot follow."""
+    def _straight(self, start: Array, shift: Array, q: Array) -> list[Array | None]:
+        """Joint paths from each of q (N, J) along a straight move of the hand by ``shift`` (3,) metres, base axes; None where one
+        cannot follow."""
         parts = max(2, int(np.ceil(np.linalg.norm(shift) / 0.01))) + 1
         targets = np.repeat(start[None], parts, axis=0)
         targets[:, :3, 3] += np.linspace(0, 1, parts)[:, None] * shift
-        paths, stopped, _ = self.robot.chain.track(targets[:, None], q[None], jump=self.settings.jump)
-        return paths[:, 0] if stopped[0] == parts else None
+        paths, stopped, _ = self.robot.chain.track(np.repeat(targets[:, None], len(q), axis=1), q, jump=self.settings.jump)
+        return [paths[:, n] if stopped[n] == parts else None for n in range(len(q))]
 
     def _pick(self, request: Request, branch: Branch) -> tuple[Array, Array, Array]:
         """Joint paths of coming to the grasp (n, J), the grasp itself (J,) and the lift (m, J)."""
@@ -560,36 +578,38 @@ class ArmPlanner:
         problem: StageError | None = None
         ways: list[tuple[Array, Array]] = []
         self._lay(request, request.tool.world_from_object)
-        for q in solutions[np.argsort(far, kind="stable")][:8]:
+        solutions = solutions[np.argsort(far, kind="stable")][:8]
+        backs = [self._straight(tip, -share * settings.standoff * tip[:3, 2], solutions) for share in (1.0, 0.5)]
+        for n, q in enumerate(solutions):
             request.budget.check("approach")
-            back = self._straight(tip, -settings.standoff * tip[:3, 2], q)
-            if back is None:
-                back = self._straight(tip, -settings.standoff / 2 * tip[:3, 2], q)
-            if back is None:
-                problem = problem or StageError(
-                    "approach",
-                    MagicError(
-                        Code.NO_IK,
-                        f"coming straight to the grasp of {request.tool.id}",
-                        "out of reach",
-                        f"{settings.standoff} m of straight way",
-                    ),
-                )
-                continue
-            hit = robot.first_collision(back[::-1], budget=request.budget, stage="approach")
-            if hit is not None:
+            for back in (backs[0][n], backs[1][n]):
+                if back is None:
+                    problem = problem or StageError(
+                        "approach",
+                        MagicError(
+                            Code.NO_IK,
+                            f"coming straight to the grasp of {request.tool.id}",
+                            "out of reach",
+                            f"{settings.standoff} m of straight way",
+                        ),
+                    )
+                    continue
+                hit = robot.first_collision(back[::-1], budget=request.budget, stage="approach")
+                if hit is None:
+                    ways.append((back[::-1], q))
+                    break
                 problem = StageError(
                     "approach",
                     MagicError(Code.PATH_IN_COLLISION, f"coming to the grasp: {hit[1]}", "in collision", "a clear way to the tool"),
                 )
-                continue
-            ways.append((back[::-1], q))
+            if len(ways) >= 3:
+                break
         self._hold(request, branch.grasp)
         # The tool leaves what it lies on.
         robot.allow(request.tool.id, "table", *request.surroundings())
         for back, q in ways:
             for height in (settings.lift, settings.lift / 2):
-                up = self._straight(tip, height * request.plane[:3], q)
+                up = self._straight(tip, height * request.plane[:3], q[None])[0]
                 if up is None:
                     problem = StageError(
                         "lift",
@@ -672,7 +692,7 @@ class ArmPlanner:
         problem: StageError | None = None
         back = -tip[:3, 2]
         for direction in (back, transforms.unit(back + 0.5 * request.plane[:3]), transforms.unit(back - 0.5 * request.plane[:3])):
-            path = self._straight(tip, settings.retreat * direction, task[-1])
+            path = self._straight(tip, settings.retreat * direction, task[-1:])[0]
             if path is None:
                 problem = problem or StageError(
                     "retreat", MagicError(Code.NO_IK, "taking the open hand away", "out of reach", f"{settings.retreat} m of straight way")
@@ -834,6 +854,12 @@ class StageError(Exception):
 def _alike(a: Array, b: Array) -> bool:
     """Whether two grasps are the same to the eye: 15 mm and 20 degrees."""
     return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.015) and transforms.rotation_angle(a, b) < np.deg2rad(20)
+
+
+def _same_place(a: Array, b: Array, closing: Array) -> bool:
+    """Whether two grasps close at the same place along the same line, to 15 mm and 20 degrees, from whatever side the hand comes."""
+    near = bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.015)
+    return near and abs(float((a[:3, :3] @ closing) @ (b[:3, :3] @ closing))) > np.cos(np.deg2rad(20))
 
 
 def _by_grasp(branches: Sequence[Branch]) -> list[list[Branch]]:

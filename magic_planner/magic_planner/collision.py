@@ -1,4 +1,4 @@
-"""Convex pieces against convex pieces: which two bodies touch, and where (FCL, as MPlib ships it)."""
+"""Convex pieces against convex pieces: which two bodies touch (FCL, as MPlib ships it)."""
 
 from __future__ import annotations
 
@@ -93,19 +93,14 @@ def fcl_pose(transform: NDArray[np.float64]) -> Any:
     return mplib.Pose(np.ascontiguousarray(transform, dtype=float))
 
 
-def convex_shapes(pieces: Iterable[Mesh]) -> list[Any]:
-    """Convex pieces as FCL's convex geometries."""
-    from mplib.collision_detection import fcl
-
-    return [fcl.Convex(*hull(piece.vertices)) for piece in pieces]
-
-
 def shell(pieces: Iterable[Mesh]) -> list[Any]:
     """The surfaces of convex pieces as one FCL triangle tree, in a list of one.
 
-    For the arm's collision world: there a triangle tree is asked in about 10 us whatever the number of pieces, a convex
-    geometry in 10 us or more each.  Two surfaces do not meet where one body is wholly inside the other; in this world
-    whatever would hold an object of the table is in the table as well, and whatever holds a finger meets the hand.
+    Not FCL's convex geometries: those of more than 32 vertices are searched along their edges, which goes astray on flat
+    faces and reports bodies 3 cm apart as touching; and a tree is asked in about 10 us whatever the number of pieces, a
+    convex geometry in 10 us or more each.  Two surfaces do not meet where one body is wholly inside the other: :class:`Body`
+    looks for that.  In the arm's collision world it is left out, for whatever would hold an object of the table is in the
+    table as well, and whatever holds a finger meets the hand.
     """
     from mplib.collision_detection import fcl
 
@@ -118,55 +113,68 @@ def shell(pieces: Iterable[Mesh]) -> list[Any]:
 
 
 class Body:
-    """A named rigid body of convex shapes that can be moved and asked what it touches."""
+    """A named rigid body of convex pieces that can be moved and asked what it touches."""
 
-    def __init__(self, name: str, shapes: Sequence[Any], local: Sequence[NDArray[np.float64]], radii: Sequence[float]) -> None:
-        """shapes: FCL geometries; local: body_from_shape (4, 4) of each; radii: of the ball about each shape's origin, m."""
+    def __init__(self, name: str, pieces: Iterable[Mesh]) -> None:
+        """pieces: convex meshes in the body's frame."""
         import mplib
         from mplib.collision_detection import fcl
 
         self.name = name
-        self.shapes = list(shapes)
-        self.objects = [fcl.CollisionObject(shape, mplib.Pose()) for shape in shapes]
-        self.local = np.asarray(local, dtype=float).reshape(-1, 4, 4)
-        self.radii = np.asarray(radii, dtype=float)
-        self.centres = self.local[:, :3, 3].copy()
-
-    @classmethod
-    def from_pieces(cls, name: str, pieces: Iterable[Mesh]) -> Body:
-        """A body of convex meshes given in the body's frame."""
-        from mplib.collision_detection import fcl
-
-        shapes, local, radii = [], [], []
-        for piece in pieces:
-            vertices, faces = hull(piece.vertices)
-            centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-            shapes.append(fcl.Convex(vertices - centre, faces))
-            local.append(transforms.make(translation=centre))
-            radii.append(float(np.linalg.norm(vertices - centre, axis=1).max()))
-        return cls(name, shapes, local, radii)
+        pieces = list(pieces)
+        self.object = fcl.CollisionObject(shell(pieces)[0], mplib.Pose())
+        hulls = [hull(piece.vertices) for piece in pieces]
+        self._planes = [_planes(vertices, faces) for vertices, faces in hulls]
+        bounds = np.array([(vertices.min(axis=0), vertices.max(axis=0)) for vertices, _ in hulls])
+        self.local = bounds.mean(axis=1)
+        #: Radius in metres of the ball about each piece, and a point of each piece.
+        self.radii = np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, self.local, strict=True)])
+        self.first = np.array([vertices[0] for vertices, _ in hulls])
+        self.pose = np.eye(4)
+        self.centres = self.local
 
     @classmethod
     def from_object(cls, item: SceneObject) -> Body:
         """A body of an object's pieces, already placed where the object is."""
-        body = cls.from_pieces(item.id, solid_pieces(item))
+        body = cls(item.id, solid_pieces(item))
         body.move(item.world_from_object)
         return body
 
     def move(self, world_from_body: NDArray[np.float64]) -> None:
         """Place the body."""
-        world_from_shape = np.asarray(world_from_body) @ self.local
-        self.centres = world_from_shape[:, :3, 3]
-        for shape, pose in zip(self.objects, world_from_shape, strict=True):
-            shape.set_pose(fcl_pose(pose))
+        self.pose = np.asarray(world_from_body, dtype=float)
+        self.centres = transforms.apply(self.pose, self.local)
+        self.object.set_pose(fcl_pose(self.pose))
 
     def touches(self, other: Body) -> bool:
-        """Whether any shape of this body meets any of the other's."""
-        from mplib.pymp.collision_detection import fcl
+        """Whether this body and the other have a point in common."""
+        from mplib.collision_detection import fcl
 
         reach = self.radii[:, None] + other.radii[None, :]
-        near = np.linalg.norm(self.centres[:, None] - other.centres[None, :], axis=2) < reach
-        for i, j in np.argwhere(near):
-            if fcl.collide(self.objects[i], other.objects[j]).is_collision():
+        near = np.argwhere(np.linalg.norm(self.centres[:, None] - other.centres[None, :], axis=2) < reach)
+        if not len(near):
+            return False
+        if fcl.collide(self.object, other.object).is_collision():
+            return True
+        # The surfaces are apart: a piece is wholly inside another one, with any of its points, or outside.
+        return self._holds(other, near) or other._holds(self, near[:, ::-1])
+
+    def _holds(self, other: Body, pairs: NDArray[np.int64]) -> bool:
+        """Whether the first point of other's piece j lies in this body's piece i, for any of the pairs (N, 2) of i and j."""
+        points = transforms.apply(transforms.inverse(self.pose), transforms.apply(other.pose, other.first))
+        close = np.linalg.norm(points[pairs[:, 1]] - self.local[pairs[:, 0]], axis=1) < self.radii[pairs[:, 0]]
+        for i, j in pairs[close]:
+            normals, offsets = self._planes[i]
+            if np.all(normals @ points[j] <= offsets):
                 return True
         return False
+
+
+def _planes(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Outward unit normals (F, 3) of a hull's faces and their offsets (F,): inside is where normals @ x <= offsets."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    good = lengths > 1e-14
+    normals = normals[good] / lengths[good][:, None]
+    return normals, np.einsum("ij,ij->i", normals, a[good])

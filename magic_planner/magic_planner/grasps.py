@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
@@ -267,31 +268,81 @@ def propose(
     return [Grasp(frames[i], float(widths[pair[i]]), float(costs[i])) for i in order]
 
 
-def _misfit(
-    robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], reach: float = 0.005
-) -> NDArray[np.float64]:
-    """(G,) cost of finger pads that do not lie flat: what is gripped askew turns in the hand when the fingers close.
+def pad_profiles(
+    robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh], across: int = 5, deep: int = 5
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What each finger pad meets when it closes: heights (G, across, deep, 2) of the tool over the plane between the pads, metres.
 
-    Lines beside each grasp's own, ``reach`` metres off across and along the fingers, measure how the two gripped faces
-    are tilted to the pads (radians, 2 a radian), and where there is nothing to grip (0.5 where all of them miss).
+    One line along the closing axis for each cell of a grid on the pad; [..., 0] is the height towards the finger on the
+    positive side of that axis, [..., 1] towards the other, -inf where the line meets nothing between the open fingers.
+    Also returns the grid's points (across, deep, 2) on the pad: metres across the fingers and along them, towards the tips.
     """
-    hulls = [hull(piece.vertices) for piece in pieces]
     index = "xy".index(robot.config.closing_axis)
-    closing = frames[:, :3, index]
-    tilts, missing = np.zeros(len(frames)), np.zeros(len(frames))
-    for axis in (frames[:, :3, 1 - index], frames[:, :3, 2]):
-        sides = []
-        for sign in (1, -1):
-            start = frames[:, :3, 3] + sign * reach * axis
-            sides.append((_through(hulls, start, closing)[0], _through(hulls, start, -closing)[0]))
-        absent = [(a < 0.3 * widths / 2) | (b < 0.3 * widths / 2) for a, b in sides]
-        missing += (absent[0].astype(float) + absent[1]) / 4
-        there = ~(absent[0] | absent[1])
-        for face in (0, 1):
-            tilts += (
-                np.where(there, np.minimum(np.abs(sides[0][face] - sides[1][face]) / (2 * reach), 0.6), 0.3 * (absent[0] != absent[1])) / 2
-            )
-    return tilts * 2.0 + 0.5 * missing
+    half, reach = 0.8 * robot.pad_half_width, robot.tip_reach - 0.001
+    grid = np.stack(np.meshgrid(np.linspace(-half, half, across), np.linspace(-reach, reach, deep), indexing="ij"), axis=-1)
+    flat = grid.reshape(-1, 2)
+    closing, origin = frames[:, :3, index], frames[:, :3, 3]
+    starts = origin[:, None] + flat[None, :, :1] * frames[:, None, :3, 1 - index] + flat[None, :, 1:] * frames[:, None, :3, 2]
+    open_half = robot.config.opening / 2
+    heights = np.full((len(frames), len(flat), 2), -np.inf)
+    for piece in pieces:
+        vertices, faces = hull(piece.vertices)
+        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        near = np.linalg.norm(origin - middle, axis=1) < np.linalg.norm(vertices - middle, axis=1).max() + open_half + half + reach
+        if not near.any():
+            continue
+        a, b, c = (vertices[faces[:, i]] for i in range(3))
+        planes = np.cross(b - a, c - a)
+        norms = np.linalg.norm(planes, axis=1)
+        planes, a = planes[norms > 1e-14] / norms[norms > 1e-14][:, None], a[norms > 1e-14]
+        slope = (closing[near] @ planes.T)[:, None]
+        gap = np.einsum("ij,ij->i", a, planes) - starts[near] @ planes.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = gap / slope
+        leave = np.where(slope > 1e-9, along, np.inf).min(axis=2)
+        enter = np.where(slope < -1e-9, along, -np.inf).max(axis=2)
+        beside = ((np.abs(slope) <= 1e-9) & (gap < -1e-9)).any(axis=2)
+        met = (leave > enter + 1e-6) & ~beside & (leave < open_half + 0.002) & (enter > -open_half - 0.002)
+        sides = np.where(met[..., None], np.stack([leave, -enter], axis=2), -np.inf)
+        heights[near] = np.maximum(heights[near], sides)
+    return heights.reshape(len(frames), across, deep, 2), grid
+
+
+def _misfit(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh]) -> NDArray[np.float64]:
+    """(G,) cost of finger pads that do not lie flat on opposite faces: what is gripped so is shoved, turns or slips when they close.
+
+    From the heights under the pads: how far a pad is stopped by something else before it is where the grasp wants it (1 a
+    centimetre), how far the middles of the two contact areas are from opposite (1 a centimetre), how far the faces are tilted
+    (2 a radian), how little of the pad is on them (1.0 where nothing is), and how far off the middle the tool is (1 for 2 cm).
+    """
+    if not len(frames):
+        return np.zeros(0)
+    heights, grid = pad_profiles(robot, frames, pieces)
+    first = heights.max(axis=(1, 2))  # (G, 2): where each pad stops
+    there = np.isfinite(first).all(axis=1)
+    contact = heights >= np.where(np.isfinite(first), first, np.inf)[:, None, None] - 0.001
+    count = contact.sum(axis=(1, 2))
+    middles = np.einsum("gadk,adj->gkj", contact, grid) / np.maximum(count, 1)[..., None]
+    share = count.min(axis=1) / (grid.shape[0] * grid.shape[1])
+    safe = np.where(np.isfinite(first), first, 0.0)
+    early = np.maximum(0.0, safe - widths[:, None] / 2).sum(axis=1)
+    tilts = np.zeros(len(frames))
+    for axis in (1, 2):
+        step = float(np.abs(np.diff(grid, axis=axis - 1)[..., axis - 1]).mean())
+        inner = np.take(heights, range(1, heights.shape[axis] - 1), axis=axis)
+        ends = np.take(inner, -1, axis=axis), np.take(inner, 0, axis=axis)
+        both = np.isfinite(ends[0]) & np.isfinite(ends[1])
+        with np.errstate(invalid="ignore"):
+            slopes = np.where(both, np.minimum(np.abs(ends[0] - ends[1]) / (step * (inner.shape[axis] - 1)), 0.6), 0.0)
+        tilts += (slopes.sum(axis=1) / np.maximum(both.sum(axis=1), 1)).sum(axis=1) / 2
+    cost = (
+        np.minimum(early / 0.01, 3.0)
+        + np.linalg.norm(middles[:, 0] - middles[:, 1], axis=1) / 0.01
+        + 2.0 * tilts
+        + np.maximum(0.0, 1 - share / 0.5)
+        + np.abs(safe[:, 0] - safe[:, 1]) / 2 / 0.02
+    )
+    return np.where(there, cost, 5.0)
 
 
 def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
@@ -382,20 +433,27 @@ def collision_free(
     checks: Sequence[tuple[NDArray[np.float64], Sequence[Body]]],
     limit: int,
     budget: Budget,
+    way: float = 0.0,
 ) -> tuple[list[Grasp], dict[str, int]]:
     """The first ``limit`` grasps whose open hand is clear of the tool itself and, at each pose, of the bodies given with it.
 
-    checks: (world_from_tool, bodies already placed).  Also returns how often each body was in the way.
+    checks: (world_from_tool, bodies already placed).  way: metres straight before the grasp on which it has to be clear of
+    the tool as well.  Also returns how often each body was in the way.
     """
+    back = np.linspace(0.0, way, 1 + int(np.ceil(way / 0.01)))
     hand = robot.hand_body()
-    held = Body.from_pieces(tool.id, solid_pieces(tool))
+    held = Body(tool.id, solid_pieces(tool))
     free: list[Grasp] = []
     blocked: dict[str, int] = {}
     for n, grasp in enumerate(grasps):
         if n % 32 == 0:
             budget.check("grasp")
-        hand.move(grasp.tool_from_tcp)
-        hit = held.name if hand.touches(held) else ""
+        hit = ""
+        for distance in back:
+            hand.move(grasp.tool_from_tcp @ transforms.make(translation=[0.0, 0.0, -distance]))
+            if hand.touches(held):
+                hit = held.name
+                break
         for world_from_tool, bodies in checks:
             if hit:
                 break

@@ -82,7 +82,7 @@ def plan_tool_motion(
     world_from_tool = (world_from_target @ target_from_contact) @ contacts @ transforms.inverse(tool_from_contact)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool))
     motion = ToolMotion(times, world_from_tool, phases)
-    start = Body.from_pieces(tool.id, solid_pieces(tool))
+    start = Body(tool.id, solid_pieces(tool))
     start.move(motion.world_from_tool[0])
     for item in (target, *obstacles):
         if start.touches(Body.from_object(item)):

@@ -192,9 +192,16 @@ class Robot:
             n for n, d in depth.items() if d > deepest - 0.005 and abs(self.hand[n].vertices[:, across].mean()) > 1e-3
         )
 
+    @property
+    def pad_half_width(self) -> float:
+        """Half the breadth of a finger across the closing and the approach direction, metres."""
+        across = 1 - "xy".index(self.config.closing_axis)
+        links = self.finger_links or tuple(self.hand)
+        return min(float(np.abs(self.hand[name].vertices[:, across]).max()) for name in links)
+
     def hand_body(self) -> Body:
         """The open hand as one body in the frame of the move group."""
-        return Body.from_pieces("hand", self.hand.values())
+        return Body("hand", self.hand.values())
 
     # ------------------------------------------------------------ the world
 

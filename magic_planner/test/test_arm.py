@@ -94,11 +94,11 @@ def test_no_pose_of_the_plan_is_in_collision(arm, solved):
     robot, motion = arm.robot, plan.arm_motion
     robot.clear()
     robot.add_table(np.array([0, 0, 1.0, 0]))
-    from magic_planner.collision import convex_shapes
+    from magic_planner.collision import shell
 
-    robot.add(target.id, convex_shapes(target.pieces), target.world_from_object)
+    robot.add(target.id, shell(target.pieces), target.world_from_object)
     robot.open_to(motion.grasp_width)
-    robot.attach(tool.id, convex_shapes(tool.pieces), transforms.inverse(motion.tool_from_tcp), tuple(robot.hand))
+    robot.attach(tool.id, shell(tool.pieces), transforms.inverse(motion.tool_from_tcp), tuple(robot.hand))
     lifted = (motion.times > span(plan, "transfer").start + 1.0) & (motion.times < span(plan, "approach").end)
     assert lifted.sum() > 20
     assert not any(robot.collides(q) for q in motion.positions[lifted][::3])

@@ -8,9 +8,10 @@ import pytest
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, hull, mass_centre
-from magic_planner.grasps import GraspSettings, antipodal, collision_free, in_the_way, propose
+from magic_planner.grasps import GraspSettings, _misfit, antipodal, collision_free, in_the_way, pad_profiles, propose
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 
@@ -78,11 +79,54 @@ def test_a_hand_stays_above_the_table_and_out_of_the_tool(arm):
         assert low > 0.0014
         assert np.linalg.norm(grasp.tool_from_tcp[:3, 3] - tool_contact.object_from_contact[:3, 3]) > 0.025
     free, _ = collision_free(arm.robot, grasps, tool, [], 20, Budget())
-    hand, held = arm.robot.hand_body(), Body.from_pieces("tool", tool.pieces)
+    hand, held = arm.robot.hand_body(), Body("tool", tool.pieces)
     assert free
     for grasp in free:
         hand.move(grasp.tool_from_tcp)
         assert not hand.touches(held)
+
+
+def test_bodies_touch_where_they_share_a_point_and_only_there():
+    bar, ball = Body("bar", [scenes.cylinder(0.01, 0.2)]), Body("ball", [scenes.box([0.02, 0.02, 0.02])])
+    for gap, touch in ((0.0005, False), (-0.0005, True)):
+        ball.move(transforms.make(translation=[0.02 + gap, 0, 0.05]))
+        assert bar.touches(ball) is touch and ball.touches(bar) is touch
+    ball.move(transforms.make(translation=[0, 0, 0.02]))
+    assert bar.touches(ball)
+    big = Body("big", [scenes.box([0.3, 0.3, 0.3]), scenes.box([0.1, 0.1, 0.1], [0.5, 0, 0])])
+    assert big.touches(ball) and ball.touches(big)  # wholly inside, no surface meets another
+    ball.move(transforms.make(translation=[0.3, 0, 0.0]))
+    assert not big.touches(ball) and not ball.touches(big)
+
+
+def test_a_long_piece_of_many_corners_between_open_fingers_is_free(arm):
+    # FCL's convex geometries of more than 32 vertices reported this one as touching a finger 3 cm away.
+    angle = np.pi / 2 + np.linspace(0, np.pi, 17)
+    outline = np.concatenate([[[0.097, 0.009], [0.097, -0.009]], [[-0.1317, 0.0]] + 0.009 * np.stack([np.cos(angle), np.sin(angle)], 1)])
+    vertices = np.concatenate([np.column_stack([outline, np.full(len(outline), z)]) for z in (-0.0075, 0.0075)])
+    held, hand = Body("bar", [Mesh(*hull(vertices))]), arm.robot.hand_body()
+    for x in np.linspace(-0.08, 0.08, 17):
+        for z in (0.0, 0.002, 0.005):
+            hand.move(transforms.from_rpy(np.pi, 0, 0, [x, 0, z]))
+            assert not hand.touches(held)
+    hand.move(transforms.from_rpy(np.pi, 0, 0, [0, 0.04, 0]))
+    assert hand.touches(held)
+
+
+def test_pads_that_meet_flat_opposite_faces_are_preferred(arm):
+    frame = np.eye(4)[None]
+    widths = np.array([0.02])
+    bar = scenes.box([0.2, 0.02, 0.02])
+    heights, grid = pad_profiles(arm.robot, frame, [bar])
+    on = np.abs(grid[..., 1]) < 0.01
+    np.testing.assert_allclose(heights[0][on], 0.01)
+    flat = _misfit(arm.robot, frame, widths, [bar])[0]
+    assert flat < 0.05
+    ledge = _misfit(arm.robot, frame, widths, [bar, scenes.box([0.004, 0.06, 0.02], [0.007, 0, 0])])[0]  # meets the pads 2 cm too early
+    askew = _misfit(arm.robot, transforms.from_rpy(0, 0, np.deg2rad(15))[None], widths, [bar])[0]
+    end = _misfit(arm.robot, transforms.make(translation=[0.103, 0, 0])[None], widths, [bar])[0]  # the pads hang over the bar's end
+    assert ledge > 2 and askew > 0.4 and end > 0.15
+    assert _misfit(arm.robot, transforms.make(translation=[0.3, 0, 0])[None], widths, [bar])[0] == 5.0
 
 
 def test_points_in_the_hand_are_found_and_points_between_the_fingers_are_not(arm):
