@@ -21,6 +21,7 @@ setup(
         "console_scripts": [
             "perception = magic_perception.perception:main",
             "perceive_images = magic_perception.perceive_images:main",
+            "evaluate = magic_perception.evaluate:main",
         ]
     },
 )

@@ -61,7 +61,8 @@ def fit_sphere(points: NDArray[np.float64]) -> Sphere | None:
 
 
 def fit_cylinder(points: NDArray[np.float64]) -> Cylinder | None:
-    """The upright cylinder that stands on z = 0 and has the points (N, 3) on its side or its top; ``None`` where there are too few."""
+    """The upright cylinder that stands on z = 0 and has the points (N, 3) on its side or its top; ``None`` where there are too few, or
+    where a part of them tells of something else (a handle, a hollow)."""
     height = float(np.percentile(points[:, 2], 98))
     top = points[points[:, 2] > height - max(0.004, 0.06 * height)]
     side = points[(points[:, 2] < height - max(0.005, 0.08 * height)) & (points[:, 2] > 0.15 * height)]
@@ -75,6 +76,10 @@ def fit_cylinder(points: NDArray[np.float64]) -> Cylinder | None:
     above = points[:, 2] - height
     # Distance to the surface of the solid: from inside the nearer of side and top, from outside the true distance.
     distance = np.where((outward < 0) & (above < 0), np.minimum(-outward, -above), np.hypot(np.maximum(outward, 0), np.maximum(above, 0)))
+    # A handle, or a mug's inside, is a small share of the points but no noise.
+    inside = points[outward < -0.4 * radius]
+    if float(np.mean(distance > max(0.008, 0.12 * radius))) > 0.03 or (len(inside) > 20 and float(np.median(inside[:, 2])) < height - max(0.008, 0.1 * height)):
+        return None
     return Cylinder(centre, radius, height, float(np.percentile(distance, 90)))
 
 

@@ -29,6 +29,7 @@ from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate
+from magic_core.rendering import Raycaster
 from magic_perception import clusters, polygons, primitives
 from magic_perception.parameters import Parameters
 from magic_perception.segmentation import open_by_two
@@ -225,11 +226,40 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         return found
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
-    length = float(np.max(np.ptp(spread @ axes.T, axis=0)))
+    # Without the outermost half percent: one stray ray must not lay a mug down.
+    length = float(np.max(np.subtract(*np.percentile(spread @ axes.T, [99.5, 0.5], axis=0))))
     if height > 0.04 and height > 0.45 * length:
-        found = _standing_round(sights, points, eyes, height, noise, parameters)
-        return found if found is not None else _layers(sights, points, height, parameters)
+        turned = _standing_round(sights, points, eyes, height, noise, parameters)
+        fit = _agreement(turned.mesh, sights) if turned is not None else 0.0
+        if turned is not None and fit > 0.8:
+            return turned
+        if height < 0.65 * length:  # a ladle's stem rises, but it lies
+            return _lying(sights, points, height, noise, parameters)
+        if turned is None:
+            return _layers(sights, points, height, parameters)
+        # It does not look as what was seen does: a hoop or a bent wire taken for a body.
+        stacked = _layers(sights, points, height, parameters)
+        other = _agreement(stacked.mesh, sights)
+        better = turned if fit >= other else stacked
+        return replace(better, confidence=better.confidence * max(fit, other))
     return _lying(sights, points, height, noise, parameters)
+
+
+def _agreement(mesh: Mesh, sights: list[Sight], step: int = 3) -> float:
+    """Mean over the cameras of the overlap (intersection over union) of a mesh's silhouette with the mask, every ``step``-th pixel."""
+    caster = Raycaster([mesh])
+    result = []
+    for sight in sights:
+        rows, columns = (np.nonzero(sight.mask.any(axis=axis))[0] for axis in (1, 0))
+        pad = 24
+        v = np.arange(max(rows[0] - pad, 0), min(rows[-1] + pad, sight.mask.shape[0]), step)
+        u = np.arange(max(columns[0] - pad, 0), min(columns[-1] + pad, sight.mask.shape[1]), step)
+        k = sight.intrinsics
+        rays = np.stack(np.broadcast_arrays(((u - k.cx) / k.fx)[None], ((v - k.cy) / k.fy)[:, None], 1.0), axis=-1) @ sight.table_from_camera[:3, :3].T
+        drawn = caster.hits(sight.eye, rays)
+        mask, told = sight.mask[np.ix_(v, u)], ~sight.hidden[np.ix_(v, u)]
+        result.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
+    return float(np.mean(result))
 
 
 def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 0.005) -> Reconstruction:
@@ -387,9 +417,10 @@ def _relief(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArra
     return Mesh(vertices, np.concatenate([faces[:, ::-1], faces + n, *polygons._walls(faces, n)]))
 
 
-def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.008) -> list[Mesh]:
-    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide."""
-    pieces = []
+def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.011) -> list[Mesh]:
+    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide;
+    then neighbours are joined again where that fills little."""
+    clouds = []
     queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.001), 0.001)]
     while queue:
         cell, depth = queue.pop()
@@ -410,16 +441,74 @@ def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom:
                 queue += [(p, depth + 1) for p in polygons.parts_of(shapely.clip_by_rect(cell, *b)) if p.area > 1e-6]
             continue
         low = np.minimum(low, high - 0.001)
-        mesh = _hull(np.concatenate([np.column_stack([xy, low]), np.column_stack([xy, high])]))
-        if mesh is not None:
-            pieces.append(mesh)
-    return pieces
+        clouds.append(np.concatenate([np.column_stack([xy, low]), np.column_stack([xy, high])]))
+    return _joined(clouds)
+
+
+def _joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: int = 40, limit: float = 0.0025) -> list[Mesh]:
+    """Hulls of clouds (N, 3), neighbours joined, the pair that fills least first.
+
+    Two are joined where the volume that their common hull fills, over half of its surface, is at most ``tolerance``
+    metres; with more than ``most`` left the tolerance grows up to ``limit``.
+    """
+    import heapq
+
+    from scipy.spatial import ConvexHull, QhullError
+
+    def solid(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
+        try:
+            hull = ConvexHull(points)
+        except (QhullError, ValueError):
+            return None
+        return points[hull.vertices], hull.volume, hull.area
+
+    parts: dict[int, tuple[NDArray[np.float64], float, float]] = {}
+    filled: dict[int, float] = {}
+    boxes: dict[int, NDArray[np.float64]] = {}
+    for cloud in clouds:
+        made = solid(cloud)
+        if made is not None:
+            i = len(parts)
+            parts[i], filled[i], boxes[i] = made, made[1], np.stack([made[0].min(axis=0), made[0].max(axis=0)])
+    queue: list[tuple[float, int, int]] = []
+    hulls: dict[tuple[int, int], tuple[NDArray[np.float64], float, float]] = {}
+
+    def offer(i: int, others: list[int]) -> None:
+        if not others:
+            return
+        box = np.stack([boxes[j] for j in others])
+        near = np.all((box[:, 0] < boxes[i][1] + 5e-4) & (box[:, 1] > boxes[i][0] - 5e-4), axis=1)
+        for j in np.array(others)[near].tolist():
+            made = solid(np.concatenate([parts[i][0], parts[j][0]]))
+            if made is not None:
+                excess = (made[1] - filled[i] - filled[j]) / (made[2] / 2)
+                if excess < limit:
+                    hulls[i, j] = made
+                    heapq.heappush(queue, (excess, i, j))
+
+    for i in list(parts):
+        offer(i, [j for j in parts if j > i])
+    following = len(parts)
+    while queue:
+        excess, i, j = heapq.heappop(queue)
+        made = hulls.pop((i, j))
+        if i not in parts or j not in parts:
+            continue
+        if excess > tolerance and len(parts) <= most:
+            break
+        k, following = following, following + 1
+        parts[k], filled[k], boxes[k] = made, filled[i] + filled[j], np.stack([made[0].min(axis=0), made[0].max(axis=0)])
+        for gone in (i, j):
+            del parts[gone], filled[gone], boxes[gone]
+        offer(k, [m for m in parts if m != k])
+    return [mesh for points, _, _ in parts.values() if (mesh := _hull(points)) is not None]
 
 
 def _bend(xy: NDArray[np.float64], z: NDArray[np.float64]) -> float:
-    """Largest distance of z from its best plane."""
+    """Largest distance of points (xy, z) from the plane that fits them best along z, perpendicular to it: a steep wall is flat too."""
     a = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
-    return float(np.max(np.abs(a @ np.linalg.lstsq(a, z, rcond=None)[0] - z)))
+    plane = np.linalg.lstsq(a, z, rcond=None)[0]
+    return float(np.max(np.abs(a @ plane - z)) / np.sqrt(1 + plane[0] ** 2 + plane[1] ** 2))
 
 
 def _hull(points: NDArray[np.float64]) -> Mesh | None:

@@ -1,6 +1,7 @@
 """Perception's core against analytic truths and ray-cast scenes."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -364,6 +365,50 @@ def test_registration_of_a_plane_seen_from_aside():
     assert np.isfinite(found[20:60, 60:260]).all()
     with pytest.raises(MagicError):
         register_depth(wall[:-1], depth_camera, color_camera, color_from_depth)
+
+
+D435_BAG = Path(__file__).resolve().parents[3] / "shared/data/rgbd/d435_ros1/single_depth_color_640x480.bag"
+
+
+@pytest.mark.skipif(not D435_BAG.is_file(), reason=f"no recording of a D435 at {D435_BAG}")
+def test_registration_of_a_real_d435():
+    import cv2
+
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    cameras, images, color_from_depth, unit = {}, {}, None, 0.0
+    with highlevel.AnyReader([D435_BAG]) as reader:
+        for connection, _, raw in reader.messages():
+            topic, which = connection.topic, "depth" if "Depth" in connection.topic else "color"
+            if topic.endswith("camera_info"):
+                m = reader.deserialize(raw, connection.msgtype)
+                cameras[which] = Intrinsics(m.width, m.height, m.K[0], m.K[4], m.K[2], m.K[5])
+            elif topic.endswith("image/data"):
+                m = reader.deserialize(raw, connection.msgtype)
+                images[which] = m.data.view(np.uint16).reshape(m.height, m.width) if which == "depth" else m.data.reshape(m.height, m.width, 3)
+            elif topic.endswith("Color_0/tf/0"):
+                m = reader.deserialize(raw, connection.msgtype)
+                q, v = m.rotation, m.translation
+                color_from_depth = transforms.from_quaternion([v.x, v.y, v.z], [q.x, q.y, q.z, q.w])
+            elif topic.endswith("Depth Units/value"):
+                unit = reader.deserialize(raw, connection.msgtype).data
+    depth = images["depth"].astype(np.float32) * unit
+    depth[depth == 0] = np.nan
+    grey = cv2.GaussianBlur(cv2.cvtColor(images["color"], cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1)
+    edges = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    edges = np.minimum(edges, np.percentile(edges, 97))
+
+    def contrast(registered):
+        """Mean colour gradient at jumps of depth, over the picture's mean."""
+        near = cv2.erode(np.nan_to_num(registered, nan=99), np.ones((3, 3), np.uint8))
+        far = cv2.dilate(np.nan_to_num(registered, nan=0), np.ones((3, 3), np.uint8))
+        jump = (far - near > 0.06 * far) & (near < 90) & (far > 0)
+        assert jump.sum() > 50
+        return edges[jump].mean() / edges.mean()
+
+    right, none, wrong = (register_depth(depth, cameras["depth"], cameras["color"], t) for t in (color_from_depth, np.eye(4), transforms.inverse(color_from_depth)))
+    # Where depth jumps the colour changes too: only with the recorded extrinsics.
+    assert contrast(right) > 2 * max(contrast(none), contrast(wrong))
+    assert np.isfinite(right).mean() > 0.85
 
 
 def test_pairs_within_the_tolerance():

@@ -207,6 +207,62 @@ def test_bad_input_is_answered_by_diagnostics(frames):
         bench.until(lambda: bench.objects[-1].objects, "objects after bad input", tick=lambda: bench.send(later(frame, next(clock))))
 
 
+def later(frame, seconds):
+    return type(frame)(frame.color, frame.depth, frame.intrinsics, frame.world_from_camera, frame.camera, seconds)
+
+
+def test_swapped_topics_are_named(frames):
+    frame = frames[0]
+    clock = iter(range(1, 100000))
+    with Bench(cameras=["left"]) as bench:
+        bench.transforms()
+        color, depth, info = bench.out["left"]
+
+        def swapped():
+            head = cv.header("left_color_optical_frame", float(next(clock)))
+            info.publish(cv.intrinsics_to_msg(frame.intrinsics, head))
+            depth.publish(cv.image_to_msg(frame.color, "rgb8", head))
+            color.publish(cv.image_to_msg(np.nan_to_num(frame.depth * 1000).round(), "16UC1", head))
+
+        bench.until(lambda: "BAD_ENCODING" in bench.codes(), "BAD_ENCODING", tick=swapped)
+        assert any("camera/left/" in m and "16UC1" in m for m in bench.messages()) and not bench.objects
+        bench.until(lambda: bench.objects, "objects once the topics are right", tick=lambda: bench.send(later(frame, float(next(clock)))))
+
+
+def test_stamps_that_jump_back_are_named_and_survived(frames):
+    frame = frames[0]
+    with Bench(cameras=["left"]) as bench:
+        bench.transforms()
+        clock = iter(range(1000, 100000))
+        bench.until(lambda: bench.objects, "objects", tick=lambda: bench.send(later(frame, float(next(clock)))))
+        count = len(bench.objects)
+        past = iter(range(10, 900))
+        bench.until(
+            lambda: len(bench.objects) > count and "STALE_DATA" in bench.codes(), "objects and STALE_DATA after stamps went back", tick=lambda: bench.send(later(frame, float(next(past))))
+        )
+        assert bench.objects[-1].header.stamp.sec < 900
+
+
+def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
+    clock = iter(range(1, 100000))
+    with Bench() as bench:
+        bench.transforms()
+
+        def both():
+            seconds = float(next(clock))
+            for frame in frames:
+                bench.send(later(frame, seconds))
+
+        bench.until(lambda: bench.objects, "objects of two cameras", tick=both)
+        count, last = len(bench.objects), bench.objects[-1].header.stamp.sec
+        bench.until(
+            lambda: len(bench.objects) > count + 1 and any("camera right" in m and "OK" not in m for m in bench.messages()) and "STALE_DATA" in bench.codes(),
+            "objects of one camera and a diagnostic of the other",
+            tick=lambda: bench.send(later(frames[0], float(next(clock)))),
+        )
+        assert bench.objects[-1].header.stamp.sec > last and len(bench.objects[-1].objects) == 2
+
+
 def test_a_bad_start_is_refused():
     rclpy.init()
     try:

@@ -1,0 +1,341 @@
+"""How good perception is, in numbers: ``ros2 run magic_perception evaluate --data FOLDER --out DIR``.
+
+Three parts, each left out, and said so, where its data are absent:
+
+osd       Segmentation of the OSD scenes: mean best IoU of the labelled objects.
+captures  Single RealSense captures: how many objects, and their sizes beside those read from the images by hand.
+meshes    Ray-cast captures of scanned and modelled objects by two D435s (:mod:`magic_core.sensor`): mask IoU, and for the
+          paper's reconstruction and this one side by side the Chamfer distance, the volumetric IoU and the holes that are open.
+
+Writes evaluation.json, evaluation.md and evaluation.png (the meshes part's pictures).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.errors import MagicError
+from magic_core.mesh import Mesh, load
+from magic_core.rendering import Raycaster
+from magic_core.scene import CanonicalView, SceneObject
+from magic_core.views import find_view, holes_of
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.segmentation import Segmenter, _frame_on, find_table, look, make_segmenter
+from magic_perception.table import camera_over_table
+
+#: Longest, middle and shortest side in mm, read from the images: silhouette edges carried to the tangent planes, highest
+#: points above the table; the bottle's depth is that of YCB's model 006.
+SIZES = {"red_mug": (123, 99, 82), "mustard": (191, 95, 58), "cylinder": (150, 68, 68)}
+
+#: Folders of meshes that stand as they are stored; the others lie in their most probable stable pose.
+STANDING = ("mugs", "mug_trees", "targets", "watches")
+
+
+def read_frame(color: Path, depth: Path, intrinsics: Intrinsics, name: str) -> RgbdFrame:
+    """A frame of PNG files, depth in mm; the table in sight is z = 0."""
+    image = cv2.imread(str(color))[..., ::-1].copy()
+    metres = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
+    metres[metres == 0] = np.nan
+    return RgbdFrame(image, metres, intrinsics, camera_over_table(intrinsics.unproject(metres)[::3, ::3]), name)
+
+
+def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Intersection over union of two masks."""
+    return float(np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1))
+
+
+# ---------------------------------------------------------------- OSD
+
+
+def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:
+    """Best IoU of each labelled object.  Labels 40, 41, ... are surfaces of one thing (a bowl's outside and inside): objects are told by their tens."""
+    scenes: dict[str, object] = {}
+    everything: list[float] = []
+    for name, k in json.loads((folder / "intrinsics.json").read_text()).items():
+        frame = read_frame(folder / f"{name}_color.png", folder / f"{name}_depth_mm.png", Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]), name)
+        truth = cv2.imread(str(folder / f"{name}_label.png"), cv2.IMREAD_UNCHANGED).astype(int) // 10 * 10
+        parameters = Parameters(region_low=(-2, -2, -0.05), region_high=(2, 2, 0.6), split=split)
+        start = time.process_time()
+        table, own = find_table([frame], parameters)
+        labels = segmenter.segment([look(frame, own[0], _frame_on(table, np.eye(4)), parameters)], (), parameters)[0]
+        seconds = time.process_time() - start
+        scores = []
+        for value in np.unique(truth[truth >= 20]):
+            mask = truth == value
+            scores.append(max((overlap(mask, labels == i) for i in np.unique(labels[mask]) if i > 0), default=0.0))
+        scenes[name] = {"objects": len(scores), "found": int(labels.max()), "best_iou": [round(s, 3) for s in scores], "cpu_seconds": round(seconds, 3)}
+        everything += scores
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(pictures / f"{name}.png"), tinted(frame.color, labels)[..., ::-1])
+    return {"mean_best_iou": round(float(np.mean(everything)), 4), "objects": len(everything), "scenes": scenes}
+
+
+def tinted(color: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """The picture with each label in a colour of its own."""
+    palette = np.random.default_rng(1).integers(60, 255, (64, 3))
+    drawn = color.copy()
+    for value in np.unique(labels[labels > 0]):
+        drawn[labels == value] = (0.4 * drawn[labels == value] + 0.6 * palette[value % 64]).astype(np.uint8)
+    return drawn
+
+
+# ---------------------------------------------------------------- real captures
+
+
+def captures(folder: Path, segmenter: Segmenter) -> dict[str, object]:
+    """Objects and sizes of the single captures; the region is cut at 1.3 m before the camera."""
+    frames = []
+    single = folder / "realsense_single"
+    if single.is_dir():
+        for name, k in json.loads((single / "intrinsics.json").read_text()).items():
+            frames.append(read_frame(single / f"{name}_color.png", single / f"{name}_depth_mm.png", Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]), name))
+    if (folder / "mallet").is_dir():
+        k = json.loads((folder / "mallet/realsense_intrinsic.json").read_text())
+        m = k["intrinsic_matrix"]
+        frames.append(read_frame(folder / "mallet/rgb.png", folder / "mallet/depth.png", Intrinsics(k["width"], k["height"], m[0], m[4], m[6], m[7]), "mallet"))
+    result: dict[str, object] = {}
+    for frame in frames:
+        report = Report()
+        start = time.process_time()
+        scene = perceive([frame], parameters=Parameters(region_low=(-1.3, -1.3, -0.05), region_high=(1.3, 1.3, 0.6)), segmenter=segmenter, report=report)
+        seconds = time.process_time() - start
+        sizes = [sorted((o.box_extents * 1000).round(1).tolist(), reverse=True) for o in scene.objects]
+        row: dict[str, object] = {"objects": len(sizes), "cpu_seconds": round(seconds, 3), "sizes_mm": sizes[:4]}
+        if frame.camera in SIZES and sizes:
+            row["read_mm"] = SIZES[frame.camera]
+            row["largest_error_mm"] = round(float(np.max(np.abs(np.array(sizes[0]) - np.sort(SIZES[frame.camera])[::-1]))), 1)
+        result[frame.camera] = row
+    return result
+
+
+# ---------------------------------------------------------------- meshes
+
+
+def placed(path: Path, yaw: float) -> Mesh:
+    """A mesh file on the table at the middle of the cameras' view, turned by ``yaw``."""
+    mesh = load(path)
+    if path.parent.name not in STANDING:
+        poses, chance = mesh.to_trimesh().convex_hull.compute_stable_poses()
+        mesh = mesh.transformed(poses[int(np.argmax(chance))])
+    middle = (mesh.bounds[0] + mesh.bounds[1]) / 2
+    mesh = mesh.transformed(transforms.make(None, [-middle[0], -middle[1], -mesh.bounds[0, 2]]))
+    return mesh.transformed(transforms.from_rpy(0, 0, yaw, [0.5, 0, 0]))
+
+
+def chamfer(a: Mesh, b: Mesh, count: int = 6000) -> float:
+    """Mean of the two mean distances in metres between points sampled on the surfaces."""
+    import trimesh
+    from scipy.spatial import cKDTree
+
+    p, q = (trimesh.sample.sample_surface(m.to_trimesh(), count, seed=0)[0] for m in (a, b))
+    return float(cKDTree(q).query(p)[0].mean() + cKDTree(p).query(q)[0].mean()) / 2
+
+
+def shared_volume(a: Mesh, b: Mesh, count: int = 60000) -> float | None:
+    """Volume of the intersection over that of the union, by points in the common box; ``None`` where a mesh is not watertight."""
+    import open3d as o3d
+
+    inside = []
+    low, high = np.minimum(a.bounds[0], b.bounds[0]), np.maximum(a.bounds[1], b.bounds[1])
+    points = np.random.default_rng(0).uniform(low, high, (count, 3)).astype(np.float32)
+    for mesh in (a, b):
+        solid = mesh.to_trimesh()
+        solid.merge_vertices()
+        if not solid.is_watertight:
+            return None
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        inside.append(scene.compute_occupancy(o3d.core.Tensor(points), nsamples=3).numpy() > 0.5)
+    return overlap(*inside)
+
+
+def open_holes(truth: Mesh, view: CanonicalView, found: Mesh, least: float = 6e-5) -> tuple[int, int]:
+    """Holes of at least ``least`` square metres in the true object's view, and how many of them are at least half open and enclosed in ``found``."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes_of(view.mask).astype(np.uint8), connectivity=4)
+    shown = Raycaster([found]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0].ids >= 0
+    holes = holes_of(shown)
+    total = opened = 0
+    for i in range(1, count):
+        if stats[i, cv2.CC_STAT_AREA] * view.metres_per_pixel**2 < least:
+            continue
+        total += 1
+        opened += int(np.mean(holes[labels == i]) > 0.5)
+    return total, opened
+
+
+def meshes(folder: Path, segmenter: Segmenter, poses: int = 3, seed: int = 0) -> tuple[dict[str, object], list[NDArray[np.uint8]]]:
+    """Ray-cast captures of each mesh file in ``poses`` yaws; also a row of pictures for each mesh."""
+    from magic_core import sensor
+
+    cameras = {"left": sensor.looking_at([0.94, 0.42, 0.66], [0.5, 0, 0.03]), "right": sensor.looking_at([0.94, -0.42, 0.66], [0.5, 0, 0.03])}
+    rows, pictures = [], []
+    for number, path in enumerate(sorted(folder.glob("*/*.obj"))):
+        for turn in range(poses):
+            truth = placed(path, 0.4 + 2 * np.pi * turn / poses)
+            caster = sensor.scene_raycaster([truth])
+            frames = [sensor.capture([truth], sensor.D435, pose, [seed, number, turn, i], camera=name, raycaster=caster) for i, (name, pose) in enumerate(cameras.items())]
+            masks = [caster.perspective(sensor.D435, pose)[0].ids == 1 for pose in cameras.values()]
+            view = find_view(truth)
+            row: dict[str, object] = {"mesh": f"{path.parent.name}/{path.stem}", "turn": turn}
+            drawn = [view.image]
+            for method in ("completed", "paper"):
+                report = Report()
+                start = time.process_time()
+                scene = perceive(frames, parameters=Parameters(method=method), segmenter=segmenter, report=report)
+                row[f"{method}_cpu_seconds"] = round(time.process_time() - start, 3)
+                item = nearest(scene.objects, truth)
+                if item is None:
+                    row[method] = None
+                    continue
+                if method == "completed":
+                    row["objects"] = len(scene.objects)
+                    label = sorted(set(np.unique(np.concatenate([i[i > 0] for i in report.labels]))))[[o.id for o in scene.objects].index(item.id)]
+                    row["mask_iou"] = round(float(np.mean([overlap(m, i == label) for m, i in zip(masks, report.labels, strict=True)])), 4)
+                    row["pieces"] = len(item.pieces)
+                    row["shape"] = report.shapes[item.id]
+                found = item.mesh.transformed(item.world_from_object)
+                volume = shared_volume(truth, found)
+                total, opened = open_holes(truth, view, found)
+                row[method] = {"chamfer_mm": round(1000 * chamfer(truth, found), 2), "volume_iou": None if volume is None else round(volume, 3), "holes": total, "open": opened}
+                shown = Raycaster([replace(found, colors=None)]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0]
+                drawn.append(np.where((shown.ids >= 0)[..., None], (90 + 150 * np.abs(shown.normals @ transforms.unit([0.3, 0.4, 0.86])))[..., None], 0).astype(np.uint8).repeat(3, axis=2))
+            rows.append(row)
+            if turn == 0:
+                pictures.append(strip(frames, masks, truth, drawn))
+    return {"rows": rows, **summary(rows)}, pictures
+
+
+def nearest(objects: tuple[SceneObject, ...], truth: Mesh) -> SceneObject | None:
+    """The object whose centre is nearest to that of the true mesh; ``None`` where all are farther than 15 cm."""
+    middle = truth.bounds.mean(axis=0)
+    far = [float(np.linalg.norm(o.world_from_object[:3, 3] - middle)) for o in objects]
+    return objects[int(np.argmin(far))] if far and min(far) < 0.15 else None
+
+
+def summary(rows: list[dict[str, object]]) -> dict[str, object]:
+    """Means over all rows."""
+    seen = [r for r in rows if r.get("mask_iou") is not None]
+    result: dict[str, object] = {"captures": len(rows), "found": len(seen), "one_object": sum(r["objects"] == 1 for r in seen), "mask_iou": round(float(np.mean([r["mask_iou"] for r in seen])), 4)}
+    for method in ("completed", "paper"):
+        cells = [r[method] for r in rows if isinstance(r.get(method), dict)]
+        volumes = [c["volume_iou"] for c in cells if c["volume_iou"] is not None]
+        result[method] = {
+            "chamfer_mm": round(float(np.mean([c["chamfer_mm"] for c in cells])), 2),
+            "chamfer_mm_median": round(float(np.median([c["chamfer_mm"] for c in cells])), 2),
+            "volume_iou": round(float(np.mean(volumes)), 3),
+            "volumes": len(volumes),
+            "holes": sum(c["holes"] for c in cells),
+            "holes_open": sum(c["open"] for c in cells),
+        }
+    return result
+
+
+def strip(frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], truth: Mesh, views: list[NDArray[np.uint8]], size: int = 150) -> NDArray[np.uint8]:
+    """One row of pictures: the left camera's cut-out, then the true view, this reconstruction and the paper's."""
+    rows, columns = np.nonzero(masks[0])
+    middle = (int(rows.mean()), int(columns.mean()))
+    half = int(max(np.ptp(rows), np.ptp(columns), 40) * 0.6)
+    cut = frames[0].color[max(middle[0] - half, 0) : middle[0] + half, max(middle[1] - half, 0) : middle[1] + half]
+    return np.hstack([cv2.resize(np.ascontiguousarray(tile), (size, size), interpolation=cv2.INTER_AREA) for tile in (cut, *views)] + [np.zeros((size, size, 3), np.uint8)] * (3 - len(views)))
+
+
+# ---------------------------------------------------------------- the report
+
+
+def markdown(result: dict) -> str:
+    """The tables."""
+    lines = ["# Perception, measured", ""]
+    if "osd" in result:
+        part = result["osd"]
+        lines += [f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects.", "", "| scene | objects | found | best IoU | CPU s |", "| --- | --- | --- | --- | --- |"]
+        lines += [f"| {n} | {s['objects']} | {s['found']} | {', '.join(f'{x:.2f}' for x in s['best_iou'])} | {s['cpu_seconds']:.2f} |" for n, s in part["scenes"].items()] + [""]
+    if "captures" in result:
+        lines += ["| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |", "| --- | --- | --- | --- | --- | --- |"]
+        for name, row in result["captures"].items():
+            size = " x ".join(f"{x:.0f}" for x in row["sizes_mm"][0]) if row["sizes_mm"] else ""
+            lines.append(f"| {name} | {row['objects']} | {size} | {' x '.join(map(str, row.get('read_mm', [])))} | {row.get('largest_error_mm', '')} | {row['cpu_seconds']:.2f} |")
+        lines.append("")
+    if "meshes" in result:
+        part = result["meshes"]
+        lines += [f"Ray-cast captures: {part['captures']}, found {part['found']}, as one object {part['one_object']}; mean mask IoU {part['mask_iou']:.3f}.", ""]
+        lines += ["| method | Chamfer, mm: mean | median | volumetric IoU | holes open |", "| --- | --- | --- | --- | --- |"]
+        for method in ("completed", "paper"):
+            m = part[method]
+            lines.append(f"| {method} | {m['chamfer_mm']:.2f} | {m['chamfer_mm_median']:.2f} | {m['volume_iou']:.3f} (of {m['volumes']}) | {m['holes_open']} of {m['holes']} |")
+        lines += ["", "| mesh | mask IoU | shape | pieces | Chamfer, mm: completed, paper | volumetric IoU: completed, paper | holes open: completed, paper |", "| --- | --- | --- | --- | --- | --- | --- |"]
+        for name in dict.fromkeys(r["mesh"] for r in part["rows"]):
+            mine = [r for r in part["rows"] if r["mesh"] == name and r.get("mask_iou") is not None]
+            if not mine:
+                lines.append(f"| {name} | not found | | | | | |")
+                continue
+
+            def pair(key: str, mine: list = mine) -> str:
+                return ", ".join(
+                    "-" if not (v := [r[m][key] for r in mine if isinstance(r.get(m), dict) and r[m][key] is not None]) else f"{np.mean(v):.2f}" for m in ("completed", "paper")
+                )
+
+            holes = ", ".join(f"{sum(r[m]['open'] for r in mine if isinstance(r.get(m), dict))}/{sum(r[m]['holes'] for r in mine if isinstance(r.get(m), dict))}" for m in ("completed", "paper"))
+            lines.append(f"| {name} | {np.mean([r['mask_iou'] for r in mine]):.3f} | {', '.join(dict.fromkeys(r['shape'] for r in mine))} | {max(r['pieces'] for r in mine)} | {pair('chamfer_mm')} | {pair('volume_iou')} | {holes} |")
+    return "\n".join(lines) + "\n"
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point; exit status 1 where no data are found."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="folder with meshes/ and rgbd/")
+    parser.add_argument("--out", type=Path, default=Path("evaluation"), help="folder for the results (default ./evaluation)")
+    parser.add_argument("--parts", nargs="+", choices=("osd", "captures", "meshes"), default=["osd", "captures", "meshes"])
+    parser.add_argument("--poses", type=int, default=3, help="yaws of each mesh (default 3)")
+    parser.add_argument("--segmenter", default="depth")
+    parser.add_argument("--weights", default="")
+    parser.add_argument("--no-split", action="store_true", help="do not part touching objects (osd)")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(args)
+    try:
+        segmenter = make_segmenter(given.segmenter, given.weights)
+        result: dict = {}
+        given.out.mkdir(parents=True, exist_ok=True)
+        for part, folder in (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes")):
+            if part not in given.parts:
+                continue
+            if not folder.is_dir():
+                print(f"evaluate: {part} left out: no folder {folder}", file=sys.stderr)
+                continue
+            if part == "osd":
+                result[part] = osd(folder, segmenter, not given.no_split, given.out / "osd")
+            elif part == "captures":
+                result[part] = captures(folder, segmenter)
+            else:
+                result[part], pictures = meshes(folder, segmenter, given.poses, given.seed)
+                half = -(-len(pictures) // 2)
+                pictures += [np.zeros_like(pictures[0])] * (2 * half - len(pictures))
+                sheet = np.hstack([np.vstack(pictures[:half]), np.vstack(pictures[half:])])
+                cv2.imwrite(str(given.out / "evaluation.png"), sheet[..., ::-1])
+    except MagicError as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        sys.exit(1)
+    if not result:
+        print(f"evaluate: nothing to measure in {given.data}", file=sys.stderr)
+        sys.exit(1)
+    (given.out / "evaluation.json").write_text(json.dumps(result, indent=1))
+    text = markdown(result)
+    (given.out / "evaluation.md").write_text(text)
+    print(text)
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()
