@@ -28,6 +28,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
+from magic_verifier.floating import settled
 from magic_verifier.posing import PoseEntry, posed, read_poses
 
 TASKS = ("scooping", "hanging", "hooking")
@@ -319,6 +320,9 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     try:
         strategy = _strategy(options)
         tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
+        if options.variant == "arm":
+            # The arm takes the tool as it lies by itself: a spoon set on the bottom of its bowl tips on to its handle.
+            tools = [settled(tool, TABLE, strategy.physics) for tool in tools]
         target, obstacles, meeting = scene_for(strategy, case.target)
         matcher = _matcher(options.features, options.weights, options.method)
         reference = _reference(strategy)

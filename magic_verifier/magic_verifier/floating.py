@@ -114,6 +114,28 @@ def lifted_onto_table(body: Body, table: NDArray[np.float64]) -> Body:
     return replace(body, world_from_object=transforms.make(translation=depth * table[:3]) @ body.world_from_object)
 
 
+def settled(item: SceneObject, table: NDArray[np.float64], physics: Physics, seconds: float = 3.0) -> SceneObject:
+    """The object as it comes to lie on the table when it is put down at its pose and let go, as a tool lies that is to be grasped.
+
+    It has come to rest when it is slower than 2 mm/s and 0.02 rad/s for a tenth of a second; else after ``seconds``.
+    Raises ``BAD_SCENE`` as :func:`make_setup` does, ``SIMULATION_EXPLODED`` where it does not stay.
+    """
+    body = Body(item.id, tuple(usable_pieces(item.id, item.pieces)), np.asarray(item.world_from_object, dtype=float))
+    body = lifted_onto_table(body, np.asarray(table, dtype=float))
+    world = World(Settings(position_iterations=25, angular_damping=2.0))
+    world.add_table(np.asarray(table, dtype=float), physics.friction, TABLE)
+    world.add(TOOL, list(body.hulls), body.world_from_object, DYNAMIC, physics.tool_density, physics.friction)
+    still = 0
+    while world.time < seconds and still < 24:
+        world.step()
+        turning = float(np.linalg.norm(world.component(TOOL).angular_velocity))
+        still = still + 1 if np.linalg.norm(world.velocity(TOOL)) < 0.002 and turning < 0.02 else 0
+    world.check((TOOL,))
+    pose = world.pose(TOOL)
+    moved = pose @ transforms.inverse(item.world_from_object)
+    return replace(item, world_from_object=pose, world_from_box=moved @ item.world_from_box)
+
+
 def perturbed(setup: Setup, perturbation: Perturbation, rng: np.random.Generator) -> Setup:
     """A setup with the target displaced and friction and densities scaled; a fixed target stays where it is."""
     scale = 1 + rng.uniform(-1, 1, 3) * [perturbation.friction, perturbation.density, perturbation.density]

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_verifier.simulation import extremes
+from magic_verifier.simulation import MANY_POINTS, extremes
 
 #: Cells along the longer side of the height map that water is poured on.
 CELLS = 40
@@ -119,11 +119,14 @@ def canonical_turn(mesh: Mesh, kind: str) -> NDArray[np.float64]:
     if kind == "top":
         # Already flat: not to be turned by the little that the least box differs from it.
         return np.eye(4) if mesh.extents[2] <= 1.05 * extents[0] + 1e-6 else _turn_up(box[0])
+    from magic_core.rendering import Raycaster
+
+    caster = Raycaster([mesh])
+    points = mesh.vertices if len(mesh.vertices) <= MANY_POINTS else extremes(mesh.vertices, 300)
     ups = [sign * axis for axis in (*np.eye(3)[::-1], *box) for sign in (1.0, -1.0)]
-    stood = [mesh.transformed(_turn_up(up)) for up in ups]
-    water = np.array([capacity(item) for item in stood])
+    water = np.array([capacity(caster, points, _turn_up(up)) for up in ups])
     best = int(np.argmax(water))
-    if water[best] < DRY * float(np.prod(stood[best].extents)):
+    if water[best] < DRY * float(np.prod(np.ptp(transforms.apply(_turn_up(ups[best]), points), axis=0))):
         return np.eye(4)
     # The first of those that hold as much: the file's own axes before the box's.
     first = int(np.argmax(water >= 0.95 * water[best]))
@@ -134,7 +137,7 @@ def canonical_turn(mesh: Mesh, kind: str) -> NDArray[np.float64]:
     for step in np.deg2rad([24.0, 12.0, 6.0, 3.0]):
         for roll, pitch in ((step, 0), (-step, 0), (0, step), (0, -step)):
             tried = transforms.from_rpy(roll, pitch, 0) @ turn
-            while (held := capacity(mesh.transformed(tried))) > 1.02 * most:
+            while (held := capacity(caster, points, tried)) > 1.02 * most:
                 turn, most = tried, held
                 tried = transforms.from_rpy(roll, pitch, 0) @ turn
     return turn
@@ -153,7 +156,7 @@ def _box(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Axes (3, 3) of the least box as rows and its edges (3,), the shortest first; the mesh's own box where there is none."""
     import trimesh
 
-    points = mesh.vertices if len(mesh.vertices) <= 1000 else extremes(mesh.vertices, 1000)
+    points = mesh.vertices if len(mesh.vertices) <= 1000 else extremes(mesh.vertices, 300)
     try:
         box_from_mesh, extents = trimesh.bounds.oriented_bounds(points)
     except Exception:  # qhull's and numpy's errors for flat or pointed meshes
@@ -162,11 +165,14 @@ def _box(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return box_from_mesh[:3, :3][order], np.asarray(extents)[order]
 
 
-def capacity(mesh: Mesh) -> float:
-    """Cubic metres of water that stay on a mesh (z up) when it is rained on, on a grid of CELLS along its longer side."""
-    from magic_core.rendering import Raycaster
+def capacity(caster: Any, points: NDArray[np.float64], turn: NDArray[np.float64]) -> float:
+    """Cubic metres of water that stay on a mesh, turned by ``turn`` (4, 4) so that z is up, when it is rained on.
 
-    low, high = mesh.bounds
+    caster: a :class:`magic_core.rendering.Raycaster` of the mesh as it is; points (N, 3) span its box.  The ground is
+    looked at on a grid of CELLS along the longer side.
+    """
+    turned = transforms.apply(turn, points)
+    low, high = turned.min(axis=0), turned.max(axis=0)
     pitch = float((high - low)[:2].max()) / CELLS
     if pitch <= 0:
         return 0.0
@@ -174,7 +180,8 @@ def capacity(mesh: Mesh) -> float:
     x, y = (low[axis] + (np.arange(shape[axis]) + 0.5) * pitch for axis in (0, 1))
     origins = np.empty((shape[0], shape[1], 3))
     origins[..., 0], origins[..., 1], origins[..., 2] = x[:, None], y[None, :], high[2] + 0.01
-    distance = Raycaster([mesh]).cast(origins, np.array([0, 0, -1.0])).distance
+    back = transforms.inverse(turn)
+    distance = caster.cast(transforms.apply(back, origins.reshape(-1, 3)).reshape(origins.shape), -back[:3, 2]).distance
     ground = np.pad(np.where(np.isfinite(distance), high[2] + 0.01 - distance, -np.inf), 1, constant_values=-np.inf)
     # Priority flood (Barnes et al. 2014): water leaves where nothing is below, and stands elsewhere up to the lowest way out.
     level = np.full(ground.shape, np.inf)
