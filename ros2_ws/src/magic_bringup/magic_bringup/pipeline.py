@@ -187,39 +187,43 @@ class Stages(Protocol):
 
 
 class Agenda:
-    """Which trial comes next.
+    """Which trial comes next: the one that promises most.
 
-    First every candidate with every reflection gets one attempt, in order of score;
-    then those that another grasp may help get their second, and so on.  A grasp that
-    slipped is followed by the next grasp of the same contact.
+    A trial promises its candidate's share of the best candidate's score, halved with each
+    further attempt: among candidates of like score every one gets its first grasp before one
+    gets its second, but a far better contact gets another grasp before far worse ones are tried.
+    A grasp that slipped is followed by the next grasp of the same contact.  Trials of the same
+    promise are taken in the order of the candidates, and of the reflections.
     """
 
     def __init__(self, candidates: Sequence[Any], reflections: Sequence[str], attempts: int) -> None:
         self._attempts = max(1, attempts)
         self._order: dict[tuple[int, str], int] = {}
-        self._heap: list[tuple[int, int, int, Trial]] = []
+        self._heap: list[tuple[float, int, int, Trial]] = []
+        best = max((float(c.score) for c in candidates), default=0.0)
         for index, candidate in enumerate(candidates):
+            share = min(1.0, max(0.0, float(candidate.score) / best)) if best > 0 else 1.0
             for reflection in reflections_of(candidate, reflections):
                 self._order[index, reflection] = len(self._order)
-                self._push(0, Trial(index, candidate, reflection))
+                self._push(share, Trial(index, candidate, reflection))
 
-    def _push(self, turn: int, trial: Trial) -> None:
+    def _push(self, promise: float, trial: Trial) -> None:
         # Order and attempt are unique together, so that trials themselves are never compared.
-        heapq.heappush(self._heap, (turn, self._order[trial.index, trial.reflection], trial.attempt, trial))
+        heapq.heappush(self._heap, (-promise, self._order[trial.index, trial.reflection], trial.attempt, trial))
 
-    def next(self) -> tuple[int, Trial] | None:
-        """The next trial with the round it belongs to; ``None`` when all are done."""
+    def next(self) -> tuple[float, Trial] | None:
+        """The next trial with what it promises; ``None`` when all are done."""
         if not self._heap:
             return None
-        turn, _, _, trial = heapq.heappop(self._heap)
-        return turn, trial
+        promise, _, _, trial = heapq.heappop(self._heap)
+        return -promise, trial
 
-    def failed(self, turn: int, trial: Trial, code: Code) -> None:
+    def failed(self, promise: float, trial: Trial, code: Code) -> None:
         """Put the next attempt of a failed trial on the list where one may help."""
         if code in EXHAUSTED or trial.attempt + 1 >= self._attempts:
             return
         again = Trial(trial.index, trial.candidate, trial.reflection, trial.attempt + 1)
-        self._push(turn if code in GRASP_ONLY else turn + 1, again)
+        self._push(promise if code in GRASP_ONLY else promise / 2, again)
 
 
 def reflections_of(candidate: Any, reflections: Sequence[str]) -> tuple[str, ...]:
@@ -293,13 +297,13 @@ class Run:
             raise MagicError(Code.NO_MATCH, "the matcher found no contact" + (f": {matches.message}" if matches.message else ""))
         agenda = Agenda(matches.candidates, self._reflections, self._settings.attempts if request.variant == "arm" else 1)
         while (entry := agenda.next()) is not None:
-            turn, trial = entry
+            promise, trial = entry
             if self._left() < self._settings.reserve:
                 raise self._late()
             outcome, code = self._try(matches, trial)
             if outcome is not None:
                 return outcome
-            agenda.failed(turn, trial, code)
+            agenda.failed(promise, trial, code)
         return self._outcome(Code.NO_CANDIDATE_SUCCEEDED, self._summary())
 
     def _try(self, matches: Matches, trial: Trial) -> tuple[Outcome | None, Code]:

@@ -184,6 +184,27 @@ def test_progress_names_stage_and_reasons_so_far():
     assert [r.code for r in last.reports] == [Code.DRIFT, Code.OK]
 
 
+@pytest.mark.parametrize(
+    "scores, code, expected",
+    [
+        # Of like score: every contact first, then the second grasps.
+        ((1.0, 0.9, 0.8), Code.NO_IK, [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]),
+        # A far better contact gets its second grasp before far worse ones are tried.
+        ((0.72, 0.19, 0.15), Code.LOST_CONTACT, [(0, 0), (0, 1), (1, 0), (2, 0), (1, 1), (2, 1)]),
+        ((1.0, 0.9), Code.GRASP_SLIPPED, [(0, 0), (0, 1), (1, 0), (1, 1)]),
+        ((0.0, -0.1), Code.DRIFT, [(0, 0), (1, 0), (0, 1), (1, 1)]),
+        ((1.0, 0.9), Code.NO_GRASP, [(0, 0), (1, 0)]),
+    ],
+)
+def test_what_promises_most_comes_next(scores, code, expected):
+    agenda = Agenda([candidate(s) for s in scores], ("keep",), 2)
+    order = []
+    while (entry := agenda.next()) is not None:
+        order.append((entry[1].index, entry[1].attempt))
+        agenda.failed(*entry, code)
+    assert order == expected
+
+
 def test_agenda_is_empty_in_the_end():
     agenda = Agenda([candidate()], ("keep",), 1)
     turn, trial = agenda.next()
