@@ -74,7 +74,7 @@ class Contour:
         return values.ravel()[: len(flat)].reshape(points.shape[:-1])
 
 
-def _resample(line: NDArray[np.float64], spacing: float) -> tuple[NDArray[np.float64], float] | None:
+def resample(line: NDArray[np.float64], spacing: float) -> tuple[NDArray[np.float64], float] | None:
     """A closed polyline at even steps of about ``spacing`` pixels."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     keep = np.concatenate([[True], steps > 1e-9])
@@ -106,7 +106,7 @@ def extract(mask: NDArray[np.bool_], spacing: float = 1.0, blur: float = BLUR) -
     normals: list[NDArray[np.float64]] = []
     spacings: list[float] = []
     for line in lines:
-        resampled = _resample(line - _MARGIN, spacing)
+        resampled = resample(line - _MARGIN, spacing)
         if resampled is None:
             continue
         loop, step = resampled

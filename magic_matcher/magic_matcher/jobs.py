@@ -1,8 +1,11 @@
 """Labelled pairs of procedural shapes: what a right answer is, for training, tests and the bench.
 
-A job names, for each family of shapes, the regions on which a contact would do it, and
-the sizes of the targets it is done to.  The families that the weights are fitted on and
-those that they are tested on are different ones.
+A job names, for each family of shapes, the regions made for it, and the sizes of the
+targets it is done to.  Where a contact would *work* is decided for the tool and the
+target at hand: in a pull the disc must find room and be held while the tool moves
+along the contact's normal; hung, the tool must not be able to fall off the disc.  This
+admits places nobody marked (the outer V of open scissors) and rejects marked ones that are too
+narrow (a finger ring for a thick cylinder).  A bowl is where the generator made it.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from magic_core import shapes
 from magic_core.contact import Contact, contact_frame
 from magic_core.scene import CanonicalView
 from magic_matcher import contour as contours
+from magic_matcher import holding
 from magic_matcher.contour import Contour
 from magic_matcher.matching import Target
 
@@ -26,13 +30,15 @@ from magic_matcher.matching import Target
 @dataclass(frozen=True)
 class Job:
     """view: kind of canonical view; regions: of each family, those that do the job ('*' at the end: all that begin so);
-    targets: least and greatest radius (m) of what it is done to; references: families of the demonstration."""
+    targets: least and greatest radius (m) of what it is done to; references: families of the demonstration and their regions;
+    needs: ``press`` (held while the tool moves along the normal), ``swing`` (the tool hangs safely) or ``region``."""
 
     name: str
     view: str
     regions: Mapping[str, tuple[str, ...]]
     targets: tuple[float, float]
     references: Mapping[str, str]
+    needs: str = "region"
 
 
 JOBS: dict[str, Job] = {
@@ -52,6 +58,7 @@ JOBS: dict[str, Job] = {
         },
         (0.015, 0.035),
         {"l_hook": "inner", "j_hook": "inner"},
+        "press",
     ),
     "hanging": Job(
         "hanging",
@@ -66,6 +73,7 @@ JOBS: dict[str, Job] = {
         },
         (0.004, 0.009),
         {"hanger": "hook"},
+        "swing",
     ),
     "scooping": Job(
         "scooping",
@@ -76,22 +84,23 @@ JOBS: dict[str, Job] = {
     ),
 }
 
-#: Families the weights are fitted on, as tools; every other family of a job is for testing only.
-TRAINING = ("l_hook", "j_hook", "s_hook", "letter", "hammer", "spoon")
+#: What counts as held: standing off from the contact, sliding before it rests (half a radius is the drift that a pull may
+#: have), and the depth of the hollow, in radii.
+GAP, DRIFT, DEPTH = 1.05, 0.5, 0.3
 
 
 @dataclass(frozen=True)
 class Example:
     """A shape drawn for matching: its view, contour, and the places that do the job.
 
-    right (N,) bool says which contour points lie on one of the regions with a normal
-    that agrees, and, where ``target`` (m) is given, admit a disc of that radius.
+    :meth:`near` and :meth:`works` say which of them do.
     """
 
     shape: shapes.Shape
     view: CanonicalView
     contour: Contour
     job: Job
+    true: Contour
 
     def names(self) -> list[str]:
         """The shape's regions that do the job."""
@@ -137,19 +146,48 @@ class Example:
         return result
 
 
+    def works(self, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
+        """Which contacts (N, 2) with outward normals would do the job with a target of ``radius`` px."""
+        if self.job.needs == "region":
+            right = self.near(points, normals, self.contour.size / 50)
+            right[right] = self.admits(points[right], normals[right], radius)
+            return right
+        held = self.held(points, normals, radius)
+        if self.job.needs == "press":
+            return (held.gap <= GAP) & (held.drift <= DRIFT) & (held.press[:, 0] >= DEPTH)
+        return (held.gap <= GAP) & (held.start >= DEPTH)
+
+    def held(self, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float) -> holding.Held:
+        """Press discs against contacts, on the outline as it truly is."""
+        return holding.hold(self.true, points, normals, radius)
+
+
+def roughen(mask: NDArray[np.bool_], seed: int) -> NDArray[np.bool_]:
+    """A mask as a camera and a segmentation leave it: corners rounded, the edge wavy by a pixel or two, a little too large or too small."""
+    random = np.random.default_rng([seed, 77])
+    noise = cv2.GaussianBlur(random.standard_normal(mask.shape).astype(np.float32), (0, 0), random.uniform(2.0, 5.0))
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), random.uniform(1.0, 2.2))
+    soft += noise * (0.12 / max(float(noise.std()), 1e-9)) * (np.abs(soft - 0.5) < 0.45)
+    return soft > random.uniform(0.38, 0.58)
+
+
 @lru_cache(maxsize=1024)
-def example(job: str, family: str, seed: int) -> Example:
-    """A drawn shape of a family for a job."""
+def example(job: str, family: str, seed: int, rough: bool = False) -> Example:
+    """A drawn shape of a family for a job; rough: seen as :func:`roughen` has it."""
     shape = shapes.make(family, seed)
     view = shape.view(JOBS[job].view)
-    return Example(shape, view, contours.extract(view.mask), JOBS[job])
+    true = contours.extract(view.mask)
+    if not rough:
+        return Example(shape, view, true, JOBS[job], true)
+    mask = roughen(view.mask, seed)
+    view = CanonicalView(np.where(mask[..., None], view.image, 0).astype(np.uint8), mask, view.metres_per_pixel, view.object_from_view, view.kind)
+    return Example(shape, view, contours.extract(mask), JOBS[job], true)
 
 
 def usable(tool: Example, radius: float) -> bool:
-    """Whether a disc of ``radius`` px finds room at any of the tool's regions: a tool that cannot do the job is no test."""
-    contour = tool.contour
-    right = tool.near(contour.points[::3], contour.normals[::3], 3.0)
-    return bool(tool.admits(contour.points[::3][right], contour.normals[::3][right], radius).any())
+    """Whether any place on the tool would do the job for a disc of ``radius`` px: a tool that cannot is no test."""
+    contour = tool.true
+    return bool(tool.works(contour.points[::3], contour.normals[::3], radius).any())
 
 
 def disc_target(radius: float, kind: str) -> Target:

@@ -1,0 +1,103 @@
+"""Speed and memory of the matcher, each against what it is measured by, in one run."""
+
+from __future__ import annotations
+
+import gc
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from magic_matcher import features, jobs, matching
+from magic_matcher.features import Reference, make_reference
+
+
+def resident() -> float:
+    """Memory of this process now, MB (the peak, where /proc is not there)."""
+    try:
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * resource.getpagesize() / 1e6
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+def timed(work: Callable[[], Any], repeats: int) -> dict[str, float]:
+    """Median and least seconds of a call: on the clock, and of this process's CPU time (all threads)."""
+    work()
+    clock, cpu = [], []
+    for _ in range(repeats):
+        a, b = time.perf_counter(), time.process_time()
+        work()
+        clock.append(time.perf_counter() - a)
+        cpu.append(time.process_time() - b)
+    return {"median_s": float(np.median(clock)), "least_s": min(clock), "median_cpu_s": float(np.median(cpu)), "least_cpu_s": min(cpu)}
+
+
+def random_vit_s(folder: str) -> str:
+    """Randomly initialised weights of DINOv2 ViT-S/14 in a folder: as fast as trained ones."""
+    import torch
+    from transformers import Dinov2Config, Dinov2Model
+
+    torch.manual_seed(0)
+    config = Dinov2Config(hidden_size=384, num_hidden_layers=12, num_attention_heads=6, image_size=518, patch_size=14)
+    Dinov2Model(config).save_pretrained(folder)
+    return folder
+
+
+def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[str, Any]:
+    """Seconds a match of both backends after the reference is prepared, DINOv2's one network pass, memory over many requests."""
+    job = jobs.JOBS["hooking"]
+    shown = jobs.example("hooking", "l_hook", 5000)
+    contact = shown.contact("inner")
+    reference: Reference = make_reference(shown.view, contact.pixel, contact.normal, 0.025 / shown.view.metres_per_pixel, shown.contour)
+    target = jobs.disc_target(0.02, job.view)
+    tools = [matching.Tool(name, jobs.example("hooking", name, 7000).view) for name in ("caliper", "hammer", "scissors", "watch")]
+
+    def match(matcher: matching.Matcher, tool: matching.Tool) -> None:
+        matcher.match_views(reference, contact, [tool], target, 3, False, 0.025)
+
+    matcher = matching.Matcher(features.load("embedded"))
+    result: dict[str, Any] = {"embedded": {tool.id: timed(lambda tool=tool: match(matcher, tool), repeats) for tool in tools}}
+    with tempfile.TemporaryDirectory() as folder:
+        backend = features.load("dinov2", weights or random_vit_s(folder))
+        network = matching.Matcher(backend)
+        network.prepare(reference)
+        picture = np.zeros((1, backend.size, backend.size, 3), np.uint8)
+        backend.extract(picture)
+        # In turns, so that what else runs on the machine slows both alike.
+        passes, matches = [], []
+        for _ in range(repeats):
+            passes.append(timed_once(lambda: backend.extract(picture)))
+            matches.append(timed_once(lambda: match(network, tools[0])))
+        one, all_ = np.median(passes, axis=0), np.median(matches, axis=0)
+        result["dinov2"] = {
+            "weights": weights or "ViT-S/14, random",
+            "side_px": backend.size,
+            "pass_s": float(one[0]),
+            "match_s": float(all_[0]),
+            "ratio": float(np.median(np.array(matches)[:, 0] / np.array(passes)[:, 0])),
+            "ratio_of_least": float(np.min(matches, axis=0)[0] / np.min(passes, axis=0)[0]),
+            "pass_cpu_s": float(one[1]),
+            "match_cpu_s": float(all_[1]),
+            "ratio_cpu": float(np.median(np.array(matches)[:, 1] / np.array(passes)[:, 1])),
+        }
+    memory = []
+    for k in range(requests):
+        if k % max(1, requests // 10) == 0:
+            gc.collect()
+            memory.append(resident())
+        match(matcher, tools[k % len(tools)])
+    gc.collect()
+    memory.append(resident())
+    result["memory"] = {"requests": requests, "resident_mb": [round(m, 1) for m in memory], "growth_mb": round(memory[-1] - memory[min(1, len(memory) - 1)], 1)}
+    return result
+
+
+def timed_once(work: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds on the clock and of CPU time of one call."""
+    a, b = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - a, time.process_time() - b
