@@ -95,7 +95,8 @@ def test_demo_writes_summary_and_report(tmp_path):
     assert list(summary) == ["strategy", "variant", "features", "success", "code", "message", "candidates", "simulations", "seconds", "peak_memory_mb"]
     assert (summary["success"], summary["code"], summary["features"]) == (True, 0, "embedded")
     assert list(summary["seconds"]) == ["perceive", "match", "plan", "verify", "total"]
-    assert 0 < sum(summary["seconds"][s] for s in ("match", "plan", "verify")) <= summary["seconds"]["total"]
+    assert summary["seconds"]["perceive"] > 0.05  # no scene is seen in less
+    assert sum(summary["seconds"][s] for s in ("perceive", "match", "plan", "verify")) <= summary["seconds"]["total"] + 0.01
     assert set(summary["peak_memory_mb"]) >= {"perception", "matcher", "planner", "verifier", "strategy_server"}
     page = (tmp_path / "report.html").read_text()
     assert "could not be drawn" not in page

@@ -21,7 +21,7 @@ TABLE_COLORS = ((226, 222, 214), (214, 209, 199))
 BACKGROUND = (244, 245, 247)
 LIGHT = np.array([-0.35, -0.45, 1.0])
 #: Frames are cast at this multiple of their size and scaled down.
-OVERSAMPLING = 1.5
+OVERSAMPLING = 1.25
 
 
 def _painted(item: SceneObject, color: tuple[int, int, int], world_from_object: NDArray[np.float64]) -> Mesh:

@@ -193,6 +193,7 @@ class Watcher:
                     self.complained_at = (self.complained_at or time.monotonic()) if wrong else None
 
     def _on_trajectory(self, message: Any) -> None:
+        self._say(f"verified trajectory with {len(message.points)} points published")
         with self.changed:
             self.trajectory = message
             self.changed.notify_all()
@@ -397,9 +398,7 @@ class Demo:
         if result.verified and result.code == 0:
             came = self._wait(graph, watcher, lambda: watcher.trajectory is not None, 5.0)
             summary["success"] = came
-            if came:
-                self.say(f"verified trajectory with {len(watcher.trajectory.points)} points published")
-            else:
+            if not came:
                 summary.update(code=int(Code.INTERNAL), message="physics agreed, but no trajectory was published")
 
     def _collect(self, graph: Graph, watcher: Watcher) -> None:
