@@ -41,7 +41,7 @@ STYLE = """
 main{max-width:1180px;margin:0 auto;padding:28px 20px 60px}h1{font-size:26px;margin:0 0 4px}h2{font-size:18px;margin:0 0 12px}
 p{margin:4px 0 12px}.soft{color:var(--soft)}section,header{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:20px 22px;margin:0 0 18px}
 .badge{display:inline-block;padding:4px 12px;border-radius:999px;color:#fff;font-weight:600;font-size:14px}.good{background:var(--good)}.bad{background:var(--bad)}
-.row{display:flex;flex-wrap:wrap;gap:16px}.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(195px,1fr));gap:16px}figure{margin:0;flex:1 1 240px;min-width:0}
+.row{display:flex;flex-wrap:wrap;gap:16px}.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(195px,1fr));gap:16px}.wide{grid-template-columns:repeat(auto-fill,minmax(330px,1fr))}figure{margin:0;flex:1 1 240px;min-width:0}
 .metrics{display:grid;grid-template-columns:repeat(auto-fill,minmax(180px,1fr));gap:2px 18px;margin-top:6px;font-size:12.5px;color:var(--soft)}
 .metrics span{display:flex;justify-content:space-between;gap:8px;border-bottom:1px dotted var(--line)}.metrics b{font-weight:500;color:var(--ink);font-variant-numeric:tabular-nums}
 figure img{width:100%;border-radius:8px;display:block;background:#0b0d11}
@@ -357,12 +357,12 @@ def _meshes(scene: Scene, result: Any) -> str:
         low, high = mesh.bounds
         center, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.01)
         camera = look_at(center + 1.5 * reach * transforms.unit([-0.6, -0.75, 0.8]), center)
-        intrinsics = Intrinsics(360, 300, 420.0, 420.0, 179.5, 149.5)
+        intrinsics = Intrinsics(450, 300, 420.0, 420.0, 224.5, 149.5)
         cast, _ = Raycaster([mesh]).perspective(intrinsics, camera)
         extent = " x ".join(f"{1000 * x:.0f}" for x in mesh.extents)
         caption = f"{item.id} ({item.source}): {extent} mm, {len(mesh.faces)} triangles, {len(item.pieces)} convex pieces"
         figures.append(_figure(shade(cast, light=(-0.5, -0.3, 1.0), background=(236, 239, 244)), caption, 90))
-    return _section("What was reconstructed", f'<div class="row">{"".join(figures)}</div>')
+    return _section("What was reconstructed", f'<div class="cards wide">{"".join(figures)}</div>')
 
 
 def _candidates(summary: dict[str, Any]) -> str:
