@@ -157,9 +157,10 @@ def _join_unproven(
     part: NDArray[np.int64], centre: NDArray[np.float64], normal: NDArray[np.float64], height: NDArray[np.float64],
     a: NDArray[np.int64], b: NDArray[np.int64], concave: NDArray[np.bool_], bend: NDArray[np.float64], clear: NDArray[np.bool_], evidence: Evidence,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Parts of voxels joined again, the least proven pair first, until there is evidence between all that touch."""
+    """Parts of voxels joined again until there is evidence between all that touch: first a bar with what it ends at (a mallet's handle
+    with its head, whatever the handle leans against), then the least proven pair."""
     while part.max() > 0:
-        worst: tuple[float, int, int] | None = None
+        worst: tuple[tuple[bool, float], int, int] | None = None
         touching = np.zeros(int(part.max()) + 1, bool)
         for i in range(int(part.max()) + 1):
             for j in range(i):
@@ -172,8 +173,12 @@ def _join_unproven(
                 angle = float(np.median(bend[told])) if told.any() else 0.0
                 if int(told.sum()) < evidence.seam:
                     share = 0.0
-                if not _two_things(centre, normal, height, part == i, part == j, share, angle, evidence) and (worst is None or share < worst[0]):
-                    worst = (share, i, j)
+                if _two_things(centre, normal, height, part == i, part == j, share, angle, evidence):
+                    continue
+                seam = np.concatenate([a[across], b[across]])
+                rank = (not (_ends_at(centre, part == i, seam, evidence) or _ends_at(centre, part == j, seam, evidence)), share)
+                if worst is None or rank < worst[0]:
+                    worst = (rank, i, j)
         if worst is None:
             # A gap in what was seen is no seam: a part that touches nothing belongs to the nearest.
             lone = np.nonzero(~touching)[0]
@@ -184,10 +189,22 @@ def _join_unproven(
 
             others = np.nonzero(part != i)[0]
             distance, nearest = cKDTree(centre[others]).query(centre[part == i])
-            worst = (0.0, i, int(part[others[nearest[np.argmin(distance)]]]))
+            worst = ((True, 0.0), i, int(part[others[nearest[np.argmin(distance)]]]))
         part = np.where(part == worst[1], worst[2], part)
         part = np.unique(part, return_inverse=True)[1]
     return part
+
+
+def _ends_at(centre: NDArray[np.float64], members: NDArray[np.bool_], seam: NDArray[np.int64], evidence: Evidence) -> bool:
+    """Whether a part is a bar and its voxels on the seam lie at one of its ends."""
+    local = centre[members] - centre[members].mean(axis=0)
+    axes = np.linalg.svd(local, full_matrices=False)[2]
+    low, high = np.percentile(local @ axes.T, [2, 98], axis=0)
+    length, breadth = float(high[0] - low[0]), float(high[1] - low[1])
+    if breadth > evidence.breadth or length < 3 * breadth:
+        return False
+    along = (centre[seam[members[seam]]] - centre[members].mean(axis=0)) @ axes[0]
+    return len(along) > 0 and float(np.percentile(np.minimum(along - low[0], high[0] - along), 90)) < 0.2 * length and float(np.ptp(along)) < 0.5 * length
 
 
 def _two_things(

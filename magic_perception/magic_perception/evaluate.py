@@ -39,6 +39,9 @@ from magic_perception.table import camera_over_table
 #: points above the table; the bottle's depth is that of YCB's model 006.
 SIZES = {"red_mug": (123, 99, 82), "mustard": (191, 95, 58), "cylinder": (150, 68, 68)}
 
+#: Pixels (row, column) of one object, here a mallet's handle and head, and of what it leans against.
+TOGETHER = {"mallet": (((120, 451), (260, 437), (400, 437)), ((330, 385), (350, 488)))}
+
 #: Folders of meshes that stand as they are stored; the others lie in their most probable stable pose.
 STANDING = ("mugs", "mug_trees", "targets", "watches")
 
@@ -117,6 +120,9 @@ def captures(folder: Path, segmenter: Segmenter) -> dict[str, object]:
         if frame.camera in SIZES and sizes:
             row["read_mm"] = SIZES[frame.camera]
             row["largest_error_mm"] = round(float(np.max(np.abs(np.array(sizes[0]) - np.sort(SIZES[frame.camera])[::-1]))), 1)
+        if frame.camera in TOGETHER:
+            mine, others = ([int(report.labels[0][pixel]) for pixel in pixels] for pixels in TOGETHER[frame.camera])
+            row["one_object"] = len(set(mine)) == 1 and mine[0] > 0 and mine[0] not in others
         result[frame.camera] = row
     return result
 
@@ -266,7 +272,7 @@ def markdown(result: dict) -> str:
         lines += ["| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |", "| --- | --- | --- | --- | --- | --- |"]
         for name, row in result["captures"].items():
             size = " x ".join(f"{x:.0f}" for x in row["sizes_mm"][0]) if row["sizes_mm"] else ""
-            lines.append(f"| {name} | {row['objects']} | {size} | {' x '.join(map(str, row.get('read_mm', [])))} | {row.get('largest_error_mm', '')} | {row['cpu_seconds']:.2f} |")
+            lines.append(f"| {name}{' (one object)' if row.get('one_object') else ' (not one object)' if 'one_object' in row else ''} | {row['objects']} | {size} | {' x '.join(map(str, row.get('read_mm', [])))} | {row.get('largest_error_mm', '')} | {row['cpu_seconds']:.2f} |")
         lines.append("")
     if "meshes" in result:
         part = result["meshes"]

@@ -213,7 +213,9 @@ def test_mug_keeps_its_handle_open():
     (item,) = scene.objects
     assert check_object(item).euler_number == 0
     assert item.view.kind == "side" and item.view.confidence > 0.9
-    np.testing.assert_allclose(np.sort(item.box_extents), np.sort(mug.mesh.extents), atol=0.008)
+    found, true = np.sort(item.box_extents), np.sort(mug.mesh.extents)
+    np.testing.assert_allclose(found[:2], true[:2], atol=0.002)  # the body
+    assert found[2] == pytest.approx(true[2], abs=0.008)  # with the handle
 
 
 def test_bowl_of_a_ladle_stays_hollow():
@@ -227,8 +229,9 @@ def test_bowl_of_a_ladle_stays_hollow():
     section = find_view(item.mesh, item.pieces, "section")
     # Seen in the cut, a column of the picture through the bowl's floor has no material at the rim's height.
     assert section.mask.sum() < 0.5 * cv2_hull_area(section.mask)
-    # The pieces leave the bowl empty too.
-    assert sum(p.to_trimesh().volume for p in item.pieces) < 1.5 * solid.volume
+    # The pieces leave the bowl empty too, and are few.
+    assert sum(p.to_trimesh().volume for p in item.pieces) < 1.6 * solid.volume
+    assert len(item.pieces) <= 40
 
 
 def cv2_hull_area(mask):
@@ -296,6 +299,53 @@ def test_empty_table_and_bad_frames():
         Parameters(region_low=(0, 0, 0), region_high=(1, -1, 1))
 
 
+# ---------------------------------------------------------------- pieces and measures
+
+
+def test_tiles_of_a_slab_become_one_piece_and_an_l_two():
+    from magic_perception.reconstruction import _joined
+
+    tiles = [box((0.01, 0.01, 0.004), 0.01 * i, 0.01 * j).vertices for i in range(6) for j in range(3)]
+    (whole,) = _joined(tiles)
+    assert tight(whole).volume == pytest.approx(0.06 * 0.03 * 0.004)
+    arms = [box((0.02, 0.1, 0.02), 0, 0).vertices, box((0.1, 0.02, 0.02), 0.06, -0.04).vertices]
+    assert len(_joined(arms)) == 2
+    # A hemispherical shell: few pieces, and its hollow stays.
+    angles = np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi / 2, 7)
+    shell = []
+    for a0, a1 in itertools.pairwise(angles[0]):
+        for b0, b1 in itertools.pairwise(angles[1]):
+            shell.append(np.array([r * np.array([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), -np.cos(b)]) for a in (a0, a1) for b in (b0, b1) for r in (0.047, 0.05)]))
+    pieces = _joined(shell)
+    assert len(pieces) <= 40
+    middle = np.array([0, 0, -0.02])
+    for piece in pieces:
+        hull = piece.to_trimesh().convex_hull
+        assert np.max(hull.face_normals @ middle - np.sum(hull.face_normals * hull.triangles[:, 0], axis=1)) > 0
+    assert sum(p.to_trimesh().volume for p in pieces) < 2 * 2 / 3 * np.pi * (0.05**3 - 0.047**3)
+
+
+def test_measures_against_known_truths():
+    from magic_perception.evaluate import chamfer, open_holes, shared_volume
+
+    def of(solid):
+        return Mesh(solid.vertices, solid.faces)
+
+    cube, moved = of(box((0.1, 0.1, 0.1), 0, 0)), of(box((0.1, 0.1, 0.1), 0.05, 0))
+    assert shared_volume(cube, moved) == pytest.approx(1 / 3, abs=0.01)
+    assert shared_volume(cube, cube) == 1.0
+    large = of(box((1.0, 1.0, 0.01), 0, 0))
+    raised = large.transformed(transforms.make(None, [0, 0, 0.005]))
+    assert chamfer(large, large) < 1e-9
+    assert 0.002 < chamfer(large, raised, 20000) < 0.008
+    ring = polygons.extrude(RING, 0, 0.01)
+    from magic_core.views import find_view
+
+    view = find_view(ring)
+    assert open_holes(ring, view, ring) == (1, 1)
+    assert open_holes(ring, view, ring.convex_hull()) == (1, 0)
+
+
 # ---------------------------------------------------------------- parting
 
 
@@ -324,6 +374,17 @@ def test_what_lies_on_another_thing_is_parted():
     frames = [scenes.capture(solids(*scene), name, i)[0] for i, name in enumerate(("left", "right"))]
     assert len(perceive(frames).objects) == 2
     assert len(perceive(frames, parameters=Parameters(split=False)).objects) == 1
+
+
+def test_a_mallet_that_leans_on_a_box_is_one_thing():
+    head, stem, crate = box((0.07, 0.13, 0.06), 0.48, -0.03), box((0.028, 0.028, 0.22), 0.48, -0.03, 0.06), box((0.06, 0.2, 0.12), 0.55, 0.02)
+    mallet = trimesh.boolean.union([head, stem], engine="manifold")
+    mesh = Mesh(mallet.vertices, mallet.faces)
+    frame, ids = scenes.capture([mesh, *solids(crate)], world_from_camera=scenes.pose([-0.05, 0.0, 0.45], [0.5, 0.0, 0.05]))
+    found = perceive([frame]).objects
+    assert len(found) == 2
+    best = max(found, key=lambda o: (o.mask & (ids == 0)).sum())
+    assert (best.mask & (ids == 0)).sum() / (best.mask | (ids == 0)).sum() > 0.85
 
 
 def test_a_neck_is_part_of_its_bottle():
