@@ -24,6 +24,7 @@ setup(
         "console_scripts": [
             "matcher = magic_matcher.matcher:main",
             "match_images = magic_matcher.match_images:main",
+            "match_meshes = magic_matcher.match_meshes:main",
             "bench = magic_matcher.bench:main",
         ],
     },

@@ -112,6 +112,27 @@ def test_fillet_is_right_at_scales_within_it(radius):
     assert found.normal @ normal > 0.99
 
 
+@pytest.mark.parametrize(("a", "b"), [(140, 110), (120, 90), (150, 130), (140, 50), (150, 80), (120, 100), (100, 55)])
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_ellipse_at_the_scale_that_is_chosen(a, b, turn):
+    c, s = np.cos(turn), np.sin(turn)
+    x, y = (U - CENTRE[0]) * c + (V - CENTRE[1]) * s, (V - CENTRE[1]) * c - (U - CENTRE[0]) * s
+    edge = contour.extract((x / a) ** 2 + (y / b) ** 2 <= 1)
+    for along, across, radius in ((a, 0, b * b / a), (0, b, a * a / b)):
+        found = curvature.estimate(edge, edge.nearest(CENTRE + (along * c - across * s, along * s + across * c)))
+        assert found.radius == pytest.approx(radius, rel=0.05) and not found.concave
+
+
+@pytest.mark.parametrize("radius", [14, 20, 30, 40, 60])
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_fillet_at_the_scale_that_is_chosen(radius, turn):
+    mask, corner, normal = hook(radius, turn=turn)
+    c = contour.extract(mask)
+    found = curvature.estimate(c, c.nearest(corner))
+    assert found.radius == pytest.approx(radius, rel=0.05) and found.concave
+    assert found.normal @ normal > 0.99
+
+
 @settings(max_examples=10, deadline=None)
 @given(turn=st.floats(0, 2 * np.pi), scale=st.floats(0.55, 1.0), mirror=st.booleans())
 def test_equivariance(turn, scale, mirror):
