@@ -32,6 +32,8 @@ from magic_planner.object_motion import table_plane, tool_contact_frame, turning
 from magic_planner.robot import Robot
 
 Array = NDArray[np.float64]
+#: Searches for one free path, each with its own random numbers.
+SEARCHES = 3
 #: The stages of a plan in the order in which they are decided: a later one is a better failure.
 STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", "timing")
 
@@ -41,7 +43,8 @@ class ArmSettings:
     """key_length, key_angle: spacing of the poses at which grasps are compared.  grasps: how many are compared at once, rounds:
     how many such lots.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
     lift, retreat: metres.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
-    neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path."""
+    neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path
+    (searches take some 20 ms; the limit is wide so that a loaded machine finds the same path)."""
 
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
@@ -54,7 +57,7 @@ class ArmSettings:
     dwell: float = 0.5
     jump: float = 0.5
     time_step: float = 0.02
-    free_time: float = 0.5
+    free_time: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -347,7 +350,16 @@ class ArmPlanner:
                 (swept if final else static).append(transforms.apply(transforms.inverse(request.poses[index]), np.concatenate(there)))
         swept_points, static_points = np.concatenate(swept), np.concatenate(static) if static else np.zeros((0, 3))
         grasps = propose(
-            self.robot, request.tool, tool_from_contact, request.plane, poses, settings, request.seed, static_points, swept_points
+            self.robot,
+            request.tool,
+            tool_from_contact,
+            request.plane,
+            poses,
+            settings,
+            request.seed,
+            static_points,
+            swept_points,
+            request.budget,
         )
         checks = [(request.tool.world_from_object, [target, *others])]
         for index in sorted({0, min(met, last), last}):
@@ -659,7 +671,7 @@ class ArmPlanner:
         if pair is not None:
             raise StageError(stage, MagicError(Code.PATH_IN_COLLISION, f"an end of the free motion: {pair}", "in collision", "free ends"))
         rng = np.random.default_rng([request.seed, STAGES.index(stage)])
-        for n in range(4):
+        for n in range(SEARCHES):
             request.budget.check(stage)
             mplib.set_global_seed(int(request.seed) % 100_000 * 10 + n + 1)
             seconds = min(self.settings.free_time, max(0.05, request.budget.left))
@@ -676,7 +688,7 @@ class ArmPlanner:
             MagicError(
                 Code.NO_PATH,
                 f"free motion of stage {stage}",
-                f"none found in {4 * self.settings.free_time:.1f} s",
+                f"none found in {SEARCHES * self.settings.free_time:.1f} s",
                 "a way around the obstacles",
             ),
         )

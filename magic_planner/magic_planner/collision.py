@@ -35,10 +35,45 @@ def hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     return result
 
 
+#: A piece with more vertices than this is represented by its outermost ones in this many directions.
+MOST_VERTICES = 2000
+DIRECTIONS = 600
+#: Coordinates beyond this (metres) are no object of this world; their products are not numbers any more.
+LARGEST = 1e4
+
+
+def _outermost(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of points (N, 3) those (M, 3), M <= DIRECTIONS, that reach furthest in directions spread evenly over the sphere.
+
+    The directions are stretched with the points, so that long and flat shapes are sampled as well as round ones: what is
+    cut off is below 1 % of the extent in each direction (0.3 % for a ball).
+    """
+    n = np.arange(DIRECTIONS) + 0.5
+    polar, turn = np.arccos(1 - 2 * n / DIRECTIONS), np.pi * (1 + np.sqrt(5)) * n
+    directions = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)])
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.svd(centred.T @ centred)[0]
+    centred = centred @ axes
+    white = np.ascontiguousarray((centred / np.maximum(np.abs(centred).max(axis=0), 1e-9)).T, dtype=np.float32)
+    towards = np.ascontiguousarray(directions.T, dtype=np.float32)
+    best, index = np.full(DIRECTIONS, -np.inf, np.float32), np.zeros(DIRECTIONS, dtype=int)
+    for first in range(0, len(points), 10_000):
+        reach = towards @ white[:, first : first + 10_000]
+        furthest = reach.argmax(axis=1)
+        value = reach[np.arange(DIRECTIONS), furthest]
+        index = np.where(value > best, first + furthest, index)
+        best = np.maximum(best, value)
+    return points[np.unique(index)]
+
+
 def _hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     points = np.asarray(vertices, dtype=float).reshape(-1, 3)
     if len(points) == 0:
         raise MagicError(Code.BAD_MESH, "convex piece", "no vertices", "at least one vertex")
+    if not np.abs(points).max() < LARGEST:
+        raise MagicError(Code.BAD_MESH, "convex piece", f"{np.abs(points).max():.3g} m", f"coordinates below {LARGEST:g} m")
+    if len(points) > MOST_VERTICES:
+        points = _outermost(points)
     try:
         shell = ConvexHull(points)
     except (QhullError, ValueError):

@@ -30,16 +30,15 @@ class GraspSettings:
     """agreement: least cosine between the inward normal at one finger and the outward normal at the other.
     samples: surface points tried.  pairs: antipodal pairs kept of them.
     angles: approach directions about the closing axis.  poses: hand poses tested in one lot.  looked: hand poses whose pads are
-    looked at.  standoff: metres of straight way to the grasp.
-     clearance: metres kept
-    between hand and table.  margin: metres left on each side of the object in the open hand.  away: metres
+    looked at.  standoff: metres of straight way to the grasp.  clearance: metres kept between hand and table.
+    margin: metres left on each side of the object in the open hand.  away: metres
     around the contact in which no finger is placed.  force, density: of the slip estimate (N, kg/m^3)."""
 
     agreement: float = 0.9
     samples: int = 500
     pairs: int = 300
     poses: int = 1500
-    looked: int = 200
+    looked: int = 400
     standoff: float = 0.08
     angles: int = 16
     clearance: float = 0.0015
@@ -149,16 +148,16 @@ def _through(
     enter, leave, far = np.array(enters), np.array(leaves), np.array(faced)
     real = leave > enter + 1e-9
     inside = ((leave > enter + 1e-4) & (enter < -3e-4) & (leave > -2e-4)).any(axis=0)
-    length, row = np.zeros(len(points)), np.arange(len(points))
-    normal = directions.copy()
-    for _ in range(len(hulls)):
-        grows = real & (enter <= length + 1e-4) & (leave > length + 1e-9)
-        if not grows.any():
-            break
-        best = np.where(grows, leave, -np.inf).argmax(axis=0)
-        grown = grows[best, row]
-        length = np.where(grown, leave[best, row], length)
-        normal[grown] = far[best, row][grown]
+    # The union of the intervals from 0 on, up to its first gap: by where they begin, and how far those so far reach.
+    enter = np.where(real & (leave > 1e-9), enter, np.inf)
+    order = np.argsort(enter, axis=0, kind="stable")
+    starts, ends = np.take_along_axis(enter, order, axis=0), np.take_along_axis(np.where(real, leave, 0.0), order, axis=0)
+    reached = np.maximum.accumulate(np.concatenate([np.zeros((1, len(points))), ends]), axis=0)
+    count = np.where((apart := starts > reached[:-1] + 1e-4).any(axis=0), apart.argmax(axis=0), len(hulls))
+    row = np.arange(len(points))
+    length = reached[count, row]
+    last = np.where(np.arange(len(hulls))[:, None] < count, ends, -np.inf).argmax(axis=0)
+    normal = np.where((count > 0)[:, None], far[order[last, row], row], directions)
     return length, normal, inside
 
 
@@ -172,6 +171,7 @@ def propose(
     seed: int,
     static: NDArray[np.float64] | None = None,
     swept: NDArray[np.float64] | None = None,
+    budget: Budget | None = None,
 ) -> list[Grasp]:
     """Grasps of the tool, best first, whose hand stays above the table at all poses (K, 4, 4) world_from_tool.
 
@@ -180,6 +180,7 @@ def propose(
     """
     pieces = solid_pieces(tool)
     rng = np.random.default_rng(seed)
+    budget = budget or Budget()
     centres, closing, widths = antipodal(pieces, robot.config.opening, settings, rng)
     if not len(widths):
         raise MagicError(
@@ -230,12 +231,14 @@ def propose(
             )
         frames, pair, back = frames[high], pair[high], back[high]
 
+    budget.check("grasp")
     costs = first[pair] + terms.of_approach(frames, back)
     own = surface(pieces, 400, rng)[0]
     nothing = np.zeros((0, 3))
     around = (nothing if static is None else static, nothing if swept is None else swept)
     ranked, kept, alone = np.argsort(costs, kind="stable"), [], 0
     for first_of in range(0, len(ranked), settings.poses):
+        budget.check("grasp")
         lot = ranked[first_of : first_of + settings.poses]
         lot = lot[~in_the_way(robot, frames[lot], nothing, own, settings.standoff)]
         alone += len(lot)
@@ -254,7 +257,7 @@ def propose(
     frames, pair, costs = frames[keep], pair[keep], costs[keep]
     order = np.argsort(costs, kind="stable")
     looked = order[: settings.looked]
-    costs[order[settings.looked :]] += 1.0
+    costs[order[settings.looked :]] += 5.0
     costs[looked] += _misfit(robot, frames[looked], widths[pair[looked]], pieces)
     order = order[np.argsort(costs[order], kind="stable")]
     # The arm's reach decides in the end, so what comes first should differ: each further grasp of a neighbourhood stands back.

@@ -275,7 +275,8 @@ def _chain(root: ElementTree.Element, tip: str, base: str | None) -> Chain:
             low, high = -2 * np.pi, 2 * np.pi
             if kind != "continuous":
                 low, high = _bound(limit, "lower", low), _bound(limit, "upper", high)
-            rows.append((fixed, b, c, direction, kind == "prismatic", low, high, _bound(limit, "velocity", 1.0), _bound(limit, "effort", np.inf)))
+            most = _bound(limit, "velocity", 1.0), _bound(limit, "effort", np.inf)
+            rows.append((fixed, b, c, direction, kind == "prismatic", low, high, *most))
             names.append(joint.get("name"))
             fixed = np.eye(4)
         carrier[joint.find("child").get("link")] = (len(names) - 1, fixed.copy())  # type: ignore[union-attr]
