@@ -13,15 +13,48 @@ from magic_core.scene import CanonicalView
 
 #: Share of the border that must agree with the background's colour for it to count as plain.
 PLAIN_SHARE = 0.8
+#: Smallest side of a picture, px.
+SMALLEST = 8
+#: Canny's thresholds (the paper authors' code).
+CANNY = (100, 200)
+
+
+def decode(path: str | Path, name: str) -> NDArray[np.uint8]:
+    """A picture file as 8 bits a channel, (H, W), (H, W, 3) BGR or (H, W, 4) BGRA; ``name`` says in errors what it is.
+
+    16-bit files are scaled by their range (12 bits where nothing exceeds them), floating-point ones by their largest value where it exceeds 1.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise MagicError(Code.BAD_REQUEST_IMAGE, name, str(path), "a file that exists")
+    raw = np.fromfile(path, np.uint8)
+    try:
+        # Decoded from memory: reading files OpenCV writes warnings of its own.
+        data = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
+    except cv2.error:
+        data = None
+    if data is None or data.size == 0:
+        raise MagicError(Code.BAD_REQUEST_IMAGE, name, str(path), "a readable PNG or JPEG file")
+    if data.dtype == np.bool_:
+        data = data.astype(np.uint8) * 255
+    elif data.dtype.kind == "f":
+        data = np.nan_to_num(data, nan=0.0, posinf=0.0, neginf=0.0)
+        data = np.clip(data * (255 / max(float(data.max()), 1.0)), 0, 255).astype(np.uint8)
+    elif data.dtype != np.uint8:
+        full = 4095 if data.dtype == np.uint16 and data.max() <= 4095 else np.iinfo(data.dtype).max
+        data = np.clip(data.astype(np.float64) * (255 / full), 0, 255).astype(np.uint8)
+    if data.ndim == 3 and data.shape[2] == 1:
+        data = data[..., 0]
+    elif data.ndim == 3 and data.shape[2] == 2:  # grey and alpha
+        data = np.dstack([data[..., :1].repeat(3, axis=2), data[..., 1]])
+    if min(data.shape[:2]) < SMALLEST:
+        raise MagicError(Code.BAD_REQUEST_IMAGE, f"size of {name} {path}", f"{data.shape[1]}x{data.shape[0]}", f"{SMALLEST} px or more a side")
+    return data
 
 
 def read(path: str | Path) -> NDArray[np.uint8]:
     """A picture file as RGBA (H, W, 4) uint8; alpha is 255 where the file has none."""
-    data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if data is None:
-        raise MagicError(Code.BAD_REQUEST_IMAGE, "picture", str(path), "a readable PNG or JPEG file")
-    if data.dtype != np.uint8:
-        data = (data / max(np.iinfo(data.dtype).max / 255, 1)).astype(np.uint8)
+    data = decode(path, "picture")
     if data.ndim == 2:
         data = cv2.cvtColor(data, cv2.COLOR_GRAY2BGRA)
     elif data.shape[2] == 3:
@@ -30,23 +63,25 @@ def read(path: str | Path) -> NDArray[np.uint8]:
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask file (on where brighter than half) of the picture's size (H, W)."""
-    data = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if data is None:
-        raise MagicError(Code.BAD_REQUEST_IMAGE, "mask", str(path), "a readable PNG file")
+    """A mask file of the picture's size (H, W): on where brighter than half of its brightest (255, or 1), and opaque."""
+    data = decode(path, "mask")
+    if data.ndim == 3:
+        grey = cv2.cvtColor(np.ascontiguousarray(data[..., :3]), cv2.COLOR_BGR2GRAY)
+        data = np.where(data[..., 3] > 127, grey, 0) if data.shape[2] == 4 else grey
     if data.shape != size:
         raise MagicError(Code.BAD_REQUEST_IMAGE, f"size of mask {path}", f"{data.shape[1]}x{data.shape[0]}", f"that of its picture, {size[1]}x{size[0]}")
-    if not (data > 127).any():
-        raise MagicError(Code.EMPTY_MASK, f"mask {path}", "no pixel above 127", "a mask that is 255 on the object")
-    return data > 127
+    if not data.any():
+        raise MagicError(Code.EMPTY_MASK, f"mask {path}", "black all over", "a mask that is 255 on the object")
+    return data > data.max() / 2
 
 
 def mask_from_background(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """The object (H, W) bool in a picture (H, W, 3 or 4) with a plain background, or with a background that is transparent.
 
     The background's colour is the border's median; what differs from it by more than
-    the border itself does is the object, holes included, specks left out.  Raises
-    ``EMPTY_MASK`` where the border is not plain or nothing differs from it.
+    the border itself does is the object, specks left out; a hole that shows the background
+    stays a hole.  Where nothing differs enough in colour the object is what Canny's edges
+    enclose.  Raises ``EMPTY_MASK`` where the border is not plain or there is no object.
     """
     if image.shape[2] == 4 and (image[..., 3] < 128).any():
         mask = image[..., 3] >= 128
@@ -68,14 +103,39 @@ def mask_from_background(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     threshold = max(12.0, 3 * spread)
     mask = (distance > threshold).astype(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    found = _large(mask)
+    if found is None:
+        found = _large(_enclosed(image))
+    if found is None:
+        raise MagicError(Code.EMPTY_MASK, "objects that stand out from the picture's plain background, by colour or by an outline", 0, "one, or give a mask")
+    if found.mean() > 0.95:
+        raise MagicError(Code.EMPTY_MASK, "share of the picture that stands out from its border", round(float(found.mean()), 3), "at most 0.95, or give a mask")
+    return found
+
+
+def _large(mask: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+    """The parts of a mask that are no specks, ``None`` where it has none."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    if count < 2:
-        raise MagicError(Code.EMPTY_MASK, "objects that stand out from the picture's plain background", 0, "one, or give a mask")
-    largest = int(stats[1:, cv2.CC_STAT_AREA].max())
-    if largest < 64 or largest > 0.95 * mask.size:
-        raise MagicError(Code.EMPTY_MASK, "pixels that stand out from the picture's plain background", largest, f"64 to {int(0.95 * mask.size)}, or give a mask")
-    keep = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= 0.02 * largest]
-    return np.isin(labels, keep)
+    largest = int(stats[1:, cv2.CC_STAT_AREA].max()) if count > 1 else 0
+    if largest < 64:
+        return None
+    return np.isin(labels, [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= 0.02 * largest])
+
+
+def _enclosed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """What Canny's edges enclose (H, W) 0 or 1: all that cannot be reached from the border without crossing an edge."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY), (0, 0), 0.8)
+    edges = cv2.Canny(grey, *CANNY)
+    if not edges.any():
+        # A faint outline, but much stronger than what the rest of the picture has.
+        steepness = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+        high = max(4 * float(np.percentile(steepness, 90)), 16.0)
+        edges = cv2.Canny(grey, high / 2, high)
+    walls = np.pad(cv2.morphologyEx(edges, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)), 1)
+    outside = walls.copy()
+    cv2.floodFill(outside, None, (0, 0), 128)
+    # The edge's own pixels are half outside: taken off again with what the closing added.
+    return cv2.morphologyEx((outside != 128).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
 
 
 def view(picture: str | Path, mask: str | Path | None = None, kind: str = "top") -> CanonicalView:

@@ -13,7 +13,8 @@
 of the target picture, concave, rotation (rad), flipped, s_dino, s_curv, score, and
 target_from_reference, the 3x3 that carries pixels of the reference picture onto the
 target's so that the contacts meet (turned, mirrored where flipped, not scaled).
-``match.png`` shows both.  Exit status: 0, or 2 with the code and what was wrong.
+``match.png`` shows both, ``heatmap.png`` (8 bits, size of the target picture) how alike its
+places are to the reference.  Exit status: 0, or 2 with the code and what was wrong.
 """
 
 from __future__ import annotations
@@ -77,8 +78,14 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
             "normal": [float(v) for v in reference.normal],
             "radius": _number(reference.radius),
             "concave": reference.concave,
+            "scale": float(contact.scale),
+            "size": [first.mask.shape[1], first.mask.shape[0]],
+            "mask": "file" if given.reference_mask else "background",
+            "mask_pixels": int(first.mask.sum()),
         },
         "candidates": [record(reference, candidate) for candidate in result.candidates],
+        "target": {"size": [second.mask.shape[1], second.mask.shape[0]], "mask": "file" if given.target_mask else "background", "mask_pixels": int(second.mask.sum())},
+        "units": "pixels and radians; normals point out of the material, v down",
         "features": result.features,
         "seconds": result.seconds,
     }
@@ -87,7 +94,14 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     (out / "match.json").write_text(json.dumps(data, indent=1) + "\n")
     shown = [drawing.draw_match(first, contact), drawing.draw_match(second, [c.tool for c in result.candidates], result.heatmap)]
     picture = drawing.side_by_side(shown, ("reference", f"target, best score {result.candidates[0].score:.3f}"), height=max(384, second.mask.shape[0]))
-    cv2.imwrite(str(out / "match.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    files = {"match.png": cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)}
+    if result.heatmap is not None:
+        files["heatmap.png"] = np.rint(255 * np.clip(result.heatmap, 0, 1)).astype(np.uint8)
+    for name, content in files.items():
+        done, raw = cv2.imencode(".png", content)
+        if not done:
+            raise OSError(f"{out / name} could not be encoded")
+        (out / name).write_bytes(raw.tobytes())
     return data
 
 
@@ -116,8 +130,8 @@ def main(argv: list[str] | None = None) -> None:
     except MagicError as error:
         print(f"match_images: {error}", file=sys.stderr)
         sys.exit(2)
-    except OSError as error:
-        print(f"match_images: {error}", file=sys.stderr)
+    except (OSError, cv2.error, MemoryError) as error:
+        print(f"match_images: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         sys.exit(2)
     for k, candidate in enumerate(data["candidates"]):
         u, v = candidate["pixel"]

@@ -36,6 +36,50 @@ def test_mask_from_transparency():
     assert images.mask_from_background(image).sum() == 400
 
 
+def test_an_object_of_the_background_s_colour_is_found_by_its_outline():
+    view = shapes.make("l_hook", 3).view()
+    inner = cv2.erode(view.mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    image = np.full((*view.mask.shape, 3), 200, np.uint8)
+    image[view.mask & ~inner] = 188  # an outline, fainter than the difference in colour that is asked for
+    mask = images.mask_from_background(image)
+    assert (mask & view.mask).sum() / (mask | view.mask).sum() > 0.85
+
+
+@pytest.mark.parametrize("kind", ["grey", "16 bits", "12 bits", "float", "alpha", "mask of ones", "mask with alpha"])
+def test_formats_of_files(tmp_path, kind):
+    view = shapes.make("caliper", 3).view()
+    image, path, mask = picture(view), tmp_path / "p.png", None
+    if kind == "grey":
+        cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    elif kind == "16 bits":
+        cv2.imwrite(str(path), image[..., ::-1].astype(np.uint16) * 257)
+    elif kind == "12 bits":
+        cv2.imwrite(str(path), image[..., ::-1].astype(np.uint16) * 16)
+    elif kind == "float":
+        path = tmp_path / "p.tiff"
+        cv2.imwrite(str(path), image[..., ::-1].astype(np.float32) / 255)
+    elif kind == "alpha":
+        cv2.imwrite(str(path), np.dstack([image[..., ::-1], view.mask.astype(np.uint8) * 255]))
+    else:
+        write(path, image)
+        mask = tmp_path / "m.png"
+        on = view.mask.astype(np.uint8)
+        cv2.imwrite(str(mask), on if kind == "mask of ones" else np.dstack([on * 0 + 255] * 3 + [on * 255]))
+    found = images.view(path, mask)
+    assert found.image.dtype == np.uint8 and found.image.shape == (*view.mask.shape, 3)
+    assert (found.mask & view.mask).sum() / (found.mask | view.mask).sum() > 0.9
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", None])
+def test_unreadable_files_have_a_code(tmp_path, content):
+    path = tmp_path / "x.png"
+    path.mkdir() if content is None else path.write_bytes(content)
+    for work in (lambda: images.read(path), lambda: images.read_mask(path, (9, 9))):
+        with pytest.raises(MagicError) as caught:
+            work()
+        assert caught.value.code == Code.BAD_REQUEST_IMAGE
+
+
 def test_a_busy_background_is_refused():
     random = np.random.default_rng(0)
     for image in (random.integers(0, 255, (100, 100, 3), dtype=np.uint8), np.full((100, 100, 3), 90, np.uint8)):
@@ -55,6 +99,9 @@ def test_the_command_writes_match_json_and_a_picture(tmp_path):
     assert len(data["candidates"]) == 2 and os.path.getsize(tmp_path / "out" / "match.png") > 1000
     best = data["candidates"][0]
     assert set(best) >= {"pixel", "normal", "radius", "scale", "score", "s_dino", "s_curv", "rotation", "flipped", "concave"}
+    heat = cv2.imread(str(tmp_path / "out" / "heatmap.png"), cv2.IMREAD_UNCHANGED)
+    assert heat.shape == second.mask.shape and heat.max() > 128
+    assert data["target"]["size"] == [384, 384] and data["reference"]["concave"] and data["reference"]["scale"] > 0
     # target_from_reference carries the reference pixel onto the candidate's
     planar = np.array(best["target_from_reference"])
     assert planar @ [*data["reference"]["pixel"], 1] == pytest.approx([*best["pixel"], 1], abs=1e-6)
@@ -67,6 +114,10 @@ def test_the_command_writes_match_json_and_a_picture(tmp_path):
         ({"--reference-mask": "small.png"}, "size of mask"),
         ({"--target-mask": "black.png"}, "EMPTY_MASK"),
         ({"--reference-point": ("900", "10")}, "POINT_OUTSIDE"),
+        ({"--reference-point": ("5", "370")}, "POINT_OUTSIDE"),
+        ({"--reference-point": ("nan", "10")}, "POINT_OUTSIDE"),
+        ({"--target": "."}, "BAD_REQUEST_IMAGE"),
+        ({"--out": "r.png"}, "r.png"),
         ({"--features": "dinov2"}, "FEATURE_WEIGHTS"),
         ({"--top": "0"}, "top_k"),
     ],
