@@ -29,8 +29,9 @@ def test_what_launch_files_name_exists(path):
         file = Path(get_package_share_directory(package)) / relative
         assert file.is_file(), file
         if file.suffix == ".yaml":
-            (parameters,) = yaml.safe_load(file.read_text()).values()
-            assert parameters["ros__parameters"]
+            content = yaml.safe_load(file.read_text())
+            assert list(content) == ["/**"], "a node's bare name is not found under a namespace"
+            assert content["/**"]["ros__parameters"]
 
 
 def test_the_graph_comes_up_and_ends_through_ros2_launch(tmp_path):

@@ -276,3 +276,14 @@ def test_a_bad_start_is_refused():
         assert "extrinsics.left" in error.value.message
     finally:
         rclpy.try_shutdown()
+
+
+def test_what_never_came_is_named_before_what_has_stopped():
+    with Bench(cameras=["left"]) as bench:
+        stream, now = bench.node.streams["left"], time.monotonic()
+        stream.last["color"] = stream.last["camera_info"] = now - 30.0
+        assert "aligned_depth_to_color/image_raw" in bench.node.camera_status("left", now).message
+        assert "NO_FRAMES" in bench.node.camera_status("left", now).message
+        stream.last["depth"] = now - 30.0
+        assert "STALE_DATA" in bench.node.camera_status("left", now).message
+        assert "color/image_raw" in bench.node.camera_status("left", now).message
