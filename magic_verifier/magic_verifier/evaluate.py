@@ -411,6 +411,8 @@ def _try(
             else:
                 plan = MotionPlan("fg", motion)
         except MagicError as error:
+            if attempt:  # no further grasp: what the last one came to says more
+                return entry, last, False
             return {"code": error.code.name, "message": error.message, "stage": "plan"}, last, False
         finally:
             seconds["plan"] += time.perf_counter() - started
