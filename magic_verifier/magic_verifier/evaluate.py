@@ -239,7 +239,7 @@ def _load(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | None]:
     family, number = name.split(":")
     meeting = None
     if family == "mug":
-        shape = _mugs()[int(number)]
+        shape = shapes.mug_of_set(int(number))
     elif family in ("sphere", "cylinder"):
         size = {"radius": float(number)}
         if family == "cylinder":
@@ -249,13 +249,6 @@ def _load(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | None]:
         shape = shapes.make(family, int(number))
         meeting = _peg(shape) if family == "mug_tree" else None
     return shape.mesh, shape.pieces, shape, meeting
-
-
-@lru_cache(maxsize=1)
-def _mugs() -> list[Any]:
-    from magic_core.shapes import mug_set
-
-    return mug_set(MUGS)
 
 
 # ---------------------------------------------------------------- one case

@@ -16,7 +16,7 @@ from magic_core.shapes.shape import Region, Shape, section_view
 
 FAMILIES: dict[str, Callable[..., Shape]] = {**FLAT, **ROUND}
 
-__all__ = ["FAMILIES", "HANDLES", "PROFILES", "Region", "Shape", "make", "mug_set", "section_view"]
+__all__ = ["FAMILIES", "HANDLES", "PROFILES", "Region", "Shape", "make", "mug_of_set", "mug_set", "section_view"]
 
 
 def make(family: str, seed: int = 0, **parameters: float | str) -> Shape:
@@ -31,6 +31,10 @@ def make(family: str, seed: int = 0, **parameters: float | str) -> Shape:
 
 def mug_set(count: int = 134, seed: int = 0) -> list[Shape]:
     """``count`` different mugs that go through all pairs of body profile and handle form."""
-    return [
-        make("mug", seed + k, profile=PROFILES[k % len(PROFILES)], handle=HANDLES[k // len(PROFILES) % len(HANDLES)]) for k in range(count)
-    ]
+    return [mug_of_set(k, seed) for k in range(count)]
+
+
+def mug_of_set(index: int, seed: int = 0) -> Shape:
+    """The mug of that index in :func:`mug_set`, without making the others."""
+    profile, handle = PROFILES[index % len(PROFILES)], HANDLES[index // len(PROFILES) % len(HANDLES)]
+    return make("mug", seed + index, profile=profile, handle=handle)
