@@ -151,17 +151,18 @@ def fit(
     an acute tip would turn it by 90 degrees, the component that is square to the mean
     of the contour's own normals.
     """
-    local = points - centres[:, None, :]
-    distance2 = np.einsum("bkc,bkc->bk", local, local)
-    near = use & (distance2 <= (scales[:, None] / 2) ** 2)
+    u, v = points[..., 0] - centres[:, :1], points[..., 1] - centres[:, 1:]
+    near = use & (u * u + v * v <= (scales[:, None] / 2) ** 2)
     near = np.where(near.sum(axis=1, keepdims=True) >= 5, near, use)
     weight = near / np.maximum(near.sum(axis=1, keepdims=True), 1)
-    mean = np.einsum("bk,bkc->bc", weight, local)
-    deviation = (local - mean[:, None, :]) * np.sqrt(weight)[..., None]
-    covariance = np.einsum("bki,bkj->bij", deviation, deviation)
-    angle = 0.5 * np.arctan2(2 * covariance[:, 0, 1], covariance[:, 0, 0] - covariance[:, 1, 1])
+    # First and second moments; the centre is near the points, so that nothing is lost by subtracting them.
+    mean_u, mean_v = np.sum(weight * u, axis=1), np.sum(weight * v, axis=1)
+    uu = np.sum(weight * u * u, axis=1) - mean_u**2
+    vv = np.sum(weight * v * v, axis=1) - mean_v**2
+    uv = np.sum(weight * u * v, axis=1) - mean_u * mean_v
+    angle = 0.5 * np.arctan2(2 * uv, uu - vv)
     tangent = np.column_stack([np.cos(angle), np.sin(angle)])
-    outward = np.einsum("bk,bkc->bc", weight, normals)
+    outward = np.column_stack([np.sum(weight * normals[..., 0], axis=1), np.sum(weight * normals[..., 1], axis=1)])
     length = np.linalg.norm(outward, axis=1)
     along = np.abs(np.sum(outward * tangent, axis=1))
     turned = (along > 0.75 * length) & (length > 0.2)
@@ -170,8 +171,8 @@ def fit(
     own = normals[np.arange(len(points)), points.shape[1] // 2]
     side = np.where(length > 0.2, np.sum(normal * outward, axis=1), np.sum(normal * own, axis=1))
     normal = np.where(side[:, None] < 0, -normal, normal)
-    x = np.einsum("bkc,bc->bk", local, tangent)
-    y = np.einsum("bkc,bc->bk", local, normal)
+    x = u * tangent[:, :1] + v * tangent[:, 1:]
+    y = u * normal[:, :1] + v * normal[:, 1:]
     x2 = np.where(use, x * x, 0.0)
     fourth = np.sum(x2 * x2, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -122,7 +122,7 @@ def _wells(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.flo
     """Depth (B, 2) px of the hollow to the left and right of the contact: the highest rise along
     the normal on the walk along the edge before it falls below the contact."""
     result = np.zeros((len(indices), 2))
-    tolerance = 0.015 * contour.size
+    tolerance, points = 0.015 * contour.size, contour.points
     for loop in np.unique(contour.loop[indices]):
         rows = np.nonzero(contour.loop[indices] == loop)[0]
         start, length = int(contour.starts[loop]), int(contour.lengths[loop])
@@ -130,7 +130,8 @@ def _wells(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.flo
         steps = np.arange(0, length, stride)
         for side, sign in enumerate((1, -1)):
             walk = start + (indices[rows, None] - start + sign * steps) % length
-            height = np.einsum("bkc,bc->bk", contour.points[walk] - contour.points[indices[rows]][:, None], normals[rows])
+            here, out = contour.points[indices[rows]], normals[rows]
+            height = (points[walk, 0] - here[:, :1]) * out[:, :1] + (points[walk, 1] - here[:, 1:]) * out[:, 1:]
             fallen = np.logical_or.accumulate(height < -tolerance, axis=1)
             result[rows, side] = np.maximum(np.where(fallen, 0.0, height).max(axis=1), 0.0)
     return result

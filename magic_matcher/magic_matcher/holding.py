@@ -115,9 +115,9 @@ def hold(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.floa
     everything = np.concatenate([curve for curve, _ in curves])
     which = np.repeat(np.arange(len(curves)), lengths)
     first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    offset = everything[None] - points[:, None]
-    along = np.einsum("bkc,bc->bk", offset, normals)
-    across = np.abs(offset[..., 0] * normals[:, 1:2] - offset[..., 1] * normals[:, 0:1])
+    u, v = everything[:, 0] - points[:, :1], everything[:, 1] - points[:, 1:]
+    along = u * normals[:, :1] + v * normals[:, 1:]
+    across = np.abs(u * normals[:, 1:] - v * normals[:, :1])
     beyond = along - radius
     # The disc comes from outside: standing off along the normal is what a narrow corner makes it do.
     cost = np.hypot(across, np.where(beyond > 0, 0.5 * beyond, beyond))
@@ -139,7 +139,10 @@ def hold(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.floa
         drift[part] = np.where(lies, np.hypot(*moved.T) / radius, np.inf)
         inward = contour.centroid - curve
         distance = np.maximum(np.hypot(*inward.T), 1e-9)
-        rest, depth = _settle(curve, at, np.broadcast_to(-distance, (len(part), len(curve))), tolerance)
+        # This height is the same for all contacts: each start is followed once.
+        starts, which_start = np.unique(at, return_inverse=True)
+        rest, depth = _settle(curve, starts, np.broadcast_to(-distance, (len(starts), len(curve))), tolerance)
+        rest, depth = rest[which_start], depth[which_start]
         lies = np.sum(free[rest] * inward[rest], axis=1) > LIES * distance[rest]
         swing[part] = np.where(lies[:, None], np.sort(depth, axis=1) / radius, 0.0)
         start[part] = np.where(lies, swing[part, 0] - (distance[rest] - distance[at]) / radius, -1.0)
