@@ -54,6 +54,7 @@ class Stream:
     problems: dict[str, Problem] = field(default_factory=dict)
     _colors: list[tuple[float, NDArray[np.uint8], str]] = field(default_factory=list)
     _depths: list[tuple[float, NDArray[np.float32], str]] = field(default_factory=list)
+    _newest: dict[str, float] = field(default_factory=dict)
 
     def wrong(self, what: str, code: Code, message: str, now: float) -> None:
         """Note a problem of one input (``color``, ``depth``, ...); a good input of the same kind clears it."""
@@ -77,6 +78,7 @@ class Stream:
         self.pairs.clear()
         self._colors.clear()
         self._depths.clear()
+        self._newest.clear()
 
     def color(self, stamp: float, image: NDArray[np.uint8], frame_id: str, now: float) -> None:
         """Take in a colour image."""
@@ -89,10 +91,12 @@ class Stream:
     def _take(self, what: str, queue: list, stamp: float, image: NDArray, frame_id: str, now: float) -> None:
         self.counts[what] += 1
         self.last[what] = now
-        if queue and stamp < queue[-1][0] - 1.0:
+        newest = self._newest.get(what)
+        if newest is not None and stamp < newest - 1.0:
             # Time went back (a bag began again): what was collected is of another time.
             self.reset()
-            self.wrong("stamps", Code.STALE_DATA, f"stamps of {what} went back from {queue[-1][0] if queue else 'later'} to {stamp:.3f}; collected images dropped", now)
+            self.wrong("stamps", Code.STALE_DATA, f"stamps of {what} went back from {newest:.3f} to {stamp:.3f}; collected images dropped", now)
+        self._newest[what] = stamp
         self.clear(what)
         queue.append((stamp, image, frame_id))
         del queue[: -max(4, self.keep)]

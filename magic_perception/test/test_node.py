@@ -237,10 +237,14 @@ def test_stamps_that_jump_back_are_named_and_survived(frames):
         bench.until(lambda: bench.objects, "objects", tick=lambda: bench.send(later(frame, float(next(clock)))))
         count = len(bench.objects)
         past = iter(range(10, 900))
-        bench.until(
-            lambda: len(bench.objects) > count and "STALE_DATA" in bench.codes(), "objects and STALE_DATA after stamps went back", tick=lambda: bench.send(later(frame, float(next(past))))
-        )
-        assert bench.objects[-1].header.stamp.sec < 900
+        # The diagnostic lasts some seconds, a slow machine's objects may come later: each is waited for by itself.
+        told = set()
+
+        def survived():
+            told.update(bench.codes())
+            return "STALE_DATA" in told and len(bench.objects) > count and bench.objects[-1].header.stamp.sec < 900
+
+        bench.until(survived, "objects and STALE_DATA after stamps went back", 30.0, tick=lambda: bench.send(later(frame, float(next(past)))))
 
 
 def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
@@ -255,11 +259,13 @@ def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
 
         bench.until(lambda: bench.objects, "objects of two cameras", tick=both)
         count, last = len(bench.objects), bench.objects[-1].header.stamp.sec
-        bench.until(
-            lambda: len(bench.objects) > count + 1 and any("camera right" in m and "OK" not in m for m in bench.messages()) and "STALE_DATA" in bench.codes(),
-            "objects of one camera and a diagnostic of the other",
-            tick=lambda: bench.send(later(frames[0], float(next(clock)))),
-        )
+        told = set()
+
+        def alone():
+            told.update(m for m in bench.messages() if "camera right" in m and "STALE_DATA" in m)
+            return told and len(bench.objects) > count + 1
+
+        bench.until(alone, "objects of one camera and a diagnostic of the other", 30.0, tick=lambda: bench.send(later(frames[0], float(next(clock)))))
         assert bench.objects[-1].header.stamp.sec > last and len(bench.objects[-1].objects) == 2
 
 
