@@ -1,0 +1,104 @@
+"""Discs pressed against shapes for which the answer is plain; the bench and the meshes' command run."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from magic_core import shapes
+from magic_core.errors import MagicError
+from magic_matcher import bench, contour, embedded, holding, jobs, match_meshes
+
+
+def at(mask, pixel, normal, radius):
+    edge = contour.extract(mask)
+    index = edge.nearest(pixel)
+    return holding.hold(edge, edge.points[index][None], np.array([normal], float) / np.hypot(*normal), radius)
+
+
+@pytest.fixture(scope="module")
+def corner():
+    """An L of 20 px strokes: the inner corner at (79.5, 79.5), arms 170 px long."""
+    mask = np.zeros((300, 300), bool)
+    mask[60:80, 60:250] = True
+    mask[60:250, 60:80] = True
+    return mask
+
+
+@pytest.mark.parametrize("radius", [10.0, 25.0])
+def test_an_inner_corner_holds_as_deep_as_its_arms_rise(corner, radius):
+    held = at(corner, (79.5, 79.5), (1, 1), radius)
+    assert held.gap[0] == pytest.approx(np.sqrt(2) - 1, abs=0.12)
+    assert held.drift[0] < 0.2
+    # From the corner to where the disc's centre passes the end of an arm, along the diagonal: more than the arm itself, less a radius.
+    assert held.press[0, 0] * radius > (170 - radius) / np.sqrt(2) - 5
+
+
+def test_sides_tips_and_outer_corners_do_not_hold(corner):
+    for pixel, normal in (((59.5, 59.5), (-1, -1)), ((60, 150), (-1, 0)), ((249.5, 70), (1, 0))):
+        held = at(corner, pixel, normal, 15.0)
+        assert held.press[0, 0] < 0.2 or held.drift[0] > 1
+
+
+def test_a_closed_ring_holds_where_the_disc_fits_only():
+    v, u = np.mgrid[0:300, 0:300] - 149.5
+    distance = np.hypot(u, v)
+    ring = (distance < 120) & (distance > 100)
+    inside = at(ring, (150, 49), (0, 1), 30.0)
+    assert inside.gap[0] < 0.1 and inside.drift[0] < 0.2 and inside.press[0, 0] > 2
+    tight = at(ring, (150, 49), (0, 1), 104.0)
+    assert not (tight.gap[0] <= jobs.GAP and tight.press[0, 0] >= jobs.DEPTH)
+
+
+def test_an_open_hook_hangs_by_its_inside_only():
+    shape = shapes.make("hanger", 3)
+    view = shape.view("side")
+    edge = contour.extract(view.mask)
+    tool = jobs.example("hanging", "hanger", 3)
+    contact = shape.contact("hook", view)
+    radius = 0.006 / view.metres_per_pixel
+    assert tool.works(contact.pixel[None], contact.normal[None], radius)[0]
+    lowest = int(np.argmax(edge.points[:, 1]))  # the outside of the bar
+    assert not tool.works(edge.points[lowest][None], edge.normals[lowest][None], radius)[0]
+
+
+def test_no_room_at_all_is_said():
+    mask = np.ones((64, 64), bool)
+    mask[28:36, 28:36] = False
+    held = at(mask, (31.5, 27.5), (0, 1), 12.0)
+    assert held.gap[0] > jobs.GAP
+
+
+def test_left_out_weights_exist_for_every_family_and_differ():
+    shipped = embedded.weights()
+    for family in {name for job in jobs.JOBS.values() for name in job.regions}:
+        assert not np.array_equal(embedded.weights(family), shipped)
+        assert not np.array_equal(embedded.weights(family), embedded.default_weights())
+
+
+def test_bench_writes_its_three_files(tmp_path):
+    bench.main(["--count", "1", "--job", "scooping", "--tool", "spoon", "--out", str(tmp_path)])
+    data = json.loads((tmp_path / "bench.json").read_text())
+    assert {m["variant"] for m in data["means"]} == {"full", "no two-step", "no curvature", "global only", "shipped"}
+    assert "| full | 1 |" in (tmp_path / "bench.md").read_text()
+    assert cv2.imread(str(tmp_path / "bench.png")).shape == (bench.TILE, 2 * bench.TILE, 3)
+
+
+def test_meshes_from_files(tmp_path, capsys):
+    trimesh = pytest.importorskip("trimesh")
+    for name in ("l_hook", "caliper"):
+        mesh = shapes.make(name, 4).mesh
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / f"{name}.obj")
+    tool = match_meshes.draw(tmp_path / "l_hook.obj", "top", True)
+    point = shapes.make("l_hook", 4).contact("inner", tool.view).pixel
+    common = ["--reference", str(tmp_path / "l_hook.obj"), "--kind", "top", "--as-is", "--radius", "0.02", "--out", str(tmp_path / "out")]
+    match_meshes.main([*common, "--reference-point", *map(str, point), "--tools", str(tmp_path / "caliper.obj"), str(tmp_path / "l_hook.obj")])
+    data = json.loads((tmp_path / "out" / "matches.json").read_text())
+    assert [len(row["candidates"]) > 0 for row in data["matches"]] == [True, True]
+    assert np.hypot(*(np.array(data["matches"][1]["candidates"][0]["pixel"]) - point)) < 12
+    with pytest.raises(SystemExit) as caught:
+        match_meshes.main([*common[:-4], "--radius", "nan", "--out", str(tmp_path), "--tools", "x.obj"])
+    assert caught.value.code == 2 and "radius" in capsys.readouterr().err
+    with pytest.raises(MagicError):
+        match_meshes.draw(tmp_path / "nothing.obj", "top", True)
