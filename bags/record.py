@@ -16,6 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
+
 from magic_bringup import make_strategies
 from magic_bringup.recording import Recording
 from magic_core import transforms
@@ -26,7 +28,6 @@ from magic_core.sensor import D435, capture, looking_at, scene_raycaster
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures, pose_data
 from magic_core.strategy import Strategy
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -161,7 +162,17 @@ def hooking_scene(seed: int) -> list[Thing]:
 
 def hanging_scene(seed: int) -> list[Thing]:
     """A mug on the table, its handle in sight, and the rod."""
-    mug = make("mug", seed + 3, profile="straight", handle="D", radius=0.039, height=0.095, handle_thickness=0.010, handle_breadth=0.014, handle_reach=0.034)
+    mug = make(
+        "mug",
+        seed + 3,
+        profile="straight",
+        handle="D",
+        radius=0.039,
+        height=0.095,
+        handle_thickness=0.010,
+        handle_breadth=0.014,
+        handle_reach=0.034,
+    )
     rod = make("rod", 0, **make_strategies.ROD)
     return [Thing("mug", mug, lying(mug, 0.50, -0.30, np.deg2rad(70))), Thing("rod", rod, make_strategies.rod_pose(rod), known=True)]
 
@@ -172,7 +183,17 @@ LADLE = (0.46, 0.31, 0.1)
 
 def scooping_scene(seed: int) -> list[Thing]:
     """A ladle on its back, a ball and the quarter pipe."""
-    ladle = make("ladle", seed + 1, bowl_radius=0.05, aspect=1.0, depth=0.036, handle=0.22, angle=np.deg2rad(14), handle_thickness=0.012, handle_breadth=0.02)
+    ladle = make(
+        "ladle",
+        seed + 1,
+        bowl_radius=0.05,
+        aspect=1.0,
+        depth=0.036,
+        handle=0.22,
+        angle=np.deg2rad(14),
+        handle_thickness=0.012,
+        handle_breadth=0.02,
+    )
     radius = 0.035
     ball = make("sphere", seed + 5, radius=radius)
     ball_pose = make_strategies.scooped_ball(radius)
@@ -211,7 +232,10 @@ def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, 
 
 def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array]) -> None:
     """The tool in use: its pose and the target's over time, the target moved by physics, seen by both cameras on the way."""
-    made = {key: make(strategy.environment[key]["family"], strategy.environment[key]["seed"], **strategy.environment[key]["parameters"]) for key in ("tool", "target")}
+    made = {
+        key: make(strategy.environment[key]["family"], strategy.environment[key]["seed"], **strategy.environment[key]["parameters"])
+        for key in ("tool", "target")
+    }
     tool, target = made["tool"], made["target"]
     world_from_target = demonstrated_pose(strategy.environment)
     obstacles = fixtures(strategy.environment, (world_from_target @ strategy.target_contact.object_from_contact)[:3, 3])
@@ -222,7 +246,14 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
     world = _World()
     friction = strategy.physics.friction
     world.add("tool", tool, world_from_tool[0], "kinematic", friction, strategy.physics.tool_density)
-    world.add("target", target, world_from_target, "static" if strategy.physics.target_is_fixed else "dynamic", friction, strategy.physics.target_density)
+    world.add(
+        "target",
+        target,
+        world_from_target,
+        "static" if strategy.physics.target_is_fixed else "dynamic",
+        friction,
+        strategy.physics.target_density,
+    )
     shapes: dict[str, Shape] = {}
     for item in obstacles:
         entry = next(e for e in strategy.environment["fixtures"] if e["id"] == item.id)
@@ -249,7 +280,11 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
         first = None
         for index, k in enumerate(np.linspace(0, len(poses) - 1, DEMONSTRATION_FRAMES).round().astype(int)):
             t, tool_pose, target_pose = poses[k]
-            meshes = [tool.mesh.transformed(tool_pose), target.mesh.transformed(target_pose), *(i.mesh.transformed(i.world_from_object) for i in obstacles)]
+            meshes = [
+                tool.mesh.transformed(tool_pose),
+                target.mesh.transformed(target_pose),
+                *(i.mesh.transformed(i.world_from_object) for i in obstacles),
+            ]
             caster = scene_raycaster(meshes)
             frames = [
                 capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=START + 0.1 + t, raycaster=caster)

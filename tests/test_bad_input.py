@@ -6,11 +6,12 @@ import time
 
 import numpy as np
 import pytest
+from rclpy.executors import MultiThreadedExecutor
+
 from magic_bringup import bag_file, demo, fakes
 from magic_bringup.testing import DEADLINE, Bench, camera_messages, feeding, started, until
 from magic_core import conversions, shapes, transforms
 from magic_core.errors import Code
-from rclpy.executors import MultiThreadedExecutor
 
 DEPTH, COLOR, INFO = "/aligned_depth_to_color/image_raw", "/color/image_raw", "/color/camera_info"
 
@@ -129,7 +130,18 @@ def test_the_demo_on_an_empty_bag(tmp_path, capsys):
     out = tmp_path / "out"
     assert demo.main(["--bag", str(tmp_path / "bag"), "--out", str(out)]) == 1
     summary = summary_of(out)
-    assert list(summary) == ["strategy", "variant", "features", "success", "code", "message", "candidates", "simulations", "seconds", "peak_memory_mb"]
+    assert list(summary) == [
+        "strategy",
+        "variant",
+        "features",
+        "success",
+        "code",
+        "message",
+        "candidates",
+        "simulations",
+        "seconds",
+        "peak_memory_mb",
+    ]
     assert summary["code"] == Code.BAD_BAG
     assert "empty" in summary["message"]
     assert str(tmp_path / "bag") in summary["message"]

@@ -13,7 +13,18 @@ BAGS = Path(__file__).resolve().parents[1] / "bags"
 def test_demo_writes_summary_and_report(tmp_path):
     assert demo.main(["--strategy", "hooking", "--variant", "fg", "--bag", str(BAGS / "hooking"), "--out", str(tmp_path)]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert list(summary) == ["strategy", "variant", "features", "success", "code", "message", "candidates", "simulations", "seconds", "peak_memory_mb"]
+    assert list(summary) == [
+        "strategy",
+        "variant",
+        "features",
+        "success",
+        "code",
+        "message",
+        "candidates",
+        "simulations",
+        "seconds",
+        "peak_memory_mb",
+    ]
     assert (summary["success"], summary["code"], summary["features"]) == (True, 0, "embedded")
     assert list(summary["seconds"]) == ["perceive", "match", "plan", "verify", "total"]
     assert summary["seconds"]["perceive"] > 0.05  # no scene is seen in less

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from magic_bringup.testing import Bench, started, until
 from magic_core import conversions
 from magic_core.errors import Code

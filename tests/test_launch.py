@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
+
 from magic_bringup.domain import isolated
 from magic_bringup.graph import NODES, Process, executable
 from magic_bringup.testing import DEADLINE, until
@@ -20,7 +21,7 @@ LAUNCH = Path(__file__).resolve().parents[1] / "ros2_ws/src/magic_bringup/launch
 def test_what_launch_files_name_exists(path):
     root = ElementTree.parse(path).getroot()
     for argument in root.iter("arg"):
-        if "value" not in argument.keys():
+        if "value" not in argument:
             assert argument.get("description"), argument.get("name")
     for node in root.iter("node"):
         if node.get("pkg").startswith("magic_"):
@@ -37,10 +38,15 @@ def test_what_launch_files_name_exists(path):
 def test_the_graph_comes_up_and_ends_through_ros2_launch(tmp_path):
     program = shutil.which("ros2")
     assert program, "there is no ros2 command"
-    process = Process.start("launch", [program, "launch", "magic_bringup", "magic.launch.xml", "features:=embedded"], tmp_path / "launch.log", isolated())
+    process = Process.start(
+        "launch", [program, "launch", "magic_bringup", "magic.launch.xml", "features:=embedded"], tmp_path / "launch.log", isolated()
+    )
     try:
         for name in NODES:
-            until(lambda n=name: re.search(rf"\[{n}\]: .*(waiting for|ready)", process.tail(500)) or process.status is not None, what=f"{name} is up")
+            until(
+                lambda n=name: re.search(rf"\[{n}\]: .*(waiting for|ready)", process.tail(500)) or process.status is not None,
+                what=f"{name} is up",
+            )
         assert process.status is None, process.tail(50)
         process.signal(signal.SIGINT)
         assert process.wait(DEADLINE) is not None

@@ -4,6 +4,7 @@ import re
 import signal
 
 import pytest
+
 from magic_bringup.domain import free_domain, isolated
 from magic_bringup.graph import NODES, Graph
 from magic_bringup.testing import DEADLINE, until

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from magic_bringup import demo, report, rgbd_to_bag
 from magic_core import conversions, transforms
 

@@ -52,7 +52,9 @@ def markers(scene: Scene) -> MarkerArray:
                     if not a & bit:
                         box.points += [Point(x=p[0], y=p[1], z=p[2]) for p in corners[[a, a | bit]].tolist()]
         top = item.world_from_object[2, 3] + float(item.mesh.extents[2]) / 2 if len(item.mesh.vertices) else item.world_from_object[2, 3]
-        text = add("names", i, Marker.TEXT_VIEW_FACING, transforms.make(None, [*item.world_from_object[:2, 3], top + 0.03]), (1.0, 1.0, 1.0), 1.0)
+        text = add(
+            "names", i, Marker.TEXT_VIEW_FACING, transforms.make(None, [*item.world_from_object[:2, 3], top + 0.03]), (1.0, 1.0, 1.0), 1.0
+        )
         text.scale.z = 0.025
         text.text = item.id
     return MarkerArray(markers=result)

@@ -127,7 +127,9 @@ def parts(
     return labels
 
 
-def _join_small(part: NDArray[np.int64], a: NDArray[np.int64], b: NDArray[np.int64], weight: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+def _join_small(
+    part: NDArray[np.int64], a: NDArray[np.int64], b: NDArray[np.int64], weight: NDArray[np.float64], least: float
+) -> NDArray[np.int64]:
     """Parts of too few points, smallest first, into the neighbour with the longest common border; without one into the largest part."""
     part = np.unique(part, return_inverse=True)[1]
     total = int(part.max()) + 1
@@ -204,7 +206,11 @@ def _ends_at(centre: NDArray[np.float64], members: NDArray[np.bool_], seam: NDAr
     if breadth > evidence.breadth or length < 3 * breadth:
         return False
     along = (centre[seam[members[seam]]] - centre[members].mean(axis=0)) @ axes[0]
-    return len(along) > 0 and float(np.percentile(np.minimum(along - low[0], high[0] - along), 90)) < 0.2 * length and float(np.ptp(along)) < 0.5 * length
+    return (
+        len(along) > 0
+        and float(np.percentile(np.minimum(along - low[0], high[0] - along), 90)) < 0.2 * length
+        and float(np.ptp(along)) < 0.5 * length
+    )
 
 
 def _two_things(
@@ -224,7 +230,12 @@ def _two_things(
     lower, upper = (first, second) if np.median(height[first]) < np.median(height[second]) else (second, first)
     bottom, top = float(np.percentile(height[upper], 2)), float(np.percentile(height[lower], 97))
     if bottom < top - evidence.rest:
-        return bottom < evidence.floor and float(np.percentile(height[lower], 2)) < evidence.floor and share >= evidence.beside and angle >= evidence.beside_bend
+        return (
+            bottom < evidence.floor
+            and float(np.percentile(height[lower], 2)) < evidence.floor
+            and share >= evidence.beside
+            and angle >= evidence.beside_bend
+        )
     foot = centre[upper & (height < bottom + 0.025), :2]
     if len(foot) < 4 or float(np.ptp(foot @ np.linalg.svd(foot - foot.mean(axis=0), full_matrices=False)[2][0])) < evidence.foot:
         return False
@@ -240,7 +251,9 @@ def _two_things(
     return not neck
 
 
-def insides(points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]) -> NDArray[np.int64]:
+def insides(
+    points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]
+) -> NDArray[np.int64]:
     """Labels (N,) with the inside of round open things (mugs, bowls, pots) joined to their outside.
 
     The two surfaces meet at a rim that depth cannot see across.  A part is the inside of another where the other is
@@ -274,7 +287,11 @@ def insides(points: NDArray[np.floating], normal: NDArray[np.floating], labels: 
             within = np.mean(np.linalg.norm(toward, axis=1) < 1.1 * radius + 0.005)
             low = np.percentile(heights[m], 90) < top + 0.012
             upright = finite[np.abs(normal[finite, 2]) < 0.8]
-            inward = np.mean(np.sum(normal[upright, :2] * (centre - points[upright, :2]), axis=1) > 0) if len(upright) > 0.2 * len(finite) else float(np.median(heights[m]) < 0.6 * top)
+            inward = (
+                np.mean(np.sum(normal[upright, :2] * (centre - points[upright, :2]), axis=1) > 0)
+                if len(upright) > 0.2 * len(finite)
+                else float(np.median(heights[m]) < 0.6 * top)
+            )
             if within > 0.85 and low and inward > 0.75 and (best is None or within > best[0]):
                 best = (within, j)
         if best is not None:

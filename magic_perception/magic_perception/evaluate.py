@@ -67,7 +67,12 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
     scenes: dict[str, object] = {}
     everything: list[float] = []
     for name, k in json.loads((folder / "intrinsics.json").read_text()).items():
-        frame = read_frame(folder / f"{name}_color.png", folder / f"{name}_depth_mm.png", Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]), name)
+        frame = read_frame(
+            folder / f"{name}_color.png",
+            folder / f"{name}_depth_mm.png",
+            Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]),
+            name,
+        )
         truth = cv2.imread(str(folder / f"{name}_label.png"), cv2.IMREAD_UNCHANGED).astype(int) // 10 * 10
         parameters = Parameters(region_low=(-2, -2, -0.05), region_high=(2, 2, 0.6), split=split)
         start = time.process_time()
@@ -78,7 +83,12 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
         for value in np.unique(truth[truth >= 20]):
             mask = truth == value
             scores.append(max((overlap(mask, labels == i) for i in np.unique(labels[mask]) if i > 0), default=0.0))
-        scenes[name] = {"objects": len(scores), "found": int(labels.max()), "best_iou": [round(s, 3) for s in scores], "cpu_seconds": round(seconds, 3)}
+        scenes[name] = {
+            "objects": len(scores),
+            "found": int(labels.max()),
+            "best_iou": [round(s, 3) for s in scores],
+            "cpu_seconds": round(seconds, 3),
+        }
         everything += scores
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
@@ -104,16 +114,32 @@ def captures(folder: Path, segmenter: Segmenter) -> dict[str, object]:
     single = folder / "realsense_single"
     if single.is_dir():
         for name, k in json.loads((single / "intrinsics.json").read_text()).items():
-            frames.append(read_frame(single / f"{name}_color.png", single / f"{name}_depth_mm.png", Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]), name))
+            frames.append(
+                read_frame(
+                    single / f"{name}_color.png",
+                    single / f"{name}_depth_mm.png",
+                    Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]),
+                    name,
+                )
+            )
     if (folder / "mallet").is_dir():
         k = json.loads((folder / "mallet/realsense_intrinsic.json").read_text())
         m = k["intrinsic_matrix"]
-        frames.append(read_frame(folder / "mallet/rgb.png", folder / "mallet/depth.png", Intrinsics(k["width"], k["height"], m[0], m[4], m[6], m[7]), "mallet"))
+        frames.append(
+            read_frame(
+                folder / "mallet/rgb.png",
+                folder / "mallet/depth.png",
+                Intrinsics(k["width"], k["height"], m[0], m[4], m[6], m[7]),
+                "mallet",
+            )
+        )
     result: dict[str, object] = {}
     for frame in frames:
         report = Report()
         start = time.process_time()
-        scene = perceive([frame], parameters=Parameters(region_low=(-1.3, -1.3, -0.05), region_high=(1.3, 1.3, 0.6)), segmenter=segmenter, report=report)
+        scene = perceive(
+            [frame], parameters=Parameters(region_low=(-1.3, -1.3, -0.05), region_high=(1.3, 1.3, 0.6)), segmenter=segmenter, report=report
+        )
         seconds = time.process_time() - start
         sizes = [sorted((o.box_extents * 1000).round(1).tolist(), reverse=True) for o in scene.objects]
         row: dict[str, object] = {"objects": len(sizes), "cpu_seconds": round(seconds, 3), "sizes_mm": sizes[:4]}
@@ -186,13 +212,19 @@ def meshes(folder: Path, segmenter: Segmenter, poses: int = 3, seed: int = 0) ->
     """Ray-cast captures of each mesh file in ``poses`` yaws; also a row of pictures for each mesh."""
     from magic_core import sensor
 
-    cameras = {"left": sensor.looking_at([0.94, 0.42, 0.66], [0.5, 0, 0.03]), "right": sensor.looking_at([0.94, -0.42, 0.66], [0.5, 0, 0.03])}
+    cameras = {
+        "left": sensor.looking_at([0.94, 0.42, 0.66], [0.5, 0, 0.03]),
+        "right": sensor.looking_at([0.94, -0.42, 0.66], [0.5, 0, 0.03]),
+    }
     rows, pictures = [], []
     for number, path in enumerate(sorted(folder.glob("*/*.obj"))):
         for turn in range(poses):
             truth = placed(path, 0.4 + 2 * np.pi * turn / poses)
             caster = sensor.scene_raycaster([truth])
-            frames = [sensor.capture([truth], sensor.D435, pose, [seed, number, turn, i], camera=name, raycaster=caster) for i, (name, pose) in enumerate(cameras.items())]
+            frames = [
+                sensor.capture([truth], sensor.D435, pose, [seed, number, turn, i], camera=name, raycaster=caster)
+                for i, (name, pose) in enumerate(cameras.items())
+            ]
             masks = [caster.perspective(sensor.D435, pose)[0].ids == 1 for pose in cameras.values()]
             view = find_view(truth)
             row: dict[str, object] = {"mesh": f"{path.parent.name}/{path.stem}", "turn": turn}
@@ -208,16 +240,31 @@ def meshes(folder: Path, segmenter: Segmenter, poses: int = 3, seed: int = 0) ->
                     continue
                 if method == "completed":
                     row["objects"] = len(scene.objects)
-                    label = sorted(set(np.unique(np.concatenate([i[i > 0] for i in report.labels]))))[[o.id for o in scene.objects].index(item.id)]
+                    label = sorted(set(np.unique(np.concatenate([i[i > 0] for i in report.labels]))))[
+                        [o.id for o in scene.objects].index(item.id)
+                    ]
                     row["mask_iou"] = round(float(np.mean([overlap(m, i == label) for m, i in zip(masks, report.labels, strict=True)])), 4)
                     row["pieces"] = len(item.pieces)
                     row["shape"] = report.shapes[item.id]
                 found = item.mesh.transformed(item.world_from_object)
                 volume = shared_volume(truth, found)
                 total, opened = open_holes(truth, view, found)
-                row[method] = {"chamfer_mm": round(1000 * chamfer(truth, found), 2), "volume_iou": None if volume is None else round(volume, 3), "holes": total, "open": opened}
-                shown = Raycaster([replace(found, colors=None)]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0]
-                drawn.append(np.where((shown.ids >= 0)[..., None], (90 + 150 * np.abs(shown.normals @ transforms.unit([0.3, 0.4, 0.86])))[..., None], 0).astype(np.uint8).repeat(3, axis=2))
+                row[method] = {
+                    "chamfer_mm": round(1000 * chamfer(truth, found), 2),
+                    "volume_iou": None if volume is None else round(volume, 3),
+                    "holes": total,
+                    "open": opened,
+                }
+                shown = Raycaster([replace(found, colors=None)]).orthographic(
+                    view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0
+                )[0]
+                drawn.append(
+                    np.where(
+                        (shown.ids >= 0)[..., None], (90 + 150 * np.abs(shown.normals @ transforms.unit([0.3, 0.4, 0.86])))[..., None], 0
+                    )
+                    .astype(np.uint8)
+                    .repeat(3, axis=2)
+                )
             rows.append(row)
             if turn == 0:
                 pictures.append(strip(frames, masks, truth, drawn))
@@ -234,7 +281,12 @@ def nearest(objects: tuple[SceneObject, ...], truth: Mesh) -> SceneObject | None
 def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     """Means over all rows."""
     seen = [r for r in rows if r.get("mask_iou") is not None]
-    result: dict[str, object] = {"captures": len(rows), "found": len(seen), "one_object": sum(r["objects"] == 1 for r in seen), "mask_iou": round(float(np.mean([r["mask_iou"] for r in seen])), 4)}
+    result: dict[str, object] = {
+        "captures": len(rows),
+        "found": len(seen),
+        "one_object": sum(r["objects"] == 1 for r in seen),
+        "mask_iou": round(float(np.mean([r["mask_iou"] for r in seen])), 4),
+    }
     for method in ("completed", "paper"):
         cells = [r[method] for r in rows if isinstance(r.get(method), dict)]
         volumes = [c["volume_iou"] for c in cells if c["volume_iou"] is not None]
@@ -249,13 +301,18 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     return result
 
 
-def strip(frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], truth: Mesh, views: list[NDArray[np.uint8]], size: int = 150) -> NDArray[np.uint8]:
+def strip(
+    frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], truth: Mesh, views: list[NDArray[np.uint8]], size: int = 150
+) -> NDArray[np.uint8]:
     """One row of pictures: the left camera's cut-out, then the true view, this reconstruction and the paper's."""
     rows, columns = np.nonzero(masks[0])
     middle = (int(rows.mean()), int(columns.mean()))
     half = int(max(np.ptp(rows), np.ptp(columns), 40) * 0.6)
     cut = frames[0].color[max(middle[0] - half, 0) : middle[0] + half, max(middle[1] - half, 0) : middle[1] + half]
-    return np.hstack([cv2.resize(np.ascontiguousarray(tile), (size, size), interpolation=cv2.INTER_AREA) for tile in (cut, *views)] + [np.zeros((size, size, 3), np.uint8)] * (3 - len(views)))
+    return np.hstack(
+        [cv2.resize(np.ascontiguousarray(tile), (size, size), interpolation=cv2.INTER_AREA) for tile in (cut, *views)]
+        + [np.zeros((size, size, 3), np.uint8)] * (3 - len(views))
+    )
 
 
 # ---------------------------------------------------------------- the report
@@ -266,22 +323,44 @@ def markdown(result: dict) -> str:
     lines = ["# Perception, measured", ""]
     if "osd" in result:
         part = result["osd"]
-        lines += [f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects.", "", "| scene | objects | found | best IoU | CPU s |", "| --- | --- | --- | --- | --- |"]
-        lines += [f"| {n} | {s['objects']} | {s['found']} | {', '.join(f'{x:.2f}' for x in s['best_iou'])} | {s['cpu_seconds']:.2f} |" for n, s in part["scenes"].items()] + [""]
+        lines += [
+            f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects.",
+            "",
+            "| scene | objects | found | best IoU | CPU s |",
+            "| --- | --- | --- | --- | --- |",
+        ]
+        lines += [
+            f"| {n} | {s['objects']} | {s['found']} | {', '.join(f'{x:.2f}' for x in s['best_iou'])} | {s['cpu_seconds']:.2f} |"
+            for n, s in part["scenes"].items()
+        ] + [""]
     if "captures" in result:
-        lines += ["| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |", "| --- | --- | --- | --- | --- | --- |"]
+        lines += [
+            "| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |",
+            "| --- | --- | --- | --- | --- | --- |",
+        ]
         for name, row in result["captures"].items():
             size = " x ".join(f"{x:.0f}" for x in row["sizes_mm"][0]) if row["sizes_mm"] else ""
-            lines.append(f"| {name}{' (one object)' if row.get('one_object') else ' (not one object)' if 'one_object' in row else ''} | {row['objects']} | {size} | {' x '.join(map(str, row.get('read_mm', [])))} | {row.get('largest_error_mm', '')} | {row['cpu_seconds']:.2f} |")
+            lines.append(
+                f"| {name}{' (one object)' if row.get('one_object') else ' (not one object)' if 'one_object' in row else ''} | {row['objects']} | {size} | {' x '.join(map(str, row.get('read_mm', [])))} | {row.get('largest_error_mm', '')} | {row['cpu_seconds']:.2f} |"
+            )
         lines.append("")
     if "meshes" in result:
         part = result["meshes"]
-        lines += [f"Ray-cast captures: {part['captures']}, found {part['found']}, as one object {part['one_object']}; mean mask IoU {part['mask_iou']:.3f}.", ""]
+        lines += [
+            f"Ray-cast captures: {part['captures']}, found {part['found']}, as one object {part['one_object']}; mean mask IoU {part['mask_iou']:.3f}.",
+            "",
+        ]
         lines += ["| method | Chamfer, mm: mean | median | volumetric IoU | holes open |", "| --- | --- | --- | --- | --- |"]
         for method in ("completed", "paper"):
             m = part[method]
-            lines.append(f"| {method} | {m['chamfer_mm']:.2f} | {m['chamfer_mm_median']:.2f} | {m['volume_iou']:.3f} (of {m['volumes']}) | {m['holes_open']} of {m['holes']} |")
-        lines += ["", "| mesh | mask IoU | shape | pieces | Chamfer, mm: completed, paper | volumetric IoU: completed, paper | holes open: completed, paper |", "| --- | --- | --- | --- | --- | --- | --- |"]
+            lines.append(
+                f"| {method} | {m['chamfer_mm']:.2f} | {m['chamfer_mm_median']:.2f} | {m['volume_iou']:.3f} (of {m['volumes']}) | {m['holes_open']} of {m['holes']} |"
+            )
+        lines += [
+            "",
+            "| mesh | mask IoU | shape | pieces | Chamfer, mm: completed, paper | volumetric IoU: completed, paper | holes open: completed, paper |",
+            "| --- | --- | --- | --- | --- | --- | --- |",
+        ]
         for name in dict.fromkeys(r["mesh"] for r in part["rows"]):
             mine = [r for r in part["rows"] if r["mesh"] == name and r.get("mask_iou") is not None]
             if not mine:
@@ -290,11 +369,19 @@ def markdown(result: dict) -> str:
 
             def pair(key: str, mine: list = mine) -> str:
                 return ", ".join(
-                    "-" if not (v := [r[m][key] for r in mine if isinstance(r.get(m), dict) and r[m][key] is not None]) else f"{np.mean(v):.2f}" for m in ("completed", "paper")
+                    "-"
+                    if not (v := [r[m][key] for r in mine if isinstance(r.get(m), dict) and r[m][key] is not None])
+                    else f"{np.mean(v):.2f}"
+                    for m in ("completed", "paper")
                 )
 
-            holes = ", ".join(f"{sum(r[m]['open'] for r in mine if isinstance(r.get(m), dict))}/{sum(r[m]['holes'] for r in mine if isinstance(r.get(m), dict))}" for m in ("completed", "paper"))
-            lines.append(f"| {name} | {np.mean([r['mask_iou'] for r in mine]):.3f} | {', '.join(dict.fromkeys(r['shape'] for r in mine))} | {max(r['pieces'] for r in mine)} | {pair('chamfer_mm')} | {pair('volume_iou')} | {holes} |")
+            holes = ", ".join(
+                f"{sum(r[m]['open'] for r in mine if isinstance(r.get(m), dict))}/{sum(r[m]['holes'] for r in mine if isinstance(r.get(m), dict))}"
+                for m in ("completed", "paper")
+            )
+            lines.append(
+                f"| {name} | {np.mean([r['mask_iou'] for r in mine]):.3f} | {', '.join(dict.fromkeys(r['shape'] for r in mine))} | {max(r['pieces'] for r in mine)} | {pair('chamfer_mm')} | {pair('volume_iou')} | {holes} |"
+            )
     return "\n".join(lines) + "\n"
 
 

@@ -56,7 +56,12 @@ class Parameters:
     def __post_init__(self) -> None:
         low, high = np.asarray(self.region_low, float), np.asarray(self.region_high, float)
         if low.shape != (3,) or high.shape != (3,) or not np.all(low < high):
-            raise MagicError(Code.BAD_REQUEST, "region of interest", f"{self.region_low} to {self.region_high}", "a lower corner below the upper one on x, y and z")
+            raise MagicError(
+                Code.BAD_REQUEST,
+                "region of interest",
+                f"{self.region_low} to {self.region_high}",
+                "a lower corner below the upper one on x, y and z",
+            )
         if self.method not in METHODS:
             raise MagicError(Code.BAD_REQUEST, "method of reconstruction", self.method, METHODS)
         for name in ("table_tilt", "table_band", "min_height", "cluster_eps", "resolution", "wall"):

@@ -64,7 +64,12 @@ def write(scene_dir: Path, frame: RgbdFrame, scene, report: Report, seconds: flo
                 "mesh": mesh_file,
                 "pieces": len(item.pieces),
                 "shape": report.shapes.get(item.id, ""),
-                "view": {"file": view_file, "kind": item.view.kind, "metres_per_pixel": item.view.metres_per_pixel, "confidence": item.view.confidence},
+                "view": {
+                    "file": view_file,
+                    "kind": item.view.kind,
+                    "metres_per_pixel": item.view.metres_per_pixel,
+                    "confidence": item.view.confidence,
+                },
                 "confidence": item.confidence,
             }
         )
@@ -90,8 +95,12 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--weights", default="", help="weights of the segmenter: a hub name or a local folder")
     parser.add_argument("--device", default="cpu", help="torch device of the segmenter")
     parser.add_argument("--method", choices=METHODS, default="completed", help="reconstruction")
-    parser.add_argument("--max-distance", type=float, default=1.3, help="how far from below the camera objects are looked for, m (default 1.3)")
-    parser.add_argument("--camera-pose", help="world_from_camera as x,y,z,qx,qy,qz,qw (world z up); without, the table that is seen is the plane z = 0")
+    parser.add_argument(
+        "--max-distance", type=float, default=1.3, help="how far from below the camera objects are looked for, m (default 1.3)"
+    )
+    parser.add_argument(
+        "--camera-pose", help="world_from_camera as x,y,z,qx,qy,qz,qw (world z up); without, the table that is seen is the plane z = 0"
+    )
     parser.add_argument("--no-split", action="store_true", help="do not part touching objects at concave seams")
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
     given = parser.parse_args(args)
@@ -119,14 +128,18 @@ def main(args: list[str] | None = None) -> None:
             split=not given.no_split,
         )
         report = Report()
-        scene = perceive([frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report)
+        scene = perceive(
+            [frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report
+        )
         write(given.out, frame, scene, report, time.perf_counter() - start)
     except MagicError as error:
         print(f"perceive_images: {error}", file=sys.stderr)
         sys.exit(1)
     for item in scene.objects:
         size = " x ".join(f"{1000 * x:.0f}" for x in item.box_extents)
-        print(f"{item.id}: {size} mm, {report.pixels.get(item.id, 0)} pixels, {report.shapes.get(item.id, '')}, view {item.view.kind}, confidence {item.confidence:.2f}")
+        print(
+            f"{item.id}: {size} mm, {report.pixels.get(item.id, 0)} pixels, {report.shapes.get(item.id, '')}, view {item.view.kind}, confidence {item.confidence:.2f}"
+        )
     print(f"{len(scene.objects)} objects in {given.out}")
     sys.exit(0)
 

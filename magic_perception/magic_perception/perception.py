@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from magic_interfaces.msg import SceneObjectArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
@@ -22,6 +21,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene, SceneObject
+from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception.averaging import average
 from magic_perception.parameters import METHODS, Parameters
@@ -51,10 +51,23 @@ class Perception(Node):
         low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box in `frame`, m", read_only=True)
         high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box in `frame`, m", read_only=True)
         count = p("average", 3, "frames of a camera at rest that are averaged", low=1, high=30, read_only=True)
-        tolerance = p("pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0, read_only=True)
-        self.skew = p("camera_tolerance", 0.5, "a camera whose newest frame is older than the newest of all by more than this is left out, s", low=0.0, high=60.0, read_only=True)
-        self.patience = p("camera_timeout", 2.0, "a camera silent for this long is no longer waited for, s", low=0.1, high=60.0, read_only=True)
-        self.max_age = p("max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0, read_only=True)
+        tolerance = p(
+            "pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0, read_only=True
+        )
+        self.skew = p(
+            "camera_tolerance",
+            0.5,
+            "a camera whose newest frame is older than the newest of all by more than this is left out, s",
+            low=0.0,
+            high=60.0,
+            read_only=True,
+        )
+        self.patience = p(
+            "camera_timeout", 2.0, "a camera silent for this long is no longer waited for, s", low=0.1, high=60.0, read_only=True
+        )
+        self.max_age = p(
+            "max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0, read_only=True
+        )
         rate = p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0, read_only=True)
         self.aligned = p("aligned", True, "depth is registered to colour by the driver", read_only=True)
         name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS, read_only=True)
@@ -64,7 +77,9 @@ class Perception(Node):
         use_color = p("use_color", True, "refine masks by the colour difference to the table", read_only=True)
         split = p("split", True, "part touching objects at concave seams where their forms say that they are two", read_only=True)
         margin = p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1, read_only=True)
-        min_height = p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1, read_only=True)
+        min_height = p(
+            "min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1, read_only=True
+        )
         seed = p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1, read_only=True)
         if not self.cameras or len(set(self.cameras)) != len(self.cameras):
             raise MagicError(Code.BAD_REQUEST, "parameter cameras", self.cameras, "at least one name, none twice")
@@ -76,7 +91,14 @@ class Perception(Node):
         )  # fmt: skip
         self.given: dict[str, np.ndarray] = {}
         for camera in self.cameras:
-            numbers = list(p(f"extrinsics.{camera}", [0.0] * 7, f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF", read_only=True))
+            numbers = list(
+                p(
+                    f"extrinsics.{camera}",
+                    [0.0] * 7,
+                    f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF",
+                    read_only=True,
+                )
+            )
             if any(numbers):
                 if len(numbers) != 7 or not 0.9 < np.linalg.norm(numbers[3:]) < 1.1:
                     raise MagicError(Code.BAD_REQUEST, f"parameter extrinsics.{camera}", numbers, "x y z and a unit quaternion x y z w")
@@ -106,7 +128,9 @@ class Perception(Node):
             self.create_subscription(CameraInfo, topics["camera_info"], partial(self.on_info, camera, False), SENSOR, callback_group=inputs)
             if not self.aligned:
                 topics["depth_camera_info"] = f"{base}/depth/camera_info"
-                self.create_subscription(CameraInfo, topics["depth_camera_info"], partial(self.on_info, camera, True), SENSOR, callback_group=inputs)
+                self.create_subscription(
+                    CameraInfo, topics["depth_camera_info"], partial(self.on_info, camera, True), SENSOR, callback_group=inputs
+                )
             self.topics[camera] = topics
         try:
             from tf2_msgs.msg import TFMessage
@@ -150,11 +174,18 @@ class Perception(Node):
             try:
                 stamp = cv.time_from_msg(msg.header.stamp)
                 if not msg.header.frame_id:
-                    raise MagicError(Code.NO_TRANSFORM, f"frame_id on {self.topics[camera][what]}", "empty", "the name of the optical frame")
+                    raise MagicError(
+                        Code.NO_TRANSFORM, f"frame_id on {self.topics[camera][what]}", "empty", "the name of the optical frame"
+                    )
                 if self.max_age > 0:
                     age = self.get_clock().now().nanoseconds * 1e-9 - stamp
                     if age > self.max_age:
-                        raise MagicError(Code.STALE_DATA, f"age in s of the image on {self.topics[camera][what]}", round(age, 2), f"at most {self.max_age}")
+                        raise MagicError(
+                            Code.STALE_DATA,
+                            f"age in s of the image on {self.topics[camera][what]}",
+                            round(age, 2),
+                            f"at most {self.max_age}",
+                        )
                 if what == "color":
                     stream.color(stamp, cv.color_from_msg(msg), msg.header.frame_id, now)
                 else:
@@ -227,14 +258,28 @@ class Perception(Node):
             seconds = time.monotonic() - now
             self.done += 1
             seen = [o for o in scene.objects if o.source == "camera"]
-            values: dict[str, object] = {"objects": ", ".join(o.id for o in scene.objects), "seconds": round(seconds, 3), "cameras": ", ".join(f.camera for f in frames)}
+            values: dict[str, object] = {
+                "objects": ", ".join(o.id for o in scene.objects),
+                "seconds": round(seconds, 3),
+                "cameras": ", ".join(f.camera for f in frames),
+            }
             values.update({f"seconds {k}": round(v, 4) for k, v in report.seconds.items()})
             values["notes"] = "; ".join(report.notes)
             if seen:
                 level = DiagnosticStatus.WARN if report.notes else DiagnosticStatus.OK
-                self.outcome = (level, Code.OK, f"{len(seen)} objects seen, {len(scene.objects) - len(seen)} known" + (f"; {values['notes']}" if report.notes else ""), values)
+                self.outcome = (
+                    level,
+                    Code.OK,
+                    f"{len(seen)} objects seen, {len(scene.objects) - len(seen)} known" + (f"; {values['notes']}" if report.notes else ""),
+                    values,
+                )
             else:
-                self.outcome = (DiagnosticStatus.WARN, Code.NO_OBJECTS, "[106 NO_OBJECTS] nothing stands on the table in the region of interest", values)
+                self.outcome = (
+                    DiagnosticStatus.WARN,
+                    Code.NO_OBJECTS,
+                    "[106 NO_OBJECTS] nothing stands on the table in the region of interest",
+                    values,
+                )
             if self.done == 1:
                 self.get_logger().info(f"first scene after {now - self.started:.1f} s: {self.outcome[2]}, in {seconds:.2f} s")
         except Exception as error:
@@ -264,12 +309,16 @@ class Perception(Node):
                         return [], notes
                 if stream.intrinsics is None:
                     if stream.pairs or stream.counts["color"]:
-                        stream.wrong("camera_info", Code.NO_CAMERA_INFO, f"no camera_info received on {self.topics[camera]['camera_info']}", now)
+                        stream.wrong(
+                            "camera_info", Code.NO_CAMERA_INFO, f"no camera_info received on {self.topics[camera]['camera_info']}", now
+                        )
                     notes.append(f"camera {camera} left out: no camera_info")
                 elif not stream.pairs:
                     notes.append(f"camera {camera} left out: no frames")
                 elif newest - stream.pairs[-1].stamp > self.skew:
-                    message = f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.skew} s)"
+                    message = (
+                        f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.skew} s)"
+                    )
                     stream.wrong("stamps", Code.STALE_DATA, f"{self.topics[camera]['color']}: {message}", now)
                     notes.append(f"camera {camera} left out: {message}")
                 else:
@@ -308,15 +357,30 @@ class Perception(Node):
                 depth = pair.depth
                 if not self.aligned:
                     if stream.depth_intrinsics is None:
-                        raise MagicError(Code.NO_CAMERA_INFO, f"camera_info of {stream.name}'s depth", "none received", self.topics[stream.name]["depth_camera_info"])
+                        raise MagicError(
+                            Code.NO_CAMERA_INFO,
+                            f"camera_info of {stream.name}'s depth",
+                            "none received",
+                            self.topics[stream.name]["depth_camera_info"],
+                        )
                     color_from_depth = self.buffer.lookup(pair.frame_id, pair.depth_frame_id, pair.stamp)
                     depth = register_depth(depth, stream.depth_intrinsics, intrinsics, color_from_depth)
                 elif pair.depth_frame_id.lstrip("/") != pair.frame_id.lstrip("/"):
-                    raise MagicError(Code.NO_TRANSFORM, f"frame of {self.topics[stream.name]['depth']}", pair.depth_frame_id, f"{pair.frame_id}, that of colour; else set aligned to false")
+                    raise MagicError(
+                        Code.NO_TRANSFORM,
+                        f"frame of {self.topics[stream.name]['depth']}",
+                        pair.depth_frame_id,
+                        f"{pair.frame_id}, that of colour; else set aligned to false",
+                    )
                 frames.append(RgbdFrame(pair.color, depth, intrinsics, poses[-1], stream.name, pair.stamp))
         result = average(frames)
         if np.isfinite(result.depth).sum() < 100:
-            raise MagicError(Code.NO_DEPTH, f"pixels with depth on {self.topics[stream.name]['depth']}", int(np.isfinite(result.depth).sum()), "at least 100")
+            raise MagicError(
+                Code.NO_DEPTH,
+                f"pixels with depth on {self.topics[stream.name]['depth']}",
+                int(np.isfinite(result.depth).sum()),
+                "at least 100",
+            )
         return result
 
     def publish(self, scene: Scene) -> None:
@@ -338,7 +402,15 @@ class Perception(Node):
                 message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
             states.append(pc.status(f"{self.get_name()}: scene", level, message, code, values))
             if self.known_problem is not None:
-                states.append(pc.status(f"{self.get_name()}: known objects", DiagnosticStatus.ERROR, f"[{int(self.known_problem[0])} {self.known_problem[0].name}] {self.known_problem[1]}", self.known_problem[0], {}))
+                states.append(
+                    pc.status(
+                        f"{self.get_name()}: known objects",
+                        DiagnosticStatus.ERROR,
+                        f"[{int(self.known_problem[0])} {self.known_problem[0].name}] {self.known_problem[1]}",
+                        self.known_problem[0],
+                        {},
+                    )
+                )
             msg = DiagnosticArray(status=states)
             msg.header.stamp = self.get_clock().now().to_msg()
             self.diagnostics_out.publish(msg)
@@ -350,7 +422,9 @@ class Perception(Node):
         stream = self.streams[camera]
         values: dict[str, object] = {}
         for what, topic in self.topics[camera].items():
-            values[topic] = f"{stream.counts.get(what, 0)} messages" + (f", last {now - stream.last[what]:.1f} s ago" if what in stream.last else "")
+            values[topic] = f"{stream.counts.get(what, 0)} messages" + (
+                f", last {now - stream.last[what]:.1f} s ago" if what in stream.last else ""
+            )
         if stream.pairs:
             values["frame"] = stream.pairs[-1].frame_id
             values["stamp"] = f"{stream.pairs[-1].stamp:.3f}"
@@ -358,7 +432,9 @@ class Perception(Node):
         for what in ("camera_info", "depth_camera_info", "color", "depth", "stamps", "pairing", "frames"):
             if what in stream.problems:
                 problem = stream.problems[what]
-                return pc.status(name, DiagnosticStatus.ERROR, f"[{int(problem.code)} {problem.code.name}] {problem.message}", problem.code, values)
+                return pc.status(
+                    name, DiagnosticStatus.ERROR, f"[{int(problem.code)} {problem.code.name}] {problem.message}", problem.code, values
+                )
         # What has never come explains more than what has stopped.
         inputs = ("color", "depth", "camera_info", *(("depth_camera_info",) if "depth_camera_info" in self.topics[camera] else ()))
         for what in sorted(inputs, key=lambda w: w in stream.last):
@@ -372,9 +448,13 @@ class Perception(Node):
                 if other:
                     why = f"published as {other[0]}"
                 else:
-                    why = f"{len(publishers)} publishers" + (f", silent for {silent:.1f} s" if what in stream.last else ", nothing received")
+                    why = f"{len(publishers)} publishers" + (
+                        f", silent for {silent:.1f} s" if what in stream.last else ", nothing received"
+                    )
                 code = Code.NO_CAMERA_INFO if what.endswith("camera_info") else (Code.STALE_DATA if what in stream.last else Code.NO_FRAMES)
-                return pc.status(name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values)
+                return pc.status(
+                    name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values
+                )
         return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
 
 

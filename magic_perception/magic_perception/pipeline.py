@@ -59,12 +59,18 @@ def perceive(
         else:
             seeing.append(frame)
     if not seeing:
-        raise MagicError(Code.NO_DEPTH, "pixels with depth", {f.camera: int(np.isfinite(f.depth).sum()) for f in frames}, "at least 100 in one camera")
+        raise MagicError(
+            Code.NO_DEPTH, "pixels with depth", {f.camera: int(np.isfinite(f.depth).sum()) for f in frames}, "at least 100 in one camera"
+        )
     frames = seeing
     start = time.perf_counter()
     table, own = find_table(frames, parameters)
     world_from_table = _frame_on(table, np.eye(4))
-    if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and abs(table.heights(np.zeros(3))) < parameters.snap_height + 0.0:
+    if (
+        parameters.snap_height > 0
+        and table.tilt() < parameters.snap_tilt
+        and abs(table.heights(np.zeros(3))) < parameters.snap_height + 0.0
+    ):
         world_from_table = np.eye(4)
     looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(frames, own, strict=True)), parameters.workers)
     report.seconds["table"] = time.perf_counter() - start
@@ -120,7 +126,15 @@ def _build(
         sigma = float(np.median(looked.sigma[cut][mask[cut]][::7]))
         hidden = (image != 0) & ~mask
         sights.append(
-            Sight(looked.frame.intrinsics, table_from_world @ looked.frame.world_from_camera, mask, hidden, looked.frame.depth, looked.heights, sigma)
+            Sight(
+                looked.frame.intrinsics,
+                table_from_world @ looked.frame.world_from_camera,
+                mask,
+                hidden,
+                looked.frame.depth,
+                looked.heights,
+                sigma,
+            )
         )
         seen = mask[cut] & np.isfinite(looked.heights[cut])
         clouds.append(looked.points[cut][seen])
@@ -142,7 +156,9 @@ def _cut_by_border(mask: NDArray[np.bool_]) -> bool:
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def _as_object(name: str, built: Reconstruction, points: NDArray[np.float64], colors: NDArray[np.uint8], world_from_table: NDArray[np.float64]) -> SceneObject:
+def _as_object(
+    name: str, built: Reconstruction, points: NDArray[np.float64], colors: NDArray[np.uint8], world_from_table: NDArray[np.float64]
+) -> SceneObject:
     """Object frame at the centre of the smallest upright box, z up, x along its longer horizontal side (towards +x, else +y, of the world)."""
     mesh = built.mesh
     low, high = mesh.bounds
@@ -161,7 +177,9 @@ def _as_object(name: str, built: Reconstruction, points: NDArray[np.float64], co
     local = Mesh(local.vertices, local.faces, _paint(local, points, colors, transforms.inverse(pose)))
     pieces = tuple(piece.transformed(object_from_table) for piece in built.pieces)
     start = find_view(local, pieces)
-    return SceneObject(name, local, pieces, pose, start, points, colors, world_from_box=pose, box_extents=local.extents, confidence=built.confidence)
+    return SceneObject(
+        name, local, pieces, pose, start, points, colors, world_from_box=pose, box_extents=local.extents, confidence=built.confidence
+    )
 
 
 def _paint(mesh: Mesh, points: NDArray[np.float64], colors: NDArray[np.uint8], object_from_world: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import shapely
@@ -21,7 +23,9 @@ def parts_of(shape: shapely.Geometry) -> list[Polygon]:
     return sorted(found, key=lambda p: -p.area)
 
 
-def outline(field: NDArray, origin: NDArray[np.float64], cell: float, level: float = 0.5, min_hole: float = 1.2e-5, simplify: float | None = None) -> list[Polygon]:
+def outline(
+    field: NDArray, origin: NDArray[np.float64], cell: float, level: float = 0.5, min_hole: float = 1.2e-5, simplify: float | None = None
+) -> list[Polygon]:
     """Polygons with holes where a field over a grid is above a level, to a fraction of a cell.
 
     field (rows, columns): value at the cell's centre, row i at y = origin[1] + i cell, column j at x = origin[0] + j cell.
@@ -33,7 +37,7 @@ def outline(field: NDArray, origin: NDArray[np.float64], cell: float, level: flo
     filled = contour_generator(z=padded, fill_type=FillType.OuterOffset).filled(level, np.inf)
     result = []
     for points, offsets in zip(*filled, strict=True):
-        rings = [(points[a:b] - 1) * cell + origin for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+        rings = [(points[a:b] - 1) * cell + origin for a, b in itertools.pairwise(offsets)]
         if len(rings[0]) < 4:
             continue
         holes = [ring for ring in rings[1:] if len(ring) >= 4 and Polygon(ring).area > min_hole]
@@ -44,7 +48,11 @@ def outline(field: NDArray, origin: NDArray[np.float64], cell: float, level: flo
 
 def smooth_field(occupied: NDArray[np.bool_], cells: float = 1.0) -> NDArray[np.float32]:
     """An occupancy grid blurred by a Gaussian of that many cells, so that its 0.5 level is a smooth outline."""
-    return cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), cells, borderType=cv2.BORDER_CONSTANT) if cells > 0 else occupied.astype(np.float32)
+    return (
+        cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), cells, borderType=cv2.BORDER_CONSTANT)
+        if cells > 0
+        else occupied.astype(np.float32)
+    )
 
 
 def alpha_shape(points: NDArray[np.float64], alpha: float) -> list[Polygon]:
@@ -75,7 +83,9 @@ def triangulate(polygon: Polygon) -> tuple[NDArray[np.float64], NDArray[np.int64
 
     rings = [np.asarray(r.coords)[:-1] for r in (polygon.exterior, *polygon.interiors)]
     vertices = np.concatenate(rings)
-    faces = mapbox_earcut.triangulate_float64(vertices, np.cumsum([len(r) for r in rings]).astype(np.uint32)).reshape(-1, 3).astype(np.int64)
+    faces = (
+        mapbox_earcut.triangulate_float64(vertices, np.cumsum([len(r) for r in rings]).astype(np.uint32)).reshape(-1, 3).astype(np.int64)
+    )
     if len(faces) == 0:
         return vertices, faces
     p = vertices[faces]
@@ -97,7 +107,10 @@ def convex_hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
     def chain(items: list[tuple[float, float]]) -> list[tuple[float, float]]:
         kept: list[tuple[float, float]] = []
         for p in items:
-            while len(kept) > 1 and (kept[-1][0] - kept[-2][0]) * (p[1] - kept[-2][1]) - (kept[-1][1] - kept[-2][1]) * (p[0] - kept[-2][0]) <= 1e-15:
+            while (
+                len(kept) > 1
+                and (kept[-1][0] - kept[-2][0]) * (p[1] - kept[-2][1]) - (kept[-1][1] - kept[-2][1]) * (p[0] - kept[-2][0]) <= 1e-15
+            ):
                 kept.pop()
             kept.append(p)
         return kept[:-1]

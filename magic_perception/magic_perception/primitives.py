@@ -78,7 +78,9 @@ def fit_cylinder(points: NDArray[np.float64]) -> Cylinder | None:
     distance = np.where((outward < 0) & (above < 0), np.minimum(-outward, -above), np.hypot(np.maximum(outward, 0), np.maximum(above, 0)))
     # A handle, or a mug's inside, is a small share of the points but no noise.
     inside = points[outward < -0.4 * radius]
-    if float(np.mean(distance > max(0.008, 0.12 * radius))) > 0.03 or (len(inside) > 20 and float(np.median(inside[:, 2])) < height - max(0.008, 0.1 * height)):
+    if float(np.mean(distance > max(0.008, 0.12 * radius))) > 0.03 or (
+        len(inside) > 20 and float(np.median(inside[:, 2])) < height - max(0.008, 0.1 * height)
+    ):
         return None
     return Cylinder(centre, radius, height, float(np.percentile(distance, 90)))
 
@@ -104,7 +106,9 @@ def revolve(profile: NDArray[np.float64], centre: NDArray[np.float64], segments:
         profile = np.vstack([profile, [0.0, profile[-1, 1]]])
     inner = profile[1:-1]
     angle = np.arange(segments) * 2 * np.pi / segments
-    rings = np.stack([inner[:, None, 0] * np.cos(angle), inner[:, None, 0] * np.sin(angle), np.repeat(inner[:, 1:2], segments, axis=1)], axis=-1)
+    rings = np.stack(
+        [inner[:, None, 0] * np.cos(angle), inner[:, None, 0] * np.sin(angle), np.repeat(inner[:, 1:2], segments, axis=1)], axis=-1
+    )
     k = len(inner)
     vertices = np.concatenate([rings.reshape(-1, 3), [[0, 0, profile[0, 1]], [0, 0, profile[-1, 1]]]])
     vertices[:, :2] += centre
@@ -128,7 +132,9 @@ def turn_ring(profile: NDArray[np.float64], centre: NDArray[np.float64], segment
     profile = np.asarray(profile, float)
     angle = np.arange(segments) * 2 * np.pi / segments
     k = len(profile)
-    vertices = np.stack([profile[:, None, 0] * np.cos(angle), profile[:, None, 0] * np.sin(angle), np.repeat(profile[:, 1:2], segments, axis=1)], axis=-1).reshape(-1, 3)
+    vertices = np.stack(
+        [profile[:, None, 0] * np.cos(angle), profile[:, None, 0] * np.sin(angle), np.repeat(profile[:, 1:2], segments, axis=1)], axis=-1
+    ).reshape(-1, 3)
     vertices[:, :2] += centre
     i = np.arange(segments)
     j = (i + 1) % segments

@@ -16,6 +16,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -64,7 +65,9 @@ class Sight:
         """(3,): where the camera is."""
         return self.table_from_camera[:3, 3]
 
-    def sample(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+    def sample(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
         """At points (..., 3): the mask (0..1, interpolated; 1 where blind), where the picture tells nothing (hidden or
         outside of it), the points' depth and the measured depth."""
         camera = transforms.apply(transforms.inverse(self.table_from_camera), points)
@@ -150,7 +153,9 @@ def _height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> _G
     low = points[:, :2].min(axis=0) - margin * cell
     size = np.ceil((points[:, :2].max(axis=0) - low) / cell).astype(int) + margin + 1
     if size.max() > 1200:
-        raise MagicError(Code.RECONSTRUCTION_FAILED, "extent of one object in metres", np.round(size * cell, 2).tolist(), f"below {1200 * cell}")
+        raise MagicError(
+            Code.RECONSTRUCTION_FAILED, "extent of one object in metres", np.round(size * cell, 2).tolist(), f"below {1200 * cell}"
+        )
     index = np.round((points[:, :2] - low) / cell).astype(int)
     flat = index[:, 1] * size[0] + index[:, 0]
     order = np.argsort(points[:, 2], kind="stable")
@@ -255,7 +260,10 @@ def _agreement(mesh: Mesh, sights: list[Sight], step: int = 3) -> float:
         v = np.arange(max(rows[0] - pad, 0), min(rows[-1] + pad, sight.mask.shape[0]), step)
         u = np.arange(max(columns[0] - pad, 0), min(columns[-1] + pad, sight.mask.shape[1]), step)
         k = sight.intrinsics
-        rays = np.stack(np.broadcast_arrays(((u - k.cx) / k.fx)[None], ((v - k.cy) / k.fy)[:, None], 1.0), axis=-1) @ sight.table_from_camera[:3, :3].T
+        rays = (
+            np.stack(np.broadcast_arrays(((u - k.cx) / k.fx)[None], ((v - k.cy) / k.fy)[:, None], 1.0), axis=-1)
+            @ sight.table_from_camera[:3, :3].T
+        )
         drawn = caster.hits(sight.eye, rays)
         mask, told = sight.mask[np.ix_(v, u)], ~sight.hidden[np.ix_(v, u)]
         result.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
@@ -293,7 +301,9 @@ def _primitive(points: NDArray[np.float64], height: float, noise: float) -> Reco
     limit = max(0.0025, 2.5 * noise)
     ball = primitives.fit_sphere(sample)
     tin = primitives.fit_cylinder(sample)
-    if ball is not None and not (0.006 < ball.radius < 0.12 and ball.residual < limit and abs(ball.centre[2] - ball.radius) < max(0.005, 0.2 * ball.radius)):
+    if ball is not None and not (
+        0.006 < ball.radius < 0.12 and ball.residual < limit and abs(ball.centre[2] - ball.radius) < max(0.005, 0.2 * ball.radius)
+    ):
         ball = None
     if tin is not None and not (tin.residual < limit and tin.radius < 0.08 and tin.height > 0.3 * tin.radius):
         tin = None
@@ -330,7 +340,10 @@ def _lying(sights: list[Sight], points: NDArray[np.float64], height: float, nois
     centres = grid.centres()
     thickness = float(max(middle if flat else high, 0.002))
     if flat and thickness < 0.06:
-        columns = [np.concatenate([centres, np.full((*centres.shape[:2], 1), z)], axis=-1) for z in np.linspace(0, thickness, 2 + int(thickness / 0.006))]
+        columns = [
+            np.concatenate([centres, np.full((*centres.shape[:2], 1), z)], axis=-1)
+            for z in np.linspace(0, thickness, 2 + int(thickness / 0.006))
+        ]
         field = _carve(sights, columns)
         near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
         field = cv2.GaussianBlur(field * near, (0, 0), 0.8)
@@ -339,7 +352,15 @@ def _lying(sights: list[Sight], points: NDArray[np.float64], height: float, nois
         # The top of each cell must be seen; two pixels of grace for errors of height and calibration.
         seen = np.ones(occupied.shape, bool)
         for sight in sights:
-            wide = Sight(sight.intrinsics, sight.table_from_camera, cv2.dilate(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, sight.hidden, sight.depth, sight.heights, sight.sigma)
+            wide = Sight(
+                sight.intrinsics,
+                sight.table_from_camera,
+                cv2.dilate(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0,
+                sight.hidden,
+                sight.depth,
+                sight.heights,
+                sight.sigma,
+            )
             seen &= wide.sample(columns[0])[0] > 0.3
         field = polygons.smooth_field(occupied & seen, 1.8)
     parts = [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > 4e-5]
@@ -397,7 +418,7 @@ def _relief(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArra
 
     ring = polygons.ring_points(part, step * 0.8)
     x0, y0, x1, y1 = part.bounds
-    y, x = np.mgrid[y0 : y1 : step, x0 : x1 : step]
+    y, x = np.mgrid[y0:y1:step, x0:x1:step]
     lattice = np.column_stack([x.ravel(), y.ravel()])
     lattice = lattice[shapely.contains_xy(part.buffer(-0.6 * step), lattice)]
     flat = np.concatenate([ring, lattice])
@@ -417,7 +438,9 @@ def _relief(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArra
     return Mesh(vertices, np.concatenate([faces[:, ::-1], faces + n, *polygons._walls(faces, n)]))
 
 
-def _relief_pieces(part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.011) -> list[Mesh]:
+def _relief_pieces(
+    part: Polygon, grid: _Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.011
+) -> list[Mesh]:
     """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide;
     then neighbours are joined again where that fills little."""
     clouds = []
@@ -569,7 +592,9 @@ def _round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: 
     det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
     sound = np.abs(det) > 1e-7
     a, rhs, det, first = a[sound], rhs[sound], det[sound], picked[sound, 0]
-    centres = np.column_stack([rhs[:, 0] * a[:, 1, 1] - rhs[:, 1] * a[:, 0, 1], a[:, 0, 0] * rhs[:, 1] - a[:, 1, 0] * rhs[:, 0]]) / det[:, None]
+    centres = (
+        np.column_stack([rhs[:, 0] * a[:, 1, 1] - rhs[:, 1] * a[:, 0, 1], a[:, 0, 0] * rhs[:, 1] - a[:, 1, 0] * rhs[:, 0]]) / det[:, None]
+    )
     radii = np.hypot(*(first - centres).T)
     sound = (radii > 0.01) & (radii < 0.12)
     centres, radii = centres[sound], radii[sound]
@@ -661,7 +686,9 @@ def _fit_to_silhouettes(body: _Body, sights: list[Sight], reach: float = 0.008) 
                 rho = radii[:, None] + steps
                 sine = np.clip(rho / distance, 0, 0.9)
                 tangent = axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * right)
-                inside, blind, _, _ = sight.sample(np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2))
+                inside, blind, _, _ = sight.sample(
+                    np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2)
+                )
                 edge = crossing(inside)
                 edge[blind.any(axis=1) | ~inner] = np.nan
                 found.append(edge)
@@ -690,7 +717,9 @@ def _fit_to_silhouettes(body: _Body, sights: list[Sight], reach: float = 0.008) 
         bearing = np.arctan2(away[1], away[0]) + np.linspace(-0.5, 0.5, 9)
         rim = axis + profile[-1, 0] * np.column_stack([np.cos(bearing), np.sin(bearing)])
         heights = profile[-1, 1] + steps
-        spots = np.concatenate([np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2)
+        spots = np.concatenate(
+            [np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2
+        )
         inside, blind, _, _ = sight.sample(spots)
         edge = crossing(inside)
         edge[blind.any(axis=1)] = np.nan
@@ -702,7 +731,9 @@ def _fit_to_silhouettes(body: _Body, sights: list[Sight], reach: float = 0.008) 
     return body
 
 
-def _standing_round(sights: list[Sight], points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction | None:
+def _standing_round(
+    sights: list[Sight], points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, parameters: Parameters
+) -> Reconstruction | None:
     body = _round_body(points, eyes, height, noise, parameters.seed)
     if body is None:
         return None
@@ -711,7 +742,9 @@ def _standing_round(sights: list[Sight], points: NDArray[np.float64], eyes: NDAr
     body = _fit_to_silhouettes(body, sights)
     # Of a band some part of the table inside shows to some camera.
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    spots = np.array([[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)])
+    spots = np.array(
+        [[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)]
+    )
     if max(float(np.mean(_carve([sight], [spots]) < 0.3)) for sight in sights) > 0.12:
         body = _Body(body.axis, body.profile, True, True)
     top = body.profile[-1, 1]
@@ -773,9 +806,9 @@ def _turned(body: _Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mes
     levels[0] = floor
     levels = levels[(levels >= floor)]
     angles = np.linspace(0, 2 * np.pi, sectors + 1)
-    for z0, z1 in zip(levels[:-1], levels[1:], strict=True):
+    for z0, z1 in itertools.pairwise(levels):
         outer0, outer1 = np.interp([z0, z1], simple[:, 1], simple[:, 0])
-        for a, b in zip(angles[:-1], angles[1:], strict=True):
+        for a, b in itertools.pairwise(angles):
             corners = [
                 [body.axis[0] + r * np.cos(t), body.axis[1] + r * np.sin(t), z]
                 for t in (a, b)
@@ -810,7 +843,9 @@ def _handle(sights: list[Sight], out: NDArray[np.float64], body: _Body, paramete
     grid_s, grid_z = np.meshgrid(s, z)
     base = np.array([*body.axis, 0.0])
     plane = base + grid_s[..., None] * e_s + grid_z[..., None] * e_z
-    facing = [abs(float((plane.mean(axis=(0, 1)) - sight.eye) @ e_n)) / np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye) for sight in sights]
+    facing = [
+        abs(float((plane.mean(axis=(0, 1)) - sight.eye) @ e_n)) / np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye) for sight in sights
+    ]
     useful = [sight for sight, f in zip(sights, facing, strict=True) if f > 0.25]
     splat = np.zeros(grid_s.shape, np.uint8)
     column = np.round((local @ along - start) / cell).astype(int)
@@ -833,7 +868,9 @@ def _handle(sights: list[Sight], out: NDArray[np.float64], body: _Body, paramete
     touching = attach & (cv2.dilate(solid.astype(np.uint8), np.ones((3, 7), np.uint8)) > 0)
     solid |= touching
     solid = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
-    parts = [p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5]
+    parts = [
+        p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5
+    ]
     # Only what reaches farther out than noise is a handle.
     parts = [p for p in parts if p.bounds[2] - float(body.radius(np.array((p.bounds[1] + p.bounds[3]) / 2))) > 0.008]
     if not parts:
@@ -935,7 +972,7 @@ def _layers(sights: list[Sight], points: NDArray[np.float64], height: float, par
     for z in levels:
         half = height / count / 2 + 0.002
         here = everything[np.abs(everything[:, 2] - np.clip(z, half, height - half)) < half, :2]
-        for away, right, edges in views:
+        for _, right, edges in views:
             row = edges[np.abs(edges[:, 1] - np.clip(z, half, height - half)) < half, 0]
             if len(row) > 1 and len(here):
                 across = (here - middle) @ right

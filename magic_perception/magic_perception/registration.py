@@ -9,7 +9,9 @@ from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
 
 
-def register_depth(depth: NDArray[np.float32], depth_camera: Intrinsics, color_camera: Intrinsics, color_from_depth: NDArray[np.float64]) -> NDArray[np.float32]:
+def register_depth(
+    depth: NDArray[np.float32], depth_camera: Intrinsics, color_camera: Intrinsics, color_from_depth: NDArray[np.float64]
+) -> NDArray[np.float32]:
     """Depth (H, W) metres of the depth camera as the colour camera sees it, (Hc, Wc) float32 metres, NaN where nothing falls.
 
     color_from_depth (4, 4): the depth optical frame in the colour optical frame.  Every depth pixel is carried over as
@@ -17,12 +19,16 @@ def register_depth(depth: NDArray[np.float32], depth_camera: Intrinsics, color_c
     where two fall on one pixel the nearer wins.
     """
     if depth.shape != (depth_camera.height, depth_camera.width):
-        raise MagicError(Code.BAD_IMAGE, "depth image", depth.shape, f"{(depth_camera.height, depth_camera.width)}, the size in its camera_info")
+        raise MagicError(
+            Code.BAD_IMAGE, "depth image", depth.shape, f"{(depth_camera.height, depth_camera.width)}, the size in its camera_info"
+        )
     v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
     z = depth[v, u].astype(float)
     corners = []
     for shift in (-0.5, 0.5):
-        rays = np.column_stack([(u + shift - depth_camera.cx) / depth_camera.fx, (v + shift - depth_camera.cy) / depth_camera.fy, np.ones(len(z))])
+        rays = np.column_stack(
+            [(u + shift - depth_camera.cx) / depth_camera.fx, (v + shift - depth_camera.cy) / depth_camera.fy, np.ones(len(z))]
+        )
         moved = (rays * z[:, None]) @ color_from_depth[:3, :3].T + color_from_depth[:3, 3]
         corners.append((color_camera.project(moved), moved[:, 2]))
     (first, z0), (second, z1) = corners

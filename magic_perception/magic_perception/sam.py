@@ -48,7 +48,9 @@ class SamSegmenter:
         config = self._model.config.vision_config
         size = getattr(config, "image_size", None)
         if size is None:
-            size = getattr(getattr(config, "backbone_config", None), "image_size", None) or self._model.config.prompt_encoder_config.image_size
+            size = (
+                getattr(getattr(config, "backbone_config", None), "image_size", None) or self._model.config.prompt_encoder_config.image_size
+            )
         self._size = int(size[0] if isinstance(size, (list, tuple)) else size)
 
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
@@ -105,7 +107,9 @@ class SamSegmenter:
             )
             logits = answer.pred_masks[0, :, 0].float()
             logits = torch.nn.functional.interpolate(logits[None], (size, size), mode="bilinear", align_corners=False)
-            logits = torch.nn.functional.interpolate(logits[..., : scaled[1], : scaled[0]], (height, width), mode="bilinear", align_corners=False)[0]
+            logits = torch.nn.functional.interpolate(
+                logits[..., : scaled[1], : scaled[0]], (height, width), mode="bilinear", align_corners=False
+            )[0]
             probability = torch.sigmoid(logits).cpu().numpy()
             scores = answer.iou_scores[0, :, 0].float().cpu().numpy()
         return [(probability[i], float(scores[i])) for i in range(len(prompts))]

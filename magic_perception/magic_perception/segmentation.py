@@ -143,12 +143,14 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
     # Bias of depth over the table, which varies slowly over the picture: a quarter of its resolution will do.
     near = (valid & (np.abs(zero) < 0.008)).astype(np.float32)
     small = (max(1, k.width // 4), max(1, k.height // 4))
-    count, total = (cv2.blur(cv2.resize(x, small, interpolation=cv2.INTER_AREA), (21, 21), borderType=cv2.BORDER_CONSTANT) for x in (near, near * zero))
+    count, total = (
+        cv2.blur(cv2.resize(x, small, interpolation=cv2.INTER_AREA), (21, 21), borderType=cv2.BORDER_CONSTANT) for x in (near, near * zero)
+    )
     bias = np.where(count > 0.15, total / np.maximum(count, 1e-6), 0).astype(np.float32)
     raw = raw - cv2.resize(bias, (k.width, k.height))
     zero = np.where(valid, raw, np.float32(0))
     # Smooth over nearby pixels of like height only: an edge of 10 mm must not smear.
-    smooth, share = masked_mean(zero, valid.astype(np.float32), 3)
+    smooth, _share = masked_mean(zero, valid.astype(np.float32), 3)
     heights = np.where(valid & (np.abs(smooth - zero) < 0.01), smooth, raw).astype(np.float32)
     flat = valid & (np.abs(zero) < 0.01) & inside
     with np.errstate(invalid="ignore"):
@@ -374,7 +376,9 @@ class DepthSegmenter:
         return _sizeable(labels, looks, parameters)
 
     @staticmethod
-    def _split(looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _split(
+        looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
         heights = np.concatenate([looked.heights[s] for looked, s in zip(looks, solid, strict=True)])
         following = int(instance.max(initial=-1)) + 1

@@ -95,7 +95,9 @@ class Stream:
         if newest is not None and stamp < newest - 1.0:
             # Time went back (a bag began again): what was collected is of another time.
             self.reset()
-            self.wrong("stamps", Code.STALE_DATA, f"stamps of {what} went back from {newest:.3f} to {stamp:.3f}; collected images dropped", now)
+            self.wrong(
+                "stamps", Code.STALE_DATA, f"stamps of {what} went back from {newest:.3f} to {stamp:.3f}; collected images dropped", now
+            )
         self._newest[what] = stamp
         self.clear(what)
         queue.append((stamp, image, frame_id))
@@ -110,7 +112,12 @@ class Stream:
             gap, i, j = best
             if gap > self.tolerance:
                 if min(self.counts["color"], self.counts["depth"]) > 3 and now - self.last.get("pair", -1e9) > 1.0:
-                    self.wrong("pairing", Code.STALE_DATA, f"stamps of colour and depth differ by at least {gap:.3f} s (allowed: {self.tolerance} s)", now)
+                    self.wrong(
+                        "pairing",
+                        Code.STALE_DATA,
+                        f"stamps of colour and depth differ by at least {gap:.3f} s (allowed: {self.tolerance} s)",
+                        now,
+                    )
                 return
             stamp, color, frame_id = self._colors[i]
             _, depth, depth_frame_id = self._depths[j]
@@ -124,5 +131,7 @@ class Stream:
     def frames(self, world_from_camera: NDArray[np.float64]) -> list[RgbdFrame]:
         """The collected pairs as frames; raises ``NO_CAMERA_INFO``, or ``BAD_IMAGE`` where sizes disagree."""
         if self.intrinsics is None:
-            raise MagicError(Code.NO_CAMERA_INFO, f"camera_info of {self.name}", "none received", "one message before the first image is used")
+            raise MagicError(
+                Code.NO_CAMERA_INFO, f"camera_info of {self.name}", "none received", "one message before the first image is used"
+            )
         return [RgbdFrame(p.color, p.depth, self.intrinsics, world_from_camera, self.name, p.stamp) for p in self.pairs]

@@ -56,7 +56,12 @@ class TransformBuffer:
         for frame, root_from_target in up_target.items():
             if frame in up_source:
                 return transforms.inverse(root_from_target) @ up_source[frame]
-        raise MagicError(Code.NO_TRANSFORM, f"transform from {source!r} to {target!r}", "not connected", f"frames known: {', '.join(self.frames()) or 'none'}")
+        raise MagicError(
+            Code.NO_TRANSFORM,
+            f"transform from {source!r} to {target!r}",
+            "not connected",
+            f"frames known: {', '.join(self.frames()) or 'none'}",
+        )
 
     def _up(self, frame: str, stamp: float | None, reach: float) -> dict[str, NDArray[np.float64]]:
         """ancestor_from_frame for the frame and all its ancestors."""
@@ -78,7 +83,10 @@ class TransformBuffer:
             return track[-1][2]
         if stamp < track[0][0] - reach or stamp > track[-1][0] + reach:
             raise MagicError(
-                Code.NO_TRANSFORM, f"stamp of the transform of {child!r}", round(stamp, 3), f"{track[0][0]:.3f} to {track[-1][0]:.3f}, {reach} s more on both sides"
+                Code.NO_TRANSFORM,
+                f"stamp of the transform of {child!r}",
+                round(stamp, 3),
+                f"{track[0][0]:.3f} to {track[-1][0]:.3f}, {reach} s more on both sides",
             )
         i = bisect([item[0] for item in track], stamp)
         if i == 0 or i == len(track) or track[i][0] - track[i - 1][0] < 1e-9:

@@ -160,7 +160,11 @@ def test_cylinder_from_one_side_and_its_top():
     side = np.column_stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), rng.uniform(0, 0.04, 2000)])
     disc = rng.uniform(-0.02, 0.02, (3000, 2))
     disc = disc[np.linalg.norm(disc, axis=1) < 0.02]
-    points = np.concatenate([side, np.column_stack([disc, np.full(len(disc), 0.04)])]) + [0.3, 0.2, 0] + rng.normal(0, 0.0005, (2000 + len(disc), 3))
+    points = (
+        np.concatenate([side, np.column_stack([disc, np.full(len(disc), 0.04)])])
+        + [0.3, 0.2, 0]
+        + rng.normal(0, 0.0005, (2000 + len(disc), 3))
+    )
     tin = primitives.fit_cylinder(points)
     assert tin.radius == pytest.approx(0.02, abs=5e-4) and tin.height == pytest.approx(0.04, abs=5e-4)
     np.testing.assert_allclose(tin.centre, [0.3, 0.2], atol=5e-4)
@@ -172,7 +176,11 @@ def test_cylinder_from_one_side_and_its_top():
 @pytest.fixture(scope="module")
 def hooking():
     truth = [shapes.make("l_hook", 1), shapes.make("cylinder", 1), shapes.make("scissors", 1)]
-    meshes = [scenes.placed(truth[0].mesh, 0.5, -0.1, 0.4), scenes.placed(truth[1].mesh, 0.62, 0.12), scenes.placed(truth[2].mesh, 0.6, -0.27, 0.2)]
+    meshes = [
+        scenes.placed(truth[0].mesh, 0.5, -0.1, 0.4),
+        scenes.placed(truth[1].mesh, 0.62, 0.12),
+        scenes.placed(truth[2].mesh, 0.6, -0.27, 0.2),
+    ]
     captured = [scenes.capture(meshes, name, seed) for seed, name in enumerate(("left", "right"))]
     report = Report()
     scene = perceive([c[0] for c in captured], report=report)
@@ -222,7 +230,9 @@ def test_bowl_of_a_ladle_stays_hollow():
     from magic_core.views import find_view
 
     ladle = shapes.make("ladle", 2)
-    scene = perceive([scenes.capture([scenes.placed(ladle.mesh, 0.5, 0.0, 1.4)], name, seed)[0] for seed, name in enumerate(("left", "right"))])
+    scene = perceive(
+        [scenes.capture([scenes.placed(ladle.mesh, 0.5, 0.0, 1.4)], name, seed)[0] for seed, name in enumerate(("left", "right"))]
+    )
     item = scene.objects[0]
     solid = tight(item.mesh)
     assert solid.volume < 0.5 * solid.convex_hull.volume
@@ -315,7 +325,16 @@ def test_tiles_of_a_slab_become_one_piece_and_an_l_two():
     shell = []
     for a0, a1 in itertools.pairwise(angles[0]):
         for b0, b1 in itertools.pairwise(angles[1]):
-            shell.append(np.array([r * np.array([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), -np.cos(b)]) for a in (a0, a1) for b in (b0, b1) for r in (0.047, 0.05)]))
+            shell.append(
+                np.array(
+                    [
+                        r * np.array([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), -np.cos(b)])
+                        for a in (a0, a1)
+                        for b in (b0, b1)
+                        for r in (0.047, 0.05)
+                    ]
+                )
+            )
     pieces = _joined(shell)
     assert len(pieces) <= 40
     middle = np.array([0, 0, -0.02])
@@ -359,7 +378,10 @@ def box(size, x, y, z=0.0, yaw=0.0):
     return made
 
 
-@pytest.mark.parametrize("family, seed", [("mug", 0), ("mug", 2), ("mug", 5), ("mug", 7), ("ladle", 0), ("ladle", 1), ("measuring_cup", 1), ("hammer", 0), ("mug_tree", 0)])
+@pytest.mark.parametrize(
+    "family, seed",
+    [("mug", 0), ("mug", 2), ("mug", 5), ("mug", 7), ("ladle", 0), ("ladle", 1), ("measuring_cup", 1), ("hammer", 0), ("mug_tree", 0)],
+)
 def test_one_thing_is_not_parted(family, seed):
     mesh = scenes.shape(family, seed, 0.5, 0.0, 0.7 * seed)
     for names in (("left", "right"), ("left",)):
@@ -377,7 +399,11 @@ def test_what_lies_on_another_thing_is_parted():
 
 
 def test_a_mallet_that_leans_on_a_box_is_one_thing():
-    head, stem, crate = box((0.07, 0.13, 0.06), 0.48, -0.03), box((0.028, 0.028, 0.22), 0.48, -0.03, 0.06), box((0.06, 0.2, 0.12), 0.55, 0.02)
+    head, stem, crate = (
+        box((0.07, 0.13, 0.06), 0.48, -0.03),
+        box((0.028, 0.028, 0.22), 0.48, -0.03, 0.06),
+        box((0.06, 0.2, 0.12), 0.55, 0.02),
+    )
     mallet = trimesh.boolean.union([head, stem], engine="manifold")
     mesh = Mesh(mallet.vertices, mallet.faces)
     frame, ids = scenes.capture([mesh, *solids(crate)], world_from_camera=scenes.pose([-0.05, 0.0, 0.45], [0.5, 0.0, 0.05]))
@@ -445,7 +471,9 @@ def test_registration_of_a_real_d435():
                 cameras[which] = Intrinsics(m.width, m.height, m.K[0], m.K[4], m.K[2], m.K[5])
             elif topic.endswith("image/data"):
                 m = reader.deserialize(raw, connection.msgtype)
-                images[which] = m.data.view(np.uint16).reshape(m.height, m.width) if which == "depth" else m.data.reshape(m.height, m.width, 3)
+                images[which] = (
+                    m.data.view(np.uint16).reshape(m.height, m.width) if which == "depth" else m.data.reshape(m.height, m.width, 3)
+                )
             elif topic.endswith("Color_0/tf/0"):
                 m = reader.deserialize(raw, connection.msgtype)
                 q, v = m.rotation, m.translation
@@ -466,7 +494,10 @@ def test_registration_of_a_real_d435():
         assert jump.sum() > 50
         return edges[jump].mean() / edges.mean()
 
-    right, none, wrong = (register_depth(depth, cameras["depth"], cameras["color"], t) for t in (color_from_depth, np.eye(4), transforms.inverse(color_from_depth)))
+    right, none, wrong = (
+        register_depth(depth, cameras["depth"], cameras["color"], t)
+        for t in (color_from_depth, np.eye(4), transforms.inverse(color_from_depth))
+    )
     # Where depth jumps the colour changes too: only with the recorded extrinsics.
     assert contrast(right) > 2 * max(contrast(none), contrast(wrong))
     assert np.isfinite(right).mean() > 0.85
@@ -530,7 +561,16 @@ def test_perceive_images(tmp_path, hooking):
     cv2.imwrite(str(tmp_path / "c.png"), frame.color[..., ::-1])
     cv2.imwrite(str(tmp_path / "d.png"), np.nan_to_num(frame.depth * 1000).round().astype(np.uint16))
     k = frame.intrinsics
-    words = ["--color", str(tmp_path / "c.png"), "--depth", str(tmp_path / "d.png"), "--intrinsics", f"{k.fx},{k.fy},{k.cx},{k.cy}", "--out", str(tmp_path / "out")]
+    words = [
+        "--color",
+        str(tmp_path / "c.png"),
+        "--depth",
+        str(tmp_path / "d.png"),
+        "--intrinsics",
+        f"{k.fx},{k.fy},{k.cx},{k.cy}",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     with pytest.raises(SystemExit) as status:
         main(words)
     assert status.value.code == 0
@@ -554,10 +594,23 @@ def tiny_sam(folder):
     from transformers import SamConfig, SamMaskDecoderConfig, SamModel, SamPromptEncoderConfig, SamVisionConfig
 
     torch.manual_seed(0)
-    vision = SamVisionConfig(hidden_size=16, output_channels=16, num_hidden_layers=1, num_attention_heads=2, image_size=64, patch_size=16, mlp_dim=16, window_size=2, global_attn_indexes=[0], num_pos_feats=8)
+    vision = SamVisionConfig(
+        hidden_size=16,
+        output_channels=16,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        image_size=64,
+        patch_size=16,
+        mlp_dim=16,
+        window_size=2,
+        global_attn_indexes=[0],
+        num_pos_feats=8,
+    )
     prompt = SamPromptEncoderConfig(hidden_size=16, image_size=64, patch_size=16, mask_input_channels=4)
     decoder = SamMaskDecoderConfig(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, mlp_dim=16, iou_head_hidden_dim=16)
-    SamModel(SamConfig(vision_config=vision.to_dict(), prompt_encoder_config=prompt.to_dict(), mask_decoder_config=decoder.to_dict())).save_pretrained(folder)
+    SamModel(
+        SamConfig(vision_config=vision.to_dict(), prompt_encoder_config=prompt.to_dict(), mask_decoder_config=decoder.to_dict())
+    ).save_pretrained(folder)
 
 
 def tiny_sam2(folder):
@@ -569,10 +622,17 @@ def tiny_sam2(folder):
         hidden_size=12, image_size=[128, 128], window_positional_embedding_background_size=[2, 2], embed_dim_per_stage=[12, 24, 48, 96],
         blocks_per_stage=[1, 1, 2, 1], num_attention_heads_per_stage=[1, 1, 2, 2], window_size_per_stage=[4, 2, 2, 2], global_attention_blocks=[3],
     )  # fmt: skip
-    vision = Sam2VisionConfig(backbone_config=backbone.to_dict(), backbone_channel_list=[96, 48, 24, 12], backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]], fpn_hidden_size=16)
+    vision = Sam2VisionConfig(
+        backbone_config=backbone.to_dict(),
+        backbone_channel_list=[96, 48, 24, 12],
+        backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
+        fpn_hidden_size=16,
+    )
     prompt = Sam2PromptEncoderConfig(hidden_size=16, image_size=128, patch_size=16, mask_input_channels=4)
     decoder = Sam2MaskDecoderConfig(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, mlp_dim=16, iou_head_hidden_dim=16)
-    Sam2Model(Sam2Config(vision_config=vision.to_dict(), prompt_encoder_config=prompt.to_dict(), mask_decoder_config=decoder.to_dict())).save_pretrained(folder)
+    Sam2Model(
+        Sam2Config(vision_config=vision.to_dict(), prompt_encoder_config=prompt.to_dict(), mask_decoder_config=decoder.to_dict())
+    ).save_pretrained(folder)
 
 
 @pytest.mark.parametrize("name, make", [("sam", tiny_sam), ("sam2", tiny_sam2)])

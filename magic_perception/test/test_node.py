@@ -14,16 +14,15 @@ import scenes
 rclpy = pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
-from magic_interfaces.msg import SceneObjectArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magic_core import conversions as cv
-from magic_core import transforms
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene
+from magic_interfaces.msg import SceneObjectArray
 from magic_perception.parameters import Parameters
 from magic_perception.perception import Perception
 from magic_perception.pipeline import perceive
@@ -59,7 +58,10 @@ class Bench:
 
     def __enter__(self):
         used = self.node.cameras
-        self.until(lambda: all(p.get_subscription_count() for name in used for p in self.out[name]) and self.tf.get_subscription_count(), "discovery")
+        self.until(
+            lambda: all(p.get_subscription_count() for name in used for p in self.out[name]) and self.tf.get_subscription_count(),
+            "discovery",
+        )
         return self
 
     def __exit__(self, *_):
@@ -134,7 +136,10 @@ def frames():
 def test_the_node_gives_what_the_core_gives(frames):
     low, high = (0.15, -0.6, -0.05), (0.95, 0.6, 0.5)
     # Poses go through quaternions on their way: so do the core's.
-    rounded = [type(f)(f.color, f.depth, f.intrinsics, cv.transform_from_msg(cv.transform_to_msg(f.world_from_camera)), f.camera, f.stamp) for f in frames]
+    rounded = [
+        type(f)(f.color, f.depth, f.intrinsics, cv.transform_from_msg(cv.transform_to_msg(f.world_from_camera)), f.camera, f.stamp)
+        for f in frames
+    ]
     expected = perceive(rounded, parameters=Parameters(region_low=low, region_high=high))
     with Bench() as bench:
         bench.transforms()
@@ -149,7 +154,13 @@ def test_the_node_gives_what_the_core_gives(frames):
         assert bench.markers[-1].markers[0].action == Marker.DELETEALL
         # The same in metres.
         count = len(bench.objects)
-        bench.until(lambda: len(bench.objects) > count, "objects from 32FC1", tick=lambda: [bench.send(type(f)(f.color, f.depth, f.intrinsics, f.world_from_camera, f.camera, f.stamp + 1), "32FC1") for f in frames])
+        bench.until(
+            lambda: len(bench.objects) > count,
+            "objects from 32FC1",
+            tick=lambda: [
+                bench.send(type(f)(f.color, f.depth, f.intrinsics, f.world_from_camera, f.camera, f.stamp + 1), "32FC1") for f in frames
+            ],
+        )
         again = cv.scene_from_msg(bench.objects[-1])
         np.testing.assert_allclose(again.objects[0].mesh.vertices, scene.objects[0].mesh.vertices, atol=1e-4)
 
@@ -172,7 +183,11 @@ def test_known_objects_are_merged(frames):
     with Bench() as bench:
         bench.transforms()
         bench.known.publish(cv.scene_to_msg(Scene((fixture,), scene.table)))
-        bench.until(lambda: any("post" in [o.id for o in m.objects] for m in bench.objects), "the known object", tick=lambda: [bench.send(f) for f in frames])
+        bench.until(
+            lambda: any("post" in [o.id for o in m.objects] for m in bench.objects),
+            "the known object",
+            tick=lambda: [bench.send(f) for f in frames],
+        )
         assert sorted(o.id for o in bench.objects[-1].objects)[-1] == "post" and len(bench.objects[-1].objects) == 2
 
 
@@ -181,7 +196,14 @@ def test_bad_input_is_answered_by_diagnostics(frames):
     empty, _ = scenes.capture([], "left")
 
     def later(base, seconds, **changes):
-        return type(base)(changes.get("color", base.color), changes.get("depth", base.depth), base.intrinsics, base.world_from_camera, base.camera, seconds)
+        return type(base)(
+            changes.get("color", base.color),
+            changes.get("depth", base.depth),
+            base.intrinsics,
+            base.world_from_camera,
+            base.camera,
+            seconds,
+        )
 
     clock = iter(range(10, 100000))
     zero = cv.intrinsics_to_msg(frame.intrinsics)
@@ -244,7 +266,9 @@ def test_stamps_that_jump_back_are_named_and_survived(frames):
             told.update(bench.codes())
             return "STALE_DATA" in told and len(bench.objects) > count and bench.objects[-1].header.stamp.sec < 900
 
-        bench.until(survived, "objects and STALE_DATA after stamps went back", 30.0, tick=lambda: bench.send(later(frame, float(next(past)))))
+        bench.until(
+            survived, "objects and STALE_DATA after stamps went back", 30.0, tick=lambda: bench.send(later(frame, float(next(past))))
+        )
 
 
 def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
@@ -265,7 +289,12 @@ def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
             told.update(m for m in bench.messages() if "camera right" in m and "STALE_DATA" in m)
             return told and len(bench.objects) > count + 1
 
-        bench.until(alone, "objects of one camera and a diagnostic of the other", 30.0, tick=lambda: bench.send(later(frames[0], float(next(clock)))))
+        bench.until(
+            alone,
+            "objects of one camera and a diagnostic of the other",
+            30.0,
+            tick=lambda: bench.send(later(frames[0], float(next(clock)))),
+        )
         assert bench.objects[-1].header.stamp.sec > last and len(bench.objects[-1].objects) == 2
 
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy

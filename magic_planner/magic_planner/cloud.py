@@ -76,9 +76,7 @@ def outside(points: Array, pieces: Sequence[Mesh], world_from_object: Array, mar
     return free
 
 
-def unexplained(
-    seen: Sequence[SceneObject], tool: SceneObject, plane: Array, settings: CloudSettings
-) -> dict[str, Array]:
+def unexplained(seen: Sequence[SceneObject], tool: SceneObject, plane: Array, settings: CloudSettings) -> dict[str, Array]:
     """Voxel centres (M, 3), world metres, of the measured points of each seen object that no shape accounts for.
 
     Left out are points within the margin of the pieces of any of the objects (known fixtures among them), of the tool where it

@@ -12,6 +12,7 @@ the least amount that keeps the tool above the table.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -244,7 +245,7 @@ def waypoint_times(strategy: Strategy) -> tuple[tuple[str, float], ...]:
         return (("start", 0.0), *((f"end of {p.name}", p.end) for p in demonstrated_motion(strategy)[2]))
     waypoints = list(strategy.waypoints)
     marks, now = [(waypoints[0].name, 0.0)], 0.0
-    for before, waypoint in zip(waypoints[:-1], waypoints[1:], strict=True):
+    for before, waypoint in itertools.pairwise(waypoints):
         if strategy.releases and before.phase == "release":
             break
         now += float(straight_line(float(np.linalg.norm(waypoint.offset - before.offset)), waypoint.speed)[0][-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -57,7 +58,7 @@ def parameterise(path: Array, velocity: Array, acceleration: Array, step: float)
     if len(path) < 2:
         return np.zeros(1), path[:1], np.zeros_like(path[:1]), np.zeros_like(path[:1])
     rows = [path[:1]]
-    for a, b in zip(path[:-1], path[1:], strict=True):
+    for a, b in itertools.pairwise(path):
         parts = max(1 if len(path) > 6 else 4, int(np.ceil(np.abs(b - a).max() / 0.15)))
         rows.append(a + (b - a) * np.linspace(0, 1, parts + 1)[1:, None])
     points = np.concatenate(rows)
@@ -99,7 +100,7 @@ class Track:
         """
         began = self.now
         known, real = [float(clock[0])], [0.0]
-        for a, b in zip(rests[:-1], rests[1:], strict=True):
+        for a, b in itertools.pairwise(rests):
             rows, times = q[a : b + 1], clock[a : b + 1]
             if np.abs(rows - rows[0]).max() < 1e-7:
                 self.hold(float(times[-1] - times[0]), step)

@@ -68,29 +68,29 @@ def pulling(waypoints=None, **changes) -> Strategy:
     """A ``plan`` strategy: from above to behind the target, onto it, and 0.25 m towards the robot."""
     tool, tool_contact = hook()
     target, target_contact = standing_cylinder()
-    values = dict(
-        name="pulling",
-        description="",
-        view="top",
-        mode="plan",
-        tool_view=DOWN,
-        tool_contact=tool_contact,
-        target_view=DOWN,
-        target_contact=target_contact,
-        target_normal=np.array([1.0, 0, 0]),
-        target_view_direction=np.array([0, 0, -1.0]),
-        times=np.array([0.0, 1.0]),
-        target_from_tool=np.stack([np.eye(4)] * 2),
-        tool_mesh=tool.mesh,
-        target_mesh=target.mesh,
-        waypoints=waypoints
+    values = {
+        "name": "pulling",
+        "description": "",
+        "view": "top",
+        "mode": "plan",
+        "tool_view": DOWN,
+        "tool_contact": tool_contact,
+        "target_view": DOWN,
+        "target_contact": target_contact,
+        "target_normal": np.array([1.0, 0, 0]),
+        "target_view_direction": np.array([0, 0, -1.0]),
+        "times": np.array([0.0, 1.0]),
+        "target_from_tool": np.stack([np.eye(4)] * 2),
+        "tool_mesh": tool.mesh,
+        "target_mesh": target.mesh,
+        "waypoints": waypoints
         or (
             Waypoint("above", np.array([0.03, 0, -0.10]), "approach", 0.1),
             Waypoint("behind", np.array([0.03, 0, 0]), "approach", 0.1),
             Waypoint("contact", np.zeros(3), "contact", 0.05),
             Waypoint("goal", np.array([-0.25, 0, 0]), "goal", 0.1),
         ),
-        goal=Goal("hook"),
-        physics=Physics(),
-    )
+        "goal": Goal("hook"),
+        "physics": Physics(),
+    }
     return Strategy(**{**values, **changes})

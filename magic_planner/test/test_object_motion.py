@@ -66,8 +66,8 @@ def test_a_line_keeps_speed_and_acceleration():
 
 def demonstration():
     """A demonstrated sweep with a turn, given as target_from_tool, and the strategy that holds it."""
-    tool, tool_contact = scenes.hook()
-    target, target_contact = scenes.standing_cylinder()
+    _tool, tool_contact = scenes.hook()
+    _target, target_contact = scenes.standing_cylinder()
     times = np.linspace(0, 2, 9)
     poses = []
     for share in times / 2:
@@ -121,7 +121,7 @@ def test_turned_over_is_a_proper_rotation_and_keeps_the_normals_opposed():
 
 @pytest.mark.parametrize("table", [[0, 0, 1, 0], [0.05, 0.02, 1.0, -0.01], [0, 0, -2.0, 0.06]])
 def test_the_tool_is_raised_by_the_least_amount_that_clears_the_table(table):
-    strategy, tool, _, _ = setup()
+    strategy, _tool, _, _ = setup()
     _, tool_contact = scenes.hook(thickness=0.08)
     tall, _ = scenes.hook(thickness=0.08)
     target, target_contact = scenes.standing_cylinder(0.02)

@@ -337,7 +337,9 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
             tool, name = by_id[candidate.tool_id]
             reflections = strategy.reflections if candidate.flipped else ("keep",)
             for reflection in reflections[: 1 if only_best else None]:
-                entry, last, solved = _try(options, _strategy(options, name), candidate, reflection, tool, target, obstacles, seconds, answer)
+                entry, last, solved = _try(
+                    options, _strategy(options, name), candidate, reflection, tool, target, obstacles, seconds, answer
+                )
                 tried.append({"tool": _short(name), "score": float(candidate.score), "reflection": reflection, **entry})
                 if solved:
                     answer["success"] = True

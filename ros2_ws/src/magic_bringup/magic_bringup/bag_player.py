@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import rclpy
-from magic_core.errors import Code, MagicError
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from magic_bringup import bag_qos
 from magic_bringup.bag_file import open_bag, topics_of
+from magic_core.errors import Code, MagicError
 
 #: After the last message: how long reliable subscribers have to acknowledge, s.
 ACKNOWLEDGE_TIMEOUT = 2.0

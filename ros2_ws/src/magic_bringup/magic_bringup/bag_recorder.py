@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from magic_core.errors import Code, MagicError
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -23,6 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from magic_bringup import bag_qos
 from magic_bringup.bag_file import BagWriter
 from magic_bringup.bag_player import interrupt, message_class
+from magic_core.errors import Code, MagicError
 
 #: How often the graph is asked for new topics, s (``ros2 bag record`` does the same).
 POLL = 0.1

@@ -20,13 +20,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magic_core import strategy as strategies
-from magic_core.errors import Code, MagicError
-from magic_core.motion import VARIANTS
-
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, peak_memory
 from magic_bringup.pipeline import split_metrics
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_core.motion import VARIANTS
 
 #: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
 START_TIMEOUT = 120.0
@@ -130,14 +129,15 @@ class Watcher:
     def __init__(self, topics: Sequence[str], say: Any) -> None:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
-        from magic_core import qos
-        from magic_interfaces.action import RunStrategy
-        from magic_interfaces.msg import SceneObjectArray
         from rclpy.action import ActionClient
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
         from rclpy.signals import SignalHandlerOptions
         from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
+
+        from magic_core import qos
+        from magic_interfaces.action import RunStrategy
+        from magic_interfaces.msg import SceneObjectArray
 
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._rclpy = rclpy
@@ -188,7 +188,12 @@ class Watcher:
         for status in message.status:
             if status.name == "perception: scene":
                 code = next((v.value for v in status.values if v.key == "code"), "")
-                wrong = status.level != b"\x00" and code not in (Code.OK.name, Code.NO_FRAMES.name, str(int(Code.OK)), str(int(Code.NO_FRAMES)))
+                wrong = status.level != b"\x00" and code not in (
+                    Code.OK.name,
+                    Code.NO_FRAMES.name,
+                    str(int(Code.OK)),
+                    str(int(Code.NO_FRAMES)),
+                )
                 with self.changed:
                     self.complained_at = (self.complained_at or time.monotonic()) if wrong else None
 

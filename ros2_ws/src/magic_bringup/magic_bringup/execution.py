@@ -25,11 +25,15 @@ def check_start(
     the future) and BAD_MOTION (a joint is missing, not finite, or farther than ``tolerance`` off).
     """
     if not names or len(names) != len(first):
-        raise MagicError(Code.BAD_MOTION, "trajectory", f"{len(names)} joints, {len(first)} positions at its start", "one position for each joint")
+        raise MagicError(
+            Code.BAD_MOTION, "trajectory", f"{len(names)} joints, {len(first)} positions at its start", "one position for each joint"
+        )
     if math.isinf(age):
         raise MagicError(Code.NO_FRAMES, "joint_states", "none received", f"one not older than {max_age:g} s")
     if not -max_age <= age <= max_age:
-        raise MagicError(Code.STALE_DATA, "age of joint_states in s", round(age, 3), f"at most {max_age:g}, by its stamp and by its arrival")
+        raise MagicError(
+            Code.STALE_DATA, "age of joint_states in s", round(age, 3), f"at most {max_age:g}, by its stamp and by its arrival"
+        )
     state = dict(zip(state_names, state_positions))
     missing = [name for name in names if name not in state]
     if missing:

@@ -11,6 +11,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+
 from magic_core import conversions, qos, transforms
 from magic_core.contact import Contact, ContactCandidate, contact_frame
 from magic_core.errors import Code
@@ -21,9 +25,6 @@ from magic_core.strategy import Goal, Physics, Strategy, Waypoint
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
-from rclpy.action import ActionServer, CancelResponse
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 
 
 def box(size: float = 0.05) -> Mesh:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -101,10 +102,8 @@ class Process:
     def signal(self, number: int) -> None:
         """Send a signal to the process, if it still runs."""
         if self.popen.poll() is None:
-            try:
+            with contextlib.suppress(ProcessLookupError):
                 os.kill(self.popen.pid, number)
-            except ProcessLookupError:
-                pass
 
     def wait(self, timeout: float) -> int | None:
         """Its exit status; ``None`` where it still runs after ``timeout`` seconds."""
@@ -139,7 +138,11 @@ class Graph:
         for name, (package, program) in NODES.items():
             if name in leave_out:
                 continue
-            arguments = [x for k, v in (parameters or {}).get(name, {}).items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
+            arguments = [
+                x
+                for k, v in (parameters or {}).get(name, {}).items()
+                for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")
+            ]
             self.start(name, package, program, *(["--ros-args", *arguments] if arguments else []))
 
     def sample(self) -> None:

@@ -18,13 +18,15 @@ scooping  a spoon, handle upright, pushes a ball along the table across the robo
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import strategy as strategies, transforms
+from magic_core import strategy as strategies
+from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact, contact_frame
 from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView
@@ -49,7 +51,7 @@ ARC_OFFSET = 0.015
 def _line(points: list[NDArray[np.float64]], speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rest-to-rest motion with a smooth start and stop along a polyline: times (T,), points (T, 3)."""
     times, places, now = [0.0], [points[0]], 0.0
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in itertools.pairwise(points):
         length = float(np.linalg.norm(b - a))
         duration = max(1.5 * length / speed, SAMPLE)  # a cubic's highest speed is 1.5 times its mean
         count = max(int(np.ceil(duration / SAMPLE)), 1)
@@ -141,7 +143,19 @@ def rod_pose(shape: Shape) -> NDArray[np.float64]:
 
 def hanging() -> Strategy:
     """A hanger is hung on a rod."""
-    tool = make("hanger", 2, span=0.32, drop=0.09, width=0.012, thickness=0.012, inner_radius=0.022, neck=0.02, sweep=np.deg2rad(265), sag=0.0, bar="straight")
+    tool = make(
+        "hanger",
+        2,
+        span=0.32,
+        drop=0.09,
+        width=0.012,
+        thickness=0.012,
+        inner_radius=0.022,
+        neck=0.02,
+        sweep=np.deg2rad(265),
+        sag=0.0,
+        bar="straight",
+    )
     target = make("rod", 0, **ROD)
     tool_view = tool.view("side")
     tool_contact = tool.contact("hook", tool_view, towards=(0, -1, 0))
@@ -210,7 +224,18 @@ def scooped_ball(radius: float) -> NDArray[np.float64]:
 def scooping() -> Strategy:
     """A spoon pushes a ball against a quarter pipe and turns it up."""
     radius = 0.035
-    tool = make("spoon", 1, bowl_half_length=0.046, bowl_half_width=0.044, depth=0.030, wall=0.003, handle=0.24, rise=0.0, handle_thickness=0.012, handle_breadth=0.022)
+    tool = make(
+        "spoon",
+        1,
+        bowl_half_length=0.046,
+        bowl_half_width=0.044,
+        depth=0.030,
+        wall=0.003,
+        handle=0.24,
+        rise=0.0,
+        handle_thickness=0.012,
+        handle_breadth=0.022,
+    )
     target = make("sphere", 3, radius=radius)
     arc = make("quarter_pipe", 0, **ARC)
     tool_view = tool.view("section")
@@ -267,7 +292,15 @@ def scooping() -> Strategy:
             "world_from_target": pose_data(scooped_ball(radius)),
             "tool": {"family": "spoon", "seed": 1, "parameters": dict(tool.parameters)},
             "target": {"family": "sphere", "seed": 3, "parameters": dict(target.parameters)},
-            "fixtures": [{"id": "arc", "family": "quarter_pipe", "seed": 0, "parameters": dict(arc.parameters), "from_target": pose_data(arc_from_target(arc))}],
+            "fixtures": [
+                {
+                    "id": "arc",
+                    "family": "quarter_pipe",
+                    "seed": 0,
+                    "parameters": dict(arc.parameters),
+                    "from_target": pose_data(arc_from_target(arc)),
+                }
+            ],
         },
     )
 
@@ -290,7 +323,9 @@ STRATEGIES = {"hooking": hooking, "hanging": hanging, "scooping": scooping}
 def main(arguments: list[str] | None = None) -> int:
     """Write the strategy folders."""
     parser = argparse.ArgumentParser(description="Write the strategies that ship with the project.")
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "strategies", help="folder that gets one folder for each strategy")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).resolve().parents[1] / "strategies", help="folder that gets one folder for each strategy"
+    )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(STRATEGIES)}; all of them by default")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in STRATEGIES]

@@ -7,14 +7,14 @@ import math
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Vector3
-from magic_core import conversions, transforms
-from magic_core.errors import Code
-from magic_interfaces import msg as mi
 from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magic_bringup.pipeline import Report
+from magic_core import conversions, transforms
+from magic_core.errors import Code
+from magic_interfaces import msg as mi
 
 KEPT = ColorRGBA(r=0.16, g=0.65, b=0.27, a=1.0)
 DROPPED = ColorRGBA(r=0.86, g=0.20, b=0.18, a=0.9)
@@ -61,7 +61,11 @@ def describe(reports: list[Report]) -> tuple[str, ColorRGBA]:
 
 
 def run_markers(
-    scene: mi.SceneObjectArray, candidates: list[mi.ContactCandidate], target_id: str, reports: tuple[Report, ...], plan: mi.MotionPlan | None
+    scene: mi.SceneObjectArray,
+    candidates: list[mi.ContactCandidate],
+    target_id: str,
+    reports: tuple[Report, ...],
+    plan: mi.MotionPlan | None,
 ) -> MarkerArray:
     """All markers of a run, in the frame of the scene; the first one deletes those of the run before."""
     build = _Builder(scene.header)

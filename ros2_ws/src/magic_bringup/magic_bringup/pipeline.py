@@ -308,7 +308,9 @@ class Run:
 
     def _try(self, matches: Matches, trial: Trial) -> tuple[Outcome | None, Code]:
         request = self._request
-        what = f"candidate {trial.index + 1} of {len(matches.candidates)}, {trial.reflection}" + (f", grasp {trial.attempt + 1}" if trial.attempt else "")
+        what = f"candidate {trial.index + 1} of {len(matches.candidates)}, {trial.reflection}" + (
+            f", grasp {trial.attempt + 1}" if trial.attempt else ""
+        )
         self._tell("plan", trial.index, what)
         planned = self._attempt("plan", trial, lambda left: self._stages.plan(request, matches, trial, left), Planned)
         if planned.code != Code.OK:
@@ -367,7 +369,9 @@ class Run:
     def _summary(self) -> str:
         if not self._reports:
             return ""
-        reasons = "; ".join(f"{r.trial.index + 1}{'' if r.trial.reflection == 'keep' else ' turned'}: {r.code.name} at {r.stage}" for r in self._reports)
+        reasons = "; ".join(
+            f"{r.trial.index + 1}{'' if r.trial.reflection == 'keep' else ' turned'}: {r.code.name} at {r.stage}" for r in self._reports
+        )
         return f"{len(self._reports)} trials of {len(self._matches.candidates) if self._matches else 0} candidates failed ({reasons})"
 
     def _tell(self, stage: str, index: int, message: str) -> None:

@@ -21,12 +21,12 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from magic_core import conversions as convert
-from magic_core.camera import RgbdFrame
-from magic_core.scene import Scene, SceneObject
 from numpy.typing import NDArray
 
 from magic_bringup.bag_file import BagWriter, message_definition
+from magic_core import conversions as convert
+from magic_core.camera import RgbdFrame
+from magic_core.scene import Scene, SceneObject
 
 #: Frame of all poses, and the arm's joints with its usual ready pose, fingers open (rad, m).
 WORLD = "panda_link0"
@@ -86,7 +86,9 @@ class Recording:
             self._topics.add(topic)
             self._writer.add_topic(topic, name, (_profile(latched, depth),))
             if name not in self._store.fielddefs:
-                self._store.register({k: v for k, v in get_types_from_msg(message_definition(name)[0], name).items() if k not in self._store.fielddefs})
+                self._store.register(
+                    {k: v for k, v in get_types_from_msg(message_definition(name)[0], name).items() if k not in self._store.fielddefs}
+                )
         # Padding in DDS's serialisation is whatever was in memory; written once more, it is zero.
         data = bytes(self._store.serialize_cdr(self._store.deserialize_cdr(serialize_message(message), name), name))
         self._writer.write(topic, round(stamp * 1e9), data)
@@ -125,7 +127,13 @@ class Recording:
 
         self.write(
             "/joint_states",
-            JointState(header=convert.header("", stamp), name=list(JOINTS), position=[float(p) for p in positions], velocity=[0.0] * 9, effort=[0.0] * 9),
+            JointState(
+                header=convert.header("", stamp),
+                name=list(JOINTS),
+                position=[float(p) for p in positions],
+                velocity=[0.0] * 9,
+                effort=[0.0] * 9,
+            ),
             stamp,
         )
 

@@ -13,10 +13,11 @@ from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from magic_core.errors import Code, MagicError
 from rclpy.action import ActionClient
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
+
+from magic_core.errors import Code, MagicError
 
 #: Between looks at whether a server is still there, s; discovery gives no event for it in rclpy.
 PRESENCE_PERIOD = 0.1
@@ -84,7 +85,9 @@ class _Remote:
     def require(self, timeout: float, token: Token) -> None:
         """Wait for the server; raises SERVER_UNAVAILABLE naming it."""
         if not token.wait(self.ready, time.monotonic() + timeout, alive=lambda: None):
-            raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server} does not answer: nothing serves {self.name} (waited {timeout:.1f} s)")
+            raise MagicError(
+                Code.SERVER_UNAVAILABLE, f"the {self.server} does not answer: nothing serves {self.name} (waited {timeout:.1f} s)"
+            )
 
     def _still_there(self) -> None:
         if not self.ready():

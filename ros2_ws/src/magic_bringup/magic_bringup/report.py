@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+
 from magic_core import conversions, transforms
 from magic_core import strategy as strategies
 from magic_core.camera import Intrinsics
@@ -23,7 +25,6 @@ from magic_core.contact import Contact
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView, Scene, SceneObject
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from magic_bringup.demo import Record
@@ -130,7 +131,11 @@ def contact_picture(view: CanonicalView, contact: Contact, base: Image | None = 
         tangent = PICTURE * np.array([-normal[1], normal[0]])
         cv2.line(picture, fixed(at - tangent), fixed(at + tangent), CIRCLE, 2, cv2.LINE_AA, 4)
     head = at + 46 * normal
-    for start, end in ((at, head), (head, head - 12 * normal + 7 * normal[::-1] * [1, -1]), (head, head - 12 * normal - 7 * normal[::-1] * [1, -1])):
+    for start, end in (
+        (at, head),
+        (head, head - 12 * normal + 7 * normal[::-1] * [1, -1]),
+        (head, head - 12 * normal - 7 * normal[::-1] * [1, -1]),
+    ):
         cv2.line(picture, fixed(start), fixed(end), NORMAL, 2, cv2.LINE_AA, 4)
     cv2.circle(picture, fixed(at), 16 * 6, (255, 255, 255), -1, cv2.LINE_AA, 4)
     cv2.circle(picture, fixed(at), 16 * 4, POINT, -1, cv2.LINE_AA, 4)
@@ -206,7 +211,16 @@ def _figure_image(figure: Any) -> Image:
 def _phases(axes: Any, phases: Any) -> None:
     for index, phase in enumerate(phases):
         axes.axvspan(phase.start, phase.end, color="#1f5fbf", alpha=0.05 if index % 2 else 0.11, lw=0)
-        axes.text((phase.start + phase.end) / 2, 1.01, phase.name, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=8, rotation=25)
+        axes.text(
+            (phase.start + phase.end) / 2,
+            1.01,
+            phase.name,
+            transform=axes.get_xaxis_transform(),
+            ha="center",
+            va="bottom",
+            fontsize=8,
+            rotation=25,
+        )
 
 
 def motion_picture(plan: Any) -> Image:
@@ -322,8 +336,14 @@ def _cameras(record: Record, scene: Scene | None) -> str:
 
 def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -> str:
     figures = [
-        _figure(contact_picture(strategy.tool_view, strategy.tool_contact), f"demonstration: tool; r = {1000 * strategy.tool_contact.radius:.1f} mm, {'concave' if strategy.tool_contact.concave else 'convex'}"),
-        _figure(contact_picture(strategy.target_view, strategy.target_contact), f"demonstration: target; r = {1000 * strategy.target_contact.radius:.1f} mm"),
+        _figure(
+            contact_picture(strategy.tool_view, strategy.tool_contact),
+            f"demonstration: tool; r = {1000 * strategy.tool_contact.radius:.1f} mm, {'concave' if strategy.tool_contact.concave else 'convex'}",
+        ),
+        _figure(
+            contact_picture(strategy.target_view, strategy.target_contact),
+            f"demonstration: target; r = {1000 * strategy.target_contact.radius:.1f} mm",
+        ),
     ]
     if scene is not None and result is not None and result.candidates:
         kept = next((r for r in result.candidates if r.code == Code.OK), result.candidates[0])
@@ -334,13 +354,23 @@ def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -
         if len(result.heatmap.data):
             heat = conversions.float_image_from_msg(result.heatmap)
             first = tool_view(scene.find(best.tool_id), strategy.view)
-            figures.append(_figure(contact_picture(first, best.tool, heat_picture(first, heat)), f"{best.tool_id}: heat map of the match and the best candidate"))
+            figures.append(
+                _figure(
+                    contact_picture(first, best.tool, heat_picture(first, heat)),
+                    f"{best.tool_id}: heat map of the match and the best candidate",
+                )
+            )
         what = "the contact that was kept" if kept.code == Code.OK else "the best candidate, not kept"
         radius = f"r = {1000 * candidate.tool.radius:.1f} mm, {'concave' if candidate.tool.concave else 'convex'}"
         figures.append(_figure(contact_picture(view, candidate.tool), f"{candidate.tool_id}: {what}; {radius}"))
         if candidate.target is not None and result.target_id:
             target = scene.find(result.target_id)
-            figures.append(_figure(contact_picture(target_view(target, strategy), candidate.target), f"{result.target_id}: its contact; r = {1000 * candidate.target.radius:.1f} mm"))
+            figures.append(
+                _figure(
+                    contact_picture(target_view(target, strategy), candidate.target),
+                    f"{result.target_id}: its contact; r = {1000 * candidate.target.radius:.1f} mm",
+                )
+            )
     note = "Point: the contact. Arrow: its outward normal. Circle: the circle of curvature."
     return _section("From the demonstrated contact to the new one", f'<div class="cards">{"".join(figures)}</div>', note)
 
@@ -375,7 +405,7 @@ def _candidates(summary: dict[str, Any]) -> str:
         rows += (
             f'<tr class="{"kept" if c["code"] == 0 else ""}"><td class="n">{index}</td><td>{html.escape(c["tool_id"])}</td><td class="n">{c["score"]:.3f}</td>'
             f'<td class="n">{c["s_dino"]:.3f}</td><td class="n">{c["s_curv"]:.3f}</td><td class="n">{np.degrees(c["rotation"]):.0f}&deg;</td>'
-            f'<td>{face}</td><td>{c["stage"]}</td><td>{html.escape(c["reason"])}{_metrics(c.get("metrics") or {})}</td></tr>'
+            f"<td>{face}</td><td>{c['stage']}</td><td>{html.escape(c['reason'])}{_metrics(c.get('metrics') or {})}</td></tr>"
         )
     return _section("Candidates, in the order in which they were tried", f"<table>{head}{rows}</table>")
 
@@ -408,7 +438,9 @@ def _costs(summary: dict[str, Any]) -> str:
         for s, color in (("perceive", "#1f5fbf"), ("match", "#7b4fb5"), ("plan", "#c2741b"), ("verify", "#12805c"))
     )
     rows = "".join(f'<tr><td>{html.escape(n)}</td><td class="n">{mb:.0f} MB</td></tr>' for n, mb in summary["peak_memory_mb"].items())
-    stages = "".join(f'<tr><td>{s}</td><td class="n">{seconds[s]:.3f} s</td></tr>' for s in ("perceive", "match", "plan", "verify", "total"))
+    stages = "".join(
+        f'<tr><td>{s}</td><td class="n">{seconds[s]:.3f} s</td></tr>' for s in ("perceive", "match", "plan", "verify", "total")
+    )
     tables = (
         f'<div class="row"><figure><table><tr><th>stage</th><th>wall time</th></tr>{stages}</table></figure>'
         f"<figure><table><tr><th>process</th><th>peak memory</th></tr>{rows}</table></figure></div>"
@@ -487,12 +519,12 @@ def save(record: Record, folder: Path) -> None:
 
 def load(folder: Path) -> Record:
     """What :func:`save` kept; raises BAD_REQUEST for a folder without a run."""
-    from magic_interfaces.action import RunStrategy
-    from magic_interfaces.msg import SceneObjectArray
     from rclpy.serialization import deserialize_message
     from sensor_msgs.msg import Image as ImageMsg
 
     from magic_bringup.demo import Record
+    from magic_interfaces.action import RunStrategy
+    from magic_interfaces.msg import SceneObjectArray
 
     if not (folder / "summary.json").is_file():
         raise MagicError(Code.BAD_REQUEST, "folder of a run", str(folder), "one with a summary.json, as demo.sh writes it")

@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from magic_core import strategy as strategies
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
@@ -29,7 +31,6 @@ from magic_core.scene import SceneObject
 from magic_core.shapes import make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures
 from magic_core.strategy import Strategy
-from numpy.typing import NDArray
 
 #: Stamp of the first message, seconds since the epoch, and how often the frame is repeated, seconds apart.
 START, REPEATS, PERIOD = 1735689600.0, 3, 0.2
@@ -65,7 +66,13 @@ def read_depth(path: Path | str, unit: str | None = None) -> NDArray[np.float32]
 
     path = Path(path)
     try:
-        raw = np.load(path, allow_pickle=False) if path.suffix == ".npy" else cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+        raw = (
+            np.load(path, allow_pickle=False)
+            if path.suffix == ".npy"
+            else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if path.is_file()
+            else None
+        )
     except (OSError, ValueError) as error:
         raise MagicError(Code.BAD_IMAGE, "depth image", f"{path}: {error}", "a readable array") from error
     if raw is None:
@@ -107,7 +114,9 @@ def read_intrinsics(source: str, width: int, height: int, hint: str = "") -> Int
             data = data[max(fitting, key=len)]
         values, size = _from_json(data, path, allowed)
         if size and size != (width, height):
-            raise MagicError(Code.BAD_INTRINSICS, f"image size in {path}", f"{size[0]} x {size[1]}", f"{width} x {height}, the size of the colour image")
+            raise MagicError(
+                Code.BAD_INTRINSICS, f"image size in {path}", f"{size[0]} x {size[1]}", f"{width} x {height}, the size of the colour image"
+            )
     else:
         try:
             values = [float(v) for v in source.split(",")]
@@ -246,15 +255,23 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     result = argparse.ArgumentParser(prog="rgbd_to_bag", description="Turn a colour image, a depth image and intrinsics into a bag.")
     result.add_argument("--color", type=Path, required=True, help="colour image (PNG, JPEG)")
-    result.add_argument("--depth", type=Path, required=True, help="depth image registered to the colour image (16-bit PNG, float TIFF, .npy)")
+    result.add_argument(
+        "--depth", type=Path, required=True, help="depth image registered to the colour image (16-bit PNG, float TIFF, .npy)"
+    )
     result.add_argument("--intrinsics", required=True, help="fx,fy,cx,cy in pixels, or a JSON file (FILE:NAME for one entry of several)")
-    result.add_argument("--depth-unit", choices=tuple(UNITS), help="unit of the depth image; default: mm for whole numbers, m for floating point")
+    result.add_argument(
+        "--depth-unit", choices=tuple(UNITS), help="unit of the depth image; default: mm for whole numbers, m for floating point"
+    )
     result.add_argument("--out", type=Path, required=True, help="folder of the new bag")
     result.add_argument("--force", action="store_true", help="replace the bag if it exists")
     pose = {"nargs": 7, "type": float, "metavar": ("X", "Y", "Z", "QX", "QY", "QZ", "QW")}
     result.add_argument("--camera-pose", **pose, help="pose of the colour optical frame in panda_link0; default: from the table in view")
-    result.add_argument("--strategy", default="hanging", help="name or folder of the strategy whose fixtures are added, or none; default hanging")
-    result.add_argument("--rod", **pose, help="pose of the strategy's fixed target (hanging: the rod, free end at its -x); default: the demonstration's")
+    result.add_argument(
+        "--strategy", default="hanging", help="name or folder of the strategy whose fixtures are added, or none; default hanging"
+    )
+    result.add_argument(
+        "--rod", **pose, help="pose of the strategy's fixed target (hanging: the rod, free end at its -x); default: the demonstration's"
+    )
     result.add_argument("--camera", default="left", help="name of the camera in the topics; default left")
     result.add_argument("--seed", type=int, default=0, help="seed of the search for the table")
     return result

@@ -10,14 +10,6 @@ from typing import Any
 
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from magic_core import qos
-from magic_core import strategy as strategies
-from magic_core.conversions import time_from_msg
-from magic_core.errors import Code, MagicError
-from magic_core.node import describe, parameter, run
-from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
-from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObject, SceneObjectArray, StageTimes
-from magic_interfaces.srv import MatchContact
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -28,6 +20,14 @@ from visualization_msgs.msg import MarkerArray
 
 from magic_bringup import execution, markers, pipeline
 from magic_bringup.remote import RemoteAction, RemoteService, Token
+from magic_core import qos
+from magic_core import strategy as strategies
+from magic_core.conversions import time_from_msg
+from magic_core.errors import Code, MagicError
+from magic_core.node import describe, parameter, run
+from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
+from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObject, SceneObjectArray, StageTimes
+from magic_interfaces.srv import MatchContact
 
 #: Where perception's own explanation is looked for when no objects come.
 PERCEPTION = "perception"
@@ -61,7 +61,9 @@ class StrategyServer(Node):
         self._root = parameter(self, "strategies", "", "folder of the strategies; empty: the installed ones", read_only=True)
         self._top_k = parameter(self, "top_k", 3, "candidates to try where the goal does not say", low=1, high=50, read_only=True)
         self._attempts = parameter(self, "attempts", 3, "grasps to try for one contact (variant arm)", low=1, high=50, read_only=True)
-        self._repetitions = parameter(self, "repetitions", 1, "simulations of one motion; above 1: perturbed ones", low=1, high=1000, read_only=True)
+        self._repetitions = parameter(
+            self, "repetitions", 1, "simulations of one motion; above 1: perturbed ones", low=1, high=1000, read_only=True
+        )
         self._film = parameter(self, "film", True, "return the film strip of the last simulation", read_only=True)
         self._timeout = parameter(self, "timeout", 120.0, "s for a whole run where the goal does not say", **seconds, read_only=True)
         self._presence = parameter(self, "server_timeout", 5.0, "s to wait for a server that is not there", **seconds, read_only=True)
@@ -69,11 +71,29 @@ class StrategyServer(Node):
         self._match_timeout = parameter(self, "match_timeout", 60.0, "s for one match", **seconds, read_only=True)
         self._plan_timeout = parameter(self, "plan_timeout", 30.0, "s for one plan", **seconds, read_only=True)
         self._verify_timeout = parameter(self, "verify_timeout", 60.0, "s for one verification", **seconds, read_only=True)
-        self._grace = parameter(self, "grace", 5.0, "s that an answer may come late before its server counts as dead", **seconds, read_only=True)
+        self._grace = parameter(
+            self, "grace", 5.0, "s that an answer may come late before its server counts as dead", **seconds, read_only=True
+        )
         execute = parameter(self, "execute", False, "hand verified trajectories to the arm's controller", read_only=True)
-        topic = parameter(self, "execute_topic", "joint_trajectory_controller/joint_trajectory", "topic of the controller (JointTrajectory)", read_only=True)
-        self._start_tolerance = parameter(self, "start_tolerance", 0.02, "rad that a joint may be off the trajectory's start to execute it", low=0.0, high=0.5, read_only=True)
-        self._state_age = parameter(self, "state_age", 0.5, "s that joint_states may be old to execute a trajectory", low=0.01, high=10.0, read_only=True)
+        topic = parameter(
+            self,
+            "execute_topic",
+            "joint_trajectory_controller/joint_trajectory",
+            "topic of the controller (JointTrajectory)",
+            read_only=True,
+        )
+        self._start_tolerance = parameter(
+            self,
+            "start_tolerance",
+            0.02,
+            "rad that a joint may be off the trajectory's start to execute it",
+            low=0.0,
+            high=0.5,
+            read_only=True,
+        )
+        self._state_age = parameter(
+            self, "state_age", 0.5, "s that joint_states may be old to execute a trajectory", low=0.01, high=10.0, read_only=True
+        )
 
         group = ReentrantCallbackGroup()
         self._lock = threading.Lock()
@@ -354,7 +374,10 @@ class _Stages:
         topic = node._objects_topic
         if scene is not None:
             ids = [o.id for o in scene.objects]
-            code, what = Code.NO_OBJECTS, f"{topic} holds {len(ids)} objects {ids} (allowed: a tool that a camera sees, and a target), waited {wait:.1f} s"
+            code, what = (
+                Code.NO_OBJECTS,
+                f"{topic} holds {len(ids)} objects {ids} (allowed: a tool that a camera sees, and a target), waited {wait:.1f} s",
+            )
         else:
             publishers = node.count_publishers(topic)
             code = Code.NO_OBJECTS if publishers else Code.NO_FRAMES
@@ -421,7 +444,9 @@ class _Stages:
         result = node._planner.call(goal, timeout, self._token, node._presence, node._grace)
         return pipeline.Planned(code_of(result.code), result.message, result.plan)
 
-    def verify(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, plan: MotionPlan, timeout: float) -> pipeline.Verdict:
+    def verify(
+        self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, plan: MotionPlan, timeout: float
+    ) -> pipeline.Verdict:
         """Ask the verifier for one planned motion."""
         node = self._node
         timeout = min(timeout, node._verify_timeout)
@@ -460,7 +485,9 @@ class _Stages:
             node.get_logger().warning(f"no film: {error.message}")
             return None
         if result.code != self._last_code:  # another client came in between, and the repetition took too long, for one
-            node.get_logger().warning(f"no film: asked for it, the verifier answered {result.code} instead of {self._last_code}: {result.message}")
+            node.get_logger().warning(
+                f"no film: asked for it, the verifier answered {result.code} instead of {self._last_code}: {result.message}"
+            )
             return None
         return result.film if len(result.film.data) else None
 
@@ -489,7 +516,11 @@ def complaint_code(status: DiagnosticStatus) -> Code | None:
 def report_to_msg(report: pipeline.Report) -> CandidateReport:
     """Report to its message."""
     message = CandidateReport(
-        candidate=report.trial.candidate, reflection=report.trial.reflection, stage=report.stage, code=int(report.code), message=report.message
+        candidate=report.trial.candidate,
+        reflection=report.trial.reflection,
+        stage=report.stage,
+        code=int(report.code),
+        message=report.message,
     )
     if report.plan is not None:
         message.grasp = report.plan.tool_from_tcp

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from magic_core import qos
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
@@ -23,6 +22,7 @@ from magic_bringup.bag_player import message_class
 from magic_bringup.demo import Options, Watcher, look_into
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph
+from magic_core import qos
 
 #: Longest wait for anything in these tests, s; a machine with two busy cores starts the graph in less than half of it.
 DEADLINE = 90.0
@@ -101,7 +101,9 @@ class Bench:
 
 
 @contextmanager
-def started(logs: Path, bag: Path | None = None, parameters: dict[str, dict[str, object]] | None = None, leave_out: tuple[str, ...] = ()) -> Iterator[Bench]:
+def started(
+    logs: Path, bag: Path | None = None, parameters: dict[str, dict[str, object]] | None = None, leave_out: tuple[str, ...] = ()
+) -> Iterator[Bench]:
     """A graph in a domain of its own; everything is stopped in the end."""
     env = isolated()
     before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
@@ -186,8 +188,9 @@ def feeding(messages: dict[str, Any], change: Callable[[str, Any], Any] = lambda
 def camera_messages(meshes: list[Any], names: tuple[str, ...] = ("left", "right"), seed: int = 0) -> dict[str, Any]:
     """What D435 cameras that look at meshes (world coordinates) on the table publish: topic -> message."""
     from geometry_msgs.msg import TransformStamped
-    from magic_core import conversions, sensor
     from tf2_msgs.msg import TFMessage
+
+    from magic_core import conversions, sensor
 
     messages: dict[str, Any] = {}
     static = TFMessage()
@@ -203,6 +206,8 @@ def camera_messages(meshes: list[Any], names: tuple[str, ...] = ("left", "right"
         messages[f"{base}/aligned_depth_to_color/image_raw"] = conversions.image_to_msg(depth, "16UC1", head)
         messages[f"{base}/aligned_depth_to_color/camera_info"] = conversions.intrinsics_to_msg(frame.intrinsics, head)
         static.transforms.append(
-            TransformStamped(header=conversions.header("panda_link0"), child_frame_id=head.frame_id, transform=conversions.transform_to_msg(pose))
+            TransformStamped(
+                header=conversions.header("panda_link0"), child_frame_id=head.frame_id, transform=conversions.transform_to_msg(pose)
+            )
         )
     return {"/tf_static": static, **messages}

@@ -14,21 +14,22 @@ import pytest
 DOMAIN = str(1 + (os.getpid() * 7 + 11) % 100)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
-import rclpy  # noqa: E402
-from builtin_interfaces.msg import Time  # noqa: E402
-from geometry_msgs.msg import TransformStamped  # noqa: E402
-from magic_bringup import bag_file, bag_qos  # noqa: E402
-from magic_bringup.bag_player import PlayOptions, Player  # noqa: E402
-from magic_bringup.bag_recorder import RecordOptions  # noqa: E402
-from magic_core.errors import Code, MagicError  # noqa: E402
-from magic_core.qos import LATCHED, SENSOR  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-from tf2_msgs.msg import TFMessage  # noqa: E402
+import rclpy
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+from tf2_msgs.msg import TFMessage
+
+from magic_bringup import bag_file, bag_qos
+from magic_bringup.bag_player import Player, PlayOptions
+from magic_bringup.bag_recorder import RecordOptions
+from magic_core.errors import Code, MagicError
+from magic_core.qos import LATCHED, SENSOR
 
 FOREVER = QosTime(9223372036, 854775807)
 
@@ -167,7 +168,6 @@ def test_record_what_is_published(node, tmp_path: Path) -> None:
     assert qos["/camera/left/color/image_raw"].reliability == QosReliability.BEST_EFFORT
 
 
-
 def test_play_reaches_late_and_early_subscribers(node, tmp_path: Path) -> None:
     """Best-effort images arrive byte for byte in order and in time; a latched topic also reaches who subscribes afterwards."""
     bag = write(tmp_path / "bag")
@@ -200,7 +200,9 @@ def test_play_reaches_late_and_early_subscribers(node, tmp_path: Path) -> None:
     # 0.45 s of bag at half rate; arrival jitter is the executor's.
     assert stamps[-1] - stamps[0] == pytest.approx(0.9, abs=0.25)
     assert len(clocks) >= 15 and clocks == sorted(clocks) and clocks[-1] <= 100.451
-    node.create_subscription(TFMessage, "/tf_static", late.append, QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL), raw=True)
+    node.create_subscription(
+        TFMessage, "/tf_static", late.append, QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL), raw=True
+    )
     while len(late) < 2:
         assert time.monotonic() < deadline, "the latched messages did not come"
         rclpy.spin_once(node, timeout_sec=0.05)

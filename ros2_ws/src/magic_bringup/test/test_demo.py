@@ -1,6 +1,7 @@
 """What the demo measures and writes, without any node."""
 
 import pytest
+
 from magic_bringup.demo import perceive_seconds
 
 LEFT = [f"/camera/left/{part}" for part in ("color/image_raw", "color/camera_info", "aligned_depth_to_color/image_raw")]

@@ -3,20 +3,29 @@
 import math
 
 import pytest
+from sensor_msgs.msg import JointState
+from test_strategy_server import Bench
+from trajectory_msgs.msg import JointTrajectory
+
 from magic_bringup import fakes
 from magic_bringup.execution import check_start
 from magic_core import qos
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import VerifyMotion
-from sensor_msgs.msg import JointState
-from test_strategy_server import Bench
-from trajectory_msgs.msg import JointTrajectory
 
 NAMES = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 TOPIC = "controller/joint_trajectory"
-HERE = dict(names=NAMES, first=[0.1] * 7, state_names=FINGERS + NAMES, state_positions=[0.04] * 2 + [0.1] * 7, age=0.01, tolerance=0.02, max_age=0.5)
+HERE = {
+    "names": NAMES,
+    "first": [0.1] * 7,
+    "state_names": FINGERS + NAMES,
+    "state_positions": [0.04] * 2 + [0.1] * 7,
+    "age": 0.01,
+    "tolerance": 0.02,
+    "max_age": 0.5,
+}
 
 
 def test_an_arm_at_the_start_is_accepted():

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+
 from magic_bringup import pipeline
 from magic_bringup.pipeline import Agenda, Matches, Planned, Progress, Request, Run, Settings, Verdict, check, reflections_of
 from magic_core.errors import Code, MagicError

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+
 from magic_bringup.bag_file import info as read_info
 from magic_bringup.bag_file import open_bag
 from magic_core import conversions as convert
@@ -107,7 +108,9 @@ def test_a_scene_shows_what_its_truth_says(name: str) -> None:
         world_height = cloud[:, 2] > 0.008
         inside = world_height & np.all((local > low - 0.004) & (local < high + 0.004), axis=1)
         assert inside.sum() > 250, entry["name"]
-        assert transforms.apply(pose_from_data(entry["world_from_object"]), shape.mesh.vertices)[:, 2].min() == pytest.approx(0, abs=0.002), entry["name"]
+        assert transforms.apply(pose_from_data(entry["world_from_object"]), shape.mesh.vertices)[:, 2].min() == pytest.approx(
+            0, abs=0.002
+        ), entry["name"]
         if entry["known"]:
             continue
         x, y, _ = entry["world_from_object"]["position"]

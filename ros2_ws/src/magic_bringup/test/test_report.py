@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+
 from magic_bringup import fakes, report
 from magic_bringup.demo import Options, Record, candidate_summary, empty_summary
 from magic_core import conversions
@@ -25,7 +26,13 @@ def full(folder, tmp_path, variant="arm"):
     result = RunStrategy.Result(code=0, verified=True, tool_id="object_1", target_id="object_2")
     result.plan = conversions.plan_to_msg(fakes.plan(variant), "object_1")
     result.candidates = [
-        CandidateReport(candidate=conversions.candidate_to_msg(fakes.candidate()), reflection="keep", stage="verify", code=int(code), message="why <b>so</b>")
+        CandidateReport(
+            candidate=conversions.candidate_to_msg(fakes.candidate()),
+            reflection="keep",
+            stage="verify",
+            code=int(code),
+            message="why <b>so</b>",
+        )
         for code in (Code.DRIFT, Code.OK)
     ]
     result.heatmap = conversions.image_to_msg(np.random.default_rng(0).random((64, 64)).astype(np.float32), "32FC1")
@@ -47,7 +54,14 @@ def full(folder, tmp_path, variant="arm"):
 def test_a_full_report_is_self_contained(folder, tmp_path, variant):
     page = report.render(full(folder, tmp_path, variant))
     assert "could not be drawn" not in page
-    for title in ("What the cameras saw", "From the demonstrated contact", "What was reconstructed", "Simulation", "Candidates", "Time and memory"):
+    for title in (
+        "What the cameras saw",
+        "From the demonstrated contact",
+        "What was reconstructed",
+        "Simulation",
+        "Candidates",
+        "Time and memory",
+    ):
         assert title in page
     assert ("Joints" if variant == "arm" else "Motion of the tool") in page
     # Nothing is fetched from elsewhere, and what nodes say is not taken for markup.

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+
 from magic_bringup import rgbd_to_bag
 from magic_bringup.bag_file import info as read_info
 from magic_core import strategy as strategies
@@ -27,7 +28,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A mug seen by a camera whose pose is not told."""
     folder = tmp_path_factory.mktemp("rgbd")
     mug = make("mug", 3)
-    frame = capture([mug.mesh.transformed(transforms.from_rpy(0, 0, 1.0, [3.0, 2.0, mug.mesh.extents[2] / 2]))], CAMERA, looking_at([3.4, 2.2, 0.45], [3, 2, 0.04]), 0, table=_table())
+    frame = capture(
+        [mug.mesh.transformed(transforms.from_rpy(0, 0, 1.0, [3.0, 2.0, mug.mesh.extents[2] / 2]))],
+        CAMERA,
+        looking_at([3.4, 2.2, 0.45], [3, 2, 0.04]),
+        0,
+        table=_table(),
+    )
     cv2.imwrite(str(folder / "c.png"), frame.color[..., ::-1])
     depth = np.nan_to_num(frame.depth)
     cv2.imwrite(str(folder / "d.png"), np.round(depth * 1000).astype(np.uint16))
@@ -43,7 +50,12 @@ def _table() -> object:
 
 
 def run(files: dict[str, Path], out: Path, *more: str, **instead: str) -> int:
-    named = {"--color": str(files["c.png"]), "--depth": str(files["d.png"]), "--intrinsics": str(files["k.json"]), "--strategy": str(STRATEGIES / "hanging")}
+    named = {
+        "--color": str(files["c.png"]),
+        "--depth": str(files["d.png"]),
+        "--intrinsics": str(files["k.json"]),
+        "--strategy": str(STRATEGIES / "hanging"),
+    }
     named.update({f"--{k.replace('_', '-')}": v for k, v in instead.items()})
     return rgbd_to_bag.main([*(x for pair in named.items() for x in pair), "--out", str(out), *more])
 
@@ -69,7 +81,10 @@ def test_the_mug_stands_upright_in_reach_beside_the_rod(files: dict[str, Path], 
 
 def test_given_poses_are_kept(files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pose = ["0.9", "0", "0.5", "0.653281", "0.653281", "-0.270598", "-0.270598"]
-    assert run(files, tmp_path / "bag", "--camera-pose", *pose, "--rod", "0.5", "0.1", "0.19", "0", "0", "0", "1", depth=str(files["d.npy"])) == 0
+    assert (
+        run(files, tmp_path / "bag", "--camera-pose", *pose, "--rod", "0.5", "0.1", "0.19", "0", "0", "0", "1", depth=str(files["d.npy"]))
+        == 0
+    )
     assert "camera at 0.9000 0.0000 0.5000" in capsys.readouterr().out
 
 
@@ -93,7 +108,9 @@ def test_without_a_strategy_nothing_is_known(files: dict[str, Path], tmp_path: P
         ({"strategy": "no/such"}, Code.UNKNOWN_STRATEGY),
     ],
 )
-def test_bad_input_gets_a_code(files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], instead: dict[str, str], code: Code) -> None:
+def test_bad_input_gets_a_code(
+    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], instead: dict[str, str], code: Code
+) -> None:
     instead = {k: str(files[v]) if v in files else v for k, v in instead.items()}
     assert run(files, tmp_path / "bag", **instead) == 1
     assert f"[{int(code)} {code.name}]" in capsys.readouterr().err
@@ -123,7 +140,12 @@ def test_intrinsics_are_read_in_every_common_form(tmp_path: Path) -> None:
     rows = [[600.0, 0, 320.0], [0, 601.0, 240.0], [0, 0, 1.0]]
     columns = [600.0, 0, 0, 0, 601.0, 0, 320.0, 240.0, 1.0]
     plain = {"fx": 600.0, "fy": 601.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
-    for data in (plain, {"K": rows}, {"intrinsic_matrix": columns, "width": 640, "height": 480}, {"mug": plain, "can": {**plain, "fx": 1.0}}):
+    for data in (
+        plain,
+        {"K": rows},
+        {"intrinsic_matrix": columns, "width": 640, "height": 480},
+        {"mug": plain, "can": {**plain, "fx": 1.0}},
+    ):
         path = tmp_path / "k.json"
         path.write_text(json.dumps(data))
         assert rgbd_to_bag.read_intrinsics(str(path), 640, 480, "mug_color.png") == expected

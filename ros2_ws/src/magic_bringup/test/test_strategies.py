@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from magic_bringup import make_strategies
 from magic_core import strategy as strategies
 from magic_core import transforms
@@ -31,7 +32,9 @@ def made(strategy: Strategy, key: str) -> Shape:
     return make(entry["family"], entry["seed"], **entry["parameters"])
 
 
-def replay(strategy: Strategy, tool: Shape, tool_contact: object, target: Shape, target_contact: object, world_from_target: np.ndarray) -> object:
+def replay(
+    strategy: Strategy, tool: Shape, tool_contact: object, target: Shape, target_contact: object, world_from_target: np.ndarray
+) -> object:
     from magic_planner.object_motion import plan_tool_motion
     from magic_verifier.verification import verify
 
@@ -53,12 +56,21 @@ def test_the_files_are_those_of_the_script(strategy: Strategy, tmp_path: Path) -
     np.testing.assert_allclose(again.target_contact.object_from_contact, strategy.target_contact.object_from_contact, atol=1e-6)
     assert (again.tool_view.mask != strategy.tool_view.mask).mean() < 1e-3
     assert (again.target_view.mask != strategy.target_view.mask).mean() < 1e-3
-    assert (again.goal, again.physics, again.environment, again.reflections) == (strategy.goal, strategy.physics, strategy.environment, strategy.reflections)
+    assert (again.goal, again.physics, again.environment, again.reflections) == (
+        strategy.goal,
+        strategy.physics,
+        strategy.environment,
+        strategy.reflections,
+    )
     np.testing.assert_allclose([w.offset for w in again.waypoints], [w.offset for w in strategy.waypoints], atol=1e-9)
 
 
 def test_the_demonstrated_contacts_meet(strategy: Strategy) -> None:
-    contacts = transforms.inverse(strategy.target_contact.object_from_contact) @ strategy.target_from_tool @ strategy.tool_contact.object_from_contact
+    contacts = (
+        transforms.inverse(strategy.target_contact.object_from_contact)
+        @ strategy.target_from_tool
+        @ strategy.tool_contact.object_from_contact
+    )
     distance = np.linalg.norm(contacts[:, :3, 3], axis=1)
     assert distance.min() < 0.004  # hanging lets go 2 mm above the rod
     k = int(np.argmin(distance))
@@ -96,7 +108,12 @@ def test_the_tool_keeps_clear_of_the_table(strategy: Strategy) -> None:
 
 def test_the_demonstration_succeeds_in_physics(strategy: Strategy) -> None:
     verdict = replay(
-        strategy, made(strategy, "tool"), strategy.tool_contact, made(strategy, "target"), strategy.target_contact, demonstrated_pose(strategy.environment)
+        strategy,
+        made(strategy, "tool"),
+        strategy.tool_contact,
+        made(strategy, "target"),
+        strategy.target_contact,
+        demonstrated_pose(strategy.environment),
     )
     assert verdict.success, verdict.message
 
@@ -116,7 +133,12 @@ def test_mugs_hang_by_their_handles(seed: int) -> None:
     strategy = strategies.load(FOLDER / "hanging")
     mug = mug_set(1, seed)[0]
     verdict = replay(
-        strategy, mug, mug.contact("handle", towards=(-1, 0, -1)), made(strategy, "target"), strategy.target_contact, demonstrated_pose(strategy.environment)
+        strategy,
+        mug,
+        mug.contact("handle", towards=(-1, 0, -1)),
+        made(strategy, "target"),
+        strategy.target_contact,
+        demonstrated_pose(strategy.environment),
     )
     assert verdict.success, verdict.message
 

@@ -8,6 +8,12 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.action import ActionClient
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
+from visualization_msgs.msg import MarkerArray
+
 from magic_bringup import fakes
 from magic_bringup.domain import free_domain
 from magic_bringup.remote import Token
@@ -17,11 +23,6 @@ from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.srv import MatchContact
-from rclpy.action import ActionClient
-from rclpy.executors import MultiThreadedExecutor
-from rclpy.node import Node
-from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
-from visualization_msgs.msg import MarkerArray
 
 DEADLINE = 15.0
 

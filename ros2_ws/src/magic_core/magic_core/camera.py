@@ -64,6 +64,8 @@ class RgbdFrame:
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
         if self.color.shape != (*size, 3) or self.color.dtype != np.uint8:
-            raise MagicError(Code.BAD_IMAGE, f"colour image of {self.camera}", f"{self.color.shape} {self.color.dtype}", f"{(*size, 3)} uint8")
+            raise MagicError(
+                Code.BAD_IMAGE, f"colour image of {self.camera}", f"{self.color.shape} {self.color.dtype}", f"{(*size, 3)} uint8"
+            )
         if self.depth.shape != size:
             raise MagicError(Code.BAD_IMAGE, f"depth image of {self.camera}", self.depth.shape, f"{size}, the size of its colour image")

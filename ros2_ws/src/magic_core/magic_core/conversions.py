@@ -11,7 +11,6 @@ import math
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
-from magic_interfaces import msg as mi
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh as MeshMsg
@@ -31,6 +30,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_interfaces import msg as mi
 
 # ---------------------------------------------------------------- time and header
 
@@ -89,7 +89,9 @@ def transform_from_msg(msg: Transform) -> NDArray[np.float64]:
 def _transform(translation: list[float], xyzw: list[float]) -> NDArray[np.float64]:
     norm = float(np.linalg.norm(xyzw))
     if not np.all(np.isfinite(translation)) or not 0.9 < norm < 1.1:
-        raise MagicError(Code.BAD_REQUEST, "pose", f"position {translation}, orientation {xyzw}", "finite numbers and a unit quaternion (x, y, z, w)")
+        raise MagicError(
+            Code.BAD_REQUEST, "pose", f"position {translation}, orientation {xyzw}", "finite numbers and a unit quaternion (x, y, z, w)"
+        )
     return transforms.from_quaternion(translation, xyzw)
 
 
@@ -215,7 +217,9 @@ def cloud_to_msg(points: NDArray[np.float64], colors: NDArray[np.uint8], header:
     if len(colors) == len(points):
         c = colors.astype(np.uint32)
         data["rgb"] = (c[:, 0] << 16) | (c[:, 1] << 8) | c[:, 2]
-    msg = PointCloud2(header=header, height=1, width=len(points), is_bigendian=False, point_step=16, row_step=16 * len(points), is_dense=True)
+    msg = PointCloud2(
+        header=header, height=1, width=len(points), is_bigendian=False, point_step=16, row_step=16 * len(points), is_dense=True
+    )
     msg.fields = [
         PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32 if i < 3 else PointField.UINT32, count=1)
         for i, name in enumerate(("x", "y", "z", "rgb"))
@@ -284,7 +288,9 @@ def object_from_msg(msg: mi.SceneObject) -> SceneObject:
     colors = None
     if len(msg.mesh_colors):
         if len(msg.mesh_colors) != 3 * len(msg.mesh.vertices):
-            raise MagicError(Code.BAD_MESH, f"mesh_colors of {msg.id}", len(msg.mesh_colors), f"{3 * len(msg.mesh.vertices)} bytes, RGB for each vertex")
+            raise MagicError(
+                Code.BAD_MESH, f"mesh_colors of {msg.id}", len(msg.mesh_colors), f"{3 * len(msg.mesh.vertices)} bytes, RGB for each vertex"
+            )
         colors = np.array(msg.mesh_colors, dtype=np.uint8).reshape(-1, 3)
     points, point_colors = cloud_from_msg(msg.cloud)
     return SceneObject(
@@ -322,9 +328,7 @@ def plane_from_msg(msg: Plane) -> NDArray[np.float64]:
 def scene_to_msg(scene: Scene) -> mi.SceneObjectArray:
     """Scene to SceneObjectArray."""
     head = header(scene.frame_id, scene.stamp)
-    return mi.SceneObjectArray(
-        header=head, objects=[object_to_msg(item, head) for item in scene.objects], table=plane_to_msg(scene.table)
-    )
+    return mi.SceneObjectArray(header=head, objects=[object_to_msg(item, head) for item in scene.objects], table=plane_to_msg(scene.table))
 
 
 def scene_from_msg(msg: mi.SceneObjectArray) -> Scene:
@@ -355,7 +359,12 @@ def contact_to_msg(contact: Contact) -> mi.Contact:
 def contact_from_msg(msg: mi.Contact) -> Contact:
     """Message to Contact."""
     return Contact(
-        np.array(msg.pixel), np.array(msg.normal), float(msg.radius), bool(msg.concave), float(msg.scale), pose_from_msg(msg.object_from_contact)
+        np.array(msg.pixel),
+        np.array(msg.normal),
+        float(msg.radius),
+        bool(msg.concave),
+        float(msg.scale),
+        pose_from_msg(msg.object_from_contact),
     )
 
 
@@ -417,7 +426,9 @@ def arm_motion_to_msg(motion: ArmMotion, frame_id: str = "panda_link0") -> Joint
         header=header(frame_id),
         joint_names=list(motion.joint_names),
         points=[
-            JointTrajectoryPoint(positions=p.tolist(), velocities=v.tolist(), accelerations=a.tolist(), time_from_start=duration_to_msg(float(t)))
+            JointTrajectoryPoint(
+                positions=p.tolist(), velocities=v.tolist(), accelerations=a.tolist(), time_from_start=duration_to_msg(float(t))
+            )
             for t, p, v, a in zip(motion.times, motion.positions, motion.velocities, motion.accelerations, strict=True)
         ],
     )
@@ -459,7 +470,12 @@ def plan_from_msg(msg: mi.MotionPlan) -> MotionPlan:
         names = tuple(msg.arm_trajectory.joint_names)
         rows = msg.arm_trajectory.points
         if not rows or any(not len(p.positions) == len(p.velocities) == len(p.accelerations) == len(names) for p in rows):
-            raise MagicError(Code.BAD_MOTION, "arm trajectory", f"{len(rows)} points", f"points with {len(names)} positions, velocities and accelerations each")
+            raise MagicError(
+                Code.BAD_MOTION,
+                "arm trajectory",
+                f"{len(rows)} points",
+                f"points with {len(names)} positions, velocities and accelerations each",
+            )
         arm = ArmMotion(
             times=np.array([seconds(p.time_from_start) for p in rows]),
             joint_names=names,

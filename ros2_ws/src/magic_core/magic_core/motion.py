@@ -78,4 +78,9 @@ class MotionPlan:
         if self.variant not in VARIANTS:
             raise MagicError(Code.UNKNOWN_VARIANT, "variant", self.variant, VARIANTS)
         if (self.variant == "arm") != (self.arm_motion is not None):
-            raise MagicError(Code.BAD_MOTION, "plan", f"variant {self.variant} {'with' if self.arm_motion else 'without'} an arm motion", "arm with, fg without")
+            raise MagicError(
+                Code.BAD_MOTION,
+                "plan",
+                f"variant {self.variant} {'with' if self.arm_motion else 'without'} an arm motion",
+                "arm with, fg without",
+            )

@@ -46,9 +46,7 @@ class Raycaster:
         self._meshes = list(meshes)
         self._scene = o3d.t.geometry.RaycastingScene()
         for mesh in self._meshes:
-            self._scene.add_triangles(
-                o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
-            )
+            self._scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
 
     def cast(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Cast:
         """Cast rays: origins and unit directions, each (H, W, 3) in world coordinates."""
@@ -95,7 +93,9 @@ class Raycaster:
         depth = np.where(np.isfinite(cast.distance), cast.distance / length, np.nan).astype(np.float32)
         return cast, depth
 
-    def orthographic(self, world_from_view: NDArray[np.float64], size: tuple[int, int], metres_per_pixel: float, reach: float) -> tuple[Cast, NDArray[np.float32]]:
+    def orthographic(
+        self, world_from_view: NDArray[np.float64], size: tuple[int, int], metres_per_pixel: float, reach: float
+    ) -> tuple[Cast, NDArray[np.float32]]:
         """Look along z of a view frame with parallel rays from ``reach`` metres before its plane.
 
         size is (H, W); also returns depth (H, W) from the view plane, negative before it, NaN off the meshes.
@@ -117,7 +117,9 @@ def _rays(origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDAr
     return rays
 
 
-def shade(cast: Cast, light: ArrayLike = (0.3, 0.2, 1.0), ambient: float = 0.45, background: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.uint8]:
+def shade(
+    cast: Cast, light: ArrayLike = (0.3, 0.2, 1.0), ambient: float = 0.45, background: tuple[int, int, int] = (0, 0, 0)
+) -> NDArray[np.uint8]:
     """Colours under one distant light (a direction towards it, world frame): (H, W, 3) uint8."""
     lambert = np.clip(cast.normals @ transforms.unit(light), 0, 1)
     image = cast.color * (ambient + (1 - ambient) * lambert)[..., None]

@@ -117,5 +117,5 @@ class Scene:
     @property
     def table_height(self) -> float:
         """Height in metres of the table plane at the world's origin."""
-        a, b, c, d = (float(x) for x in self.table)
+        _a, _b, c, d = (float(x) for x in self.table)
         return -d / c

@@ -74,7 +74,9 @@ class DepthModel:
         return depth**2 * self.noise / (self.focal * self.baseline)
 
 
-def table_mesh(low: tuple[float, float] = (-0.6, -1.0), high: tuple[float, float] = (1.4, 1.0), color: tuple[int, int, int] = (186, 152, 112)) -> Mesh:
+def table_mesh(
+    low: tuple[float, float] = (-0.6, -1.0), high: tuple[float, float] = (1.4, 1.0), color: tuple[int, int, int] = (186, 152, 112)
+) -> Mesh:
     """The table top: the rectangle of the plane z = 0 between two corners (x, y)."""
     (x0, y0), (x1, y1) = low, high
     vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
@@ -90,7 +92,11 @@ def looking_at(eye: NDArray | Sequence[float], target: NDArray | Sequence[float]
 
 
 def degrade(
-    depth: NDArray[np.float32], cosine: NDArray[np.float32], intrinsics: Intrinsics, seed: int | Sequence[int], model: DepthModel | None = None
+    depth: NDArray[np.float32],
+    cosine: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    seed: int | Sequence[int],
+    model: DepthModel | None = None,
 ) -> NDArray[np.float32]:
     """What the sensor makes of true depth.
 

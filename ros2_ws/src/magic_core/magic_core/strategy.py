@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.contact import Contact, contact_frame
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh, load as load_mesh
+from magic_core.mesh import Mesh
+from magic_core.mesh import load as load_mesh
 from magic_core.scene import CanonicalView
 
 MODES = ("plan", "retarget")
@@ -130,9 +131,7 @@ def _view(folder: Path, prefix: str, kind: str, data: dict[str, Any]) -> Canonic
 def _contact(view: CanonicalView, data: dict[str, Any]) -> Contact:
     pixel = np.array(data["pixel"], dtype=float)
     normal = transforms.unit(data["normal"])
-    return Contact(
-        pixel, normal, float(data["radius"]), bool(data["concave"]), float(data["scale"]), contact_frame(view, pixel, normal)
-    )
+    return Contact(pixel, normal, float(data["radius"]), bool(data["concave"]), float(data["scale"]), contact_frame(view, pixel, normal))
 
 
 def load(folder: str | Path) -> Strategy:
@@ -179,7 +178,9 @@ def load(folder: str | Path) -> Strategy:
     except MagicError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OSError, yaml.YAMLError) as error:
-        raise MagicError(Code.BAD_STRATEGY, f"strategy file {path}", f"{type(error).__name__}: {error}", "the keys that magic_core.strategy documents") from error
+        raise MagicError(
+            Code.BAD_STRATEGY, f"strategy file {path}", f"{type(error).__name__}: {error}", "the keys that magic_core.strategy documents"
+        ) from error
 
 
 def installed_folder() -> Path:
@@ -252,9 +253,7 @@ def save(strategy: Strategy, folder: str | Path) -> None:
         "reflections": list(strategy.reflections),
         "releases": strategy.releases,
         "simulatable": strategy.simulatable,
-        "waypoints": [
-            {"name": w.name, "offset": _floats(w.offset), "phase": w.phase, "speed": w.speed} for w in strategy.waypoints
-        ],
+        "waypoints": [{"name": w.name, "offset": _floats(w.offset), "phase": w.phase, "speed": w.speed} for w in strategy.waypoints],
         "goal": {"test": strategy.goal.test, "values": dict(strategy.goal.values)},
         "physics": {
             "friction": strategy.physics.friction,

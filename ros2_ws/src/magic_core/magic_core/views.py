@@ -59,7 +59,9 @@ def _top(mesh: Mesh, size: int, confidence: float) -> CanonicalView:
     return canonical_view(mesh, (0, 0, -1), (0, 1, 0), "top", size, confidence=confidence)
 
 
-def _silhouettes(caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _silhouettes(
+    caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], up: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """The masks (D, P, P) of a mesh seen along directions (D, 3), and their metres per pixel (D,)."""
     steps = np.arange(_PROBE) - (_PROBE - 1) / 2
     rays = np.empty((len(directions), _PROBE, _PROBE, 6), np.float32)
@@ -187,7 +189,15 @@ def _section(mesh: Mesh, pieces: Sequence[Mesh] | None, size: int) -> CanonicalV
     origin = middle + axis * mid[0] + np.array([0, 0, mid[1] - middle[2]])
     object_from_view = transforms.make(np.column_stack([x, y, np.cross(x, y)]), origin)
     depth = np.where(mask, np.float32(0), np.float32(np.nan))
-    return CanonicalView(image, mask, scale, object_from_view, "section", depth, float(np.clip(1 - np.ptp(mesh.vertices[:, 2]) / max(np.ptp(along), 1e-9), 0.2, 1.0)))
+    return CanonicalView(
+        image,
+        mask,
+        scale,
+        object_from_view,
+        "section",
+        depth,
+        float(np.clip(1 - np.ptp(mesh.vertices[:, 2]) / max(np.ptp(along), 1e-9), 0.2, 1.0)),
+    )
 
 
 def _cut(mesh: Mesh, origin: NDArray[np.float64], axis: NDArray[np.float64], normal: NDArray[np.float64]) -> object:

@@ -1,6 +1,7 @@
 """Contact frames."""
 
 import numpy as np
+
 from magic_core import transforms as tf
 from magic_core.contact import OPPOSED, contact_frame, turned_over
 from magic_core.scene import CanonicalView

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+
 from magic_core import conversions as cv
 from magic_core import transforms as tf
 from magic_core.camera import Intrinsics
@@ -129,7 +130,9 @@ def test_clouds():
     assert empty.shape == (0, 3)
 
 
-@pytest.mark.parametrize("coef, plane", [((0, 0, 2, -1), (0, 0, 1, -0.5)), ((0, 0, -1, 0.5), (0, 0, 1, -0.5)), ((0, 0, 0, 0), (0, 0, 1, 0))])
+@pytest.mark.parametrize(
+    "coef, plane", [((0, 0, 2, -1), (0, 0, 1, -0.5)), ((0, 0, -1, 0.5), (0, 0, 1, -0.5)), ((0, 0, 0, 0), (0, 0, 1, 0))]
+)
 def test_planes_are_unit_and_point_up(coef, plane):
     np.testing.assert_allclose(cv.plane_from_msg(cv.plane_to_msg(np.array(coef))), plane, atol=1e-12)
 
@@ -146,12 +149,16 @@ def view(kind="top"):
     rng = np.random.default_rng(1)
     mask = rng.random((6, 8)) > 0.5
     depth = np.where(mask, rng.random((6, 8)), np.nan).astype(np.float32)
-    return CanonicalView(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), mask, 0.002, tf.from_rpy(0.1, 0.2, 0.3, [1, 2, 3]), kind, depth, 0.75)
+    return CanonicalView(
+        rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), mask, 0.002, tf.from_rpy(0.1, 0.2, 0.3, [1, 2, 3]), kind, depth, 0.75
+    )
 
 
 def contact():
     v = view()
-    return Contact(np.array([3.0, 2.5]), tf.unit([1.0, -1.0]), 0.012, True, 0.004, contact_frame(v, np.array([3.0, 2.5]), tf.unit([1.0, -1.0])))
+    return Contact(
+        np.array([3.0, 2.5]), tf.unit([1.0, -1.0]), 0.012, True, 0.004, contact_frame(v, np.array([3.0, 2.5]), tf.unit([1.0, -1.0]))
+    )
 
 
 def same_view(a, b):
@@ -215,11 +222,20 @@ def test_mesh_colours_of_the_wrong_length():
 
 @pytest.mark.parametrize("with_target", [True, False])
 def test_candidates(with_target):
-    before = ContactCandidate("object_1", contact(), contact() if with_target else None, 1.5, True, 0.5, 0.25, 0.75, tf.from_rpy(0.3, 0, 0, [1, 0, 0]))
+    before = ContactCandidate(
+        "object_1", contact(), contact() if with_target else None, 1.5, True, 0.5, 0.25, 0.75, tf.from_rpy(0.3, 0, 0, [1, 0, 0])
+    )
     pose = tf.from_rpy(0, 0, 0.5, [0.2, 0, 0])
     msg = cv.candidate_to_msg(before, pose)
     after = cv.candidate_from_msg(msg)
-    assert (after.tool_id, after.rotation, after.flipped, after.s_dino, after.s_curv, after.score) == ("object_1", 1.5, True, 0.5, 0.25, 0.75)
+    assert (after.tool_id, after.rotation, after.flipped, after.s_dino, after.s_curv, after.score) == (
+        "object_1",
+        1.5,
+        True,
+        0.5,
+        0.25,
+        0.75,
+    )
     assert (after.target is not None) == with_target
     np.testing.assert_allclose(after.tool.object_from_contact, before.tool.object_from_contact, atol=1e-9)
     assert after.tool.signed_curvature == pytest.approx(-1 / 0.012)
@@ -229,12 +245,25 @@ def test_candidates(with_target):
 
 def plan(variant):
     times = np.array([0.0, 0.5, 1.25])
-    motion = ToolMotion(times, np.stack([tf.from_rpy(0, 0, t, [t, 0, 0]) for t in times]), (Phase("contact", 0.0, 0.5), Phase("goal", 0.5, 1.25)))
+    motion = ToolMotion(
+        times, np.stack([tf.from_rpy(0, 0, t, [t, 0, 0]) for t in times]), (Phase("contact", 0.0, 0.5), Phase("goal", 0.5, 1.25))
+    )
     if variant == "fg":
         return MotionPlan("fg", motion)
     rng = np.random.default_rng(3)
     names = tuple(f"panda_joint{i}" for i in range(1, 8))
-    arm = ArmMotion(times, names, rng.normal(size=(3, 7)), rng.normal(size=(3, 7)), rng.normal(size=(3, 7)), tf.from_rpy(1, 0, 0), 0.03, 0.25, None, motion.phases)
+    arm = ArmMotion(
+        times,
+        names,
+        rng.normal(size=(3, 7)),
+        rng.normal(size=(3, 7)),
+        rng.normal(size=(3, 7)),
+        tf.from_rpy(1, 0, 0),
+        0.03,
+        0.25,
+        None,
+        motion.phases,
+    )
     return MotionPlan("arm", motion, arm)
 
 

@@ -1,6 +1,7 @@
 """Result codes: one list in two languages, and messages that say what is allowed."""
 
 import pytest
+
 from magic_core.errors import Code, MagicError
 from magic_interfaces.msg import ResultCode
 

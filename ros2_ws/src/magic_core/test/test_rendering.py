@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+
 from magic_core import mesh as meshes
 from magic_core import transforms as tf
 from magic_core.camera import Intrinsics

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError

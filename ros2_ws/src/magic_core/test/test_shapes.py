@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
@@ -66,7 +67,11 @@ def test_the_regions_lie_on_the_surface_with_outward_normals(shape: Shape) -> No
 
 def test_the_radius_of_a_region_is_that_of_its_points(shape: Shape) -> None:
     for name, region in shape.regions.items():
-        if not np.isfinite(region.radius) or len(region.points) < 9 or name in ("handle", "handle_loop", "bowl_inside", "band", "ring_1", "ring_2"):
+        if (
+            not np.isfinite(region.radius)
+            or len(region.points) < 9
+            or name in ("handle", "handle_loop", "bowl_inside", "band", "ring_1", "ring_2")
+        ):
             continue  # not circles: the radius is that in the middle
         if shape.family in ("spoon", "ladle", "measuring_cup", "rod", "mug_tree"):
             continue
@@ -86,7 +91,7 @@ def test_a_contact_lies_on_the_outline_of_the_view(shape: Shape) -> None:
         u, v = np.round(inside).astype(int)
         assert view.mask[v, u], name
         u, v = np.round(outside).astype(int)
-        if not (shape.family == "watch"):
+        if shape.family != "watch":
             assert not view.mask[v, u], name
         # The contact frame: x along the normal, z into the picture.
         np.testing.assert_allclose(contact.object_from_contact[:3, 2], view.direction, atol=1e-9)
@@ -98,7 +103,9 @@ def test_volumes_against_formulas() -> None:
     )
     radius = SHAPES["sphere", 1].parameters["radius"]
     assert SHAPES["sphere", 1].mesh.to_trimesh().volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)
-    assert sum(volume(p.vertices, p.faces) for p in SHAPES["sphere", 1].pieces) == pytest.approx(SHAPES["sphere", 1].mesh.to_trimesh().volume, rel=1e-6)
+    assert sum(volume(p.vertices, p.faces) for p in SHAPES["sphere", 1].pieces) == pytest.approx(
+        SHAPES["sphere", 1].mesh.to_trimesh().volume, rel=1e-6
+    )
     arc = make("quarter_pipe", 0, radius=0.2, width=0.1, back=0.02)
     expected = 0.1 * (0.2**2 * (1 - np.pi / 4) + 0.02 * 0.2)
     assert arc.mesh.to_trimesh().volume == pytest.approx(expected, rel=0.01)
@@ -114,7 +121,9 @@ def test_an_l_hook_bends_where_its_parameters_say() -> None:
     assert region.concave and region.radius == 0.03
     _, normal = region.middle()
     np.testing.assert_allclose(normal, [-np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-9)
-    fitted = np.linalg.lstsq(np.column_stack([2 * region.points[:, :2], np.ones(25)]), (region.points[:, :2] ** 2).sum(axis=1), rcond=None)[0]
+    fitted = np.linalg.lstsq(np.column_stack([2 * region.points[:, :2], np.ones(25)]), (region.points[:, :2] ** 2).sum(axis=1), rcond=None)[
+        0
+    ]
     assert np.sqrt(fitted[2] + fitted[:2] @ fitted[:2]) == pytest.approx(0.03, rel=1e-6)
 
 
@@ -152,7 +161,9 @@ def test_the_same_seed_gives_the_same_object_and_another_seed_another() -> None:
     assert SHAPES["mug", 0].parameters != SHAPES["mug", 1].parameters
     # A given parameter leaves the others as the seed drew them.
     given = make("caliper", 1, opening=0.1)
-    assert {k: v for k, v in given.parameters.items() if k != "opening"} == {k: v for k, v in SHAPES["caliper", 1].parameters.items() if k != "opening"}
+    assert {k: v for k, v in given.parameters.items() if k != "opening"} == {
+        k: v for k, v in SHAPES["caliper", 1].parameters.items() if k != "opening"
+    }
 
 
 def test_there_are_134_different_mugs() -> None:
@@ -174,7 +185,7 @@ def test_the_section_of_a_spoon_is_its_profile() -> None:
     assert view.kind == "section"
     # Through the middle of the bowl the cut shows the wall only, not the rim behind it.
     bottom = spoon.region("bowl").middle(towards=(0, 0, 1))[0]
-    u, v = np.round(view.pixels(bottom)).astype(int)
+    u, _v = np.round(view.pixels(bottom)).astype(int)
     column = view.mask[:, u]
     assert column.sum() * view.metres_per_pixel == pytest.approx(0.004, abs=2 * view.metres_per_pixel)
     area = view.mask.sum() * view.metres_per_pixel**2

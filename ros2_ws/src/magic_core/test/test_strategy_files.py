@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import yaml
+
 from magic_core import strategy as strategies
 from magic_core import transforms as tf
 from magic_core.contact import Contact, contact_frame
@@ -18,7 +19,9 @@ def make():
     def view(kind):
         mask = np.zeros((32, 32), bool)
         mask[8:24, 8:24] = True
-        return CanonicalView(rng.integers(0, 256, (32, 32, 3), dtype=np.uint8), mask, 0.001, tf.from_rpy(np.pi, 0, 0.3, [0.01, 0.02, 0.03]), kind)
+        return CanonicalView(
+            rng.integers(0, 256, (32, 32, 3), dtype=np.uint8), mask, 0.001, tf.from_rpy(np.pi, 0, 0.3, [0.01, 0.02, 0.03]), kind
+        )
 
     def contact(of, radius, concave):
         pixel, normal = np.array([23.5, 16.0]), np.array([1.0, 0.0])
@@ -71,7 +74,9 @@ def test_everything_comes_back(folder):
         np.testing.assert_allclose(getattr(after, name).object_from_contact, getattr(before, name).object_from_contact, atol=1e-9)
         assert getattr(after, name).radius == getattr(before, name).radius
         assert getattr(after, name).concave == getattr(before, name).concave
-    assert [(w.name, w.phase, w.speed, w.offset.tolist()) for w in after.waypoints] == [(w.name, w.phase, w.speed, w.offset.tolist()) for w in before.waypoints]
+    assert [(w.name, w.phase, w.speed, w.offset.tolist()) for w in after.waypoints] == [
+        (w.name, w.phase, w.speed, w.offset.tolist()) for w in before.waypoints
+    ]
     np.testing.assert_allclose(after.target_mesh.extents, 2 * after.tool_mesh.extents, rtol=1e-6)
 
 

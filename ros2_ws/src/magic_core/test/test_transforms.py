@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from magic_core import transforms as tf
 
 number = st.floats(-10, 10, allow_nan=False)

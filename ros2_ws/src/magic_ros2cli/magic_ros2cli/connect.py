@@ -46,7 +46,7 @@ def settle(made: Any, query: Callable[[], T], longest: float = 5.0) -> T:
         if state != before:
             changed = now
         others = len(state[0]) > 1
-        if now - changed >= SETTLED and (others or now - start >= EMPTY) or now - start >= longest:
+        if (now - changed >= SETTLED and (others or now - start >= EMPTY)) or now - start >= longest:
             return state[1]
         time.sleep(0.05)
 

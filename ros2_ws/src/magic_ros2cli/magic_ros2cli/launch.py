@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ctypes
 import os
 import queue
@@ -177,7 +178,11 @@ class Launcher:
             if running.child is not None and not running.ended and running.child.poll() is None:
                 level = "INFO" if stage == 1 else "ERROR"
                 if stage > 1:
-                    self._say(level, running.label, f"process[{running.label}] failed to terminate '{ESCALATION * (stage - 1):.0f}' seconds after SIGINT")
+                    self._say(
+                        level,
+                        running.label,
+                        f"process[{running.label}] failed to terminate '{ESCALATION * (stage - 1):.0f}' seconds after SIGINT",
+                    )
                 self._say(level, running.label, f"sending signal '{signal.Signals(number).name}' to process[{running.label}]")
                 self._signal(running, number)
 
@@ -226,7 +231,10 @@ class Launcher:
             return
         self._say("INFO", running.label, f"process started with pid [{running.child.pid}]")
         running.readers = []
-        for stream, on_screen in ((running.child.stdout, process.output in ("screen", "both")), (running.child.stderr, process.output != "own_log")):
+        for stream, on_screen in (
+            (running.child.stdout, process.output in ("screen", "both")),
+            (running.child.stderr, process.output != "own_log"),
+        ):
             reader = threading.Thread(target=self._copy, args=(running.label, stream, on_screen), daemon=True)
             reader.start()
             running.readers.append(reader)
@@ -281,8 +289,5 @@ class Launcher:
             log.write(f"{time.time():.7f} {line}\n")
 
     def _line(self, line: str) -> None:
-        with self._print_lock:
-            try:
-                print(line, flush=True)
-            except (BrokenPipeError, ValueError):
-                pass
+        with self._print_lock, contextlib.suppress(BrokenPipeError, ValueError):
+            print(line, flush=True)

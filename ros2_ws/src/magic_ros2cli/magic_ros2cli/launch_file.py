@@ -85,7 +85,9 @@ def find(package: str, name: str) -> Path:
     if not found:
         raise CommandError(f"file '{name}' was not found in the share directory of package '{package}' which is at '{share}'")
     if len(found) > 1:
-        raise CommandError(f"file '{name}' was found more than once in the share directory of package '{package}': {', '.join(map(str, found))}")
+        raise CommandError(
+            f"file '{name}' was found more than once in the share directory of package '{package}': {', '.join(map(str, found))}"
+        )
     return found[0]
 
 
@@ -163,7 +165,9 @@ class _Reader:
                 if self.declared_only:
                     return
                 about = f" (description: '{argument.description}')" if argument.description else ""
-                raise CommandError(f"Included launch description missing required argument '{name}'{about}, given: [{', '.join(scope.configurations)}]")
+                raise CommandError(
+                    f"Included launch description missing required argument '{name}'{about}, given: [{', '.join(scope.configurations)}]"
+                )
             scope.configurations[name] = default
         value = scope.configurations[name]
         if choices and value not in choices:
@@ -277,7 +281,11 @@ class _Reader:
             if not nested:
                 raise self.wrong(f"<param name={name!r}> has no value")
             return nested
-        return [Parameters(name=name, value=self.typed(name, self.attribute(entity, "value", scope), self.attribute(entity, "type", scope, "auto")))]
+        return [
+            Parameters(
+                name=name, value=self.typed(name, self.attribute(entity, "value", scope), self.attribute(entity, "type", scope, "auto"))
+            )
+        ]
 
     def typed(self, name: str, text: str, kind: str) -> Any:
         import yaml
@@ -390,7 +398,9 @@ class _Reader:
                 return arguments[1]
             if self.declared_only:
                 return f"$(var {arguments[0]})"
-            raise self.wrong(f"launch configuration '{arguments[0]}' does not exist (there are: {', '.join(sorted(scope.configurations)) or 'none'})")
+            raise self.wrong(
+                f"launch configuration '{arguments[0]}' does not exist (there are: {', '.join(sorted(scope.configurations)) or 'none'})"
+            )
         if name == "env":
             count(1, 2)
             value = scope.environment.get(arguments[0], os.environ.get(arguments[0], arguments[1] if len(arguments) > 1 else None))
@@ -422,7 +432,17 @@ class _Reader:
         if name == "eval":
             expression = " ".join(arguments)
             try:
-                allowed = {"__builtins__": {}, "math": math, "str": str, "int": int, "float": float, "bool": bool, "len": len, "min": min, "max": max}
+                allowed = {
+                    "__builtins__": {},
+                    "math": math,
+                    "str": str,
+                    "int": int,
+                    "float": float,
+                    "bool": bool,
+                    "len": len,
+                    "min": min,
+                    "max": max,
+                }
                 return str(eval(expression, allowed))
             except Exception as error:
                 raise self.wrong(f"$(eval {expression}): {type(error).__name__}: {error}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import sys
 import time
@@ -169,7 +170,7 @@ def topic_hz(arguments: list[str]) -> int:
                 continue
             seen = stamps[-1]
             times = list(stamps)
-            gaps = [b - a for a, b in zip(times, times[1:], strict=False)]
+            gaps = [b - a for a, b in itertools.pairwise(times)]
             mean = sum(gaps) / len(gaps)
             deviation = math.sqrt(sum((g - mean) ** 2 for g in gaps) / len(gaps))
             print(f"average rate: {1.0 / mean:.3f}" if mean > 0 else "average rate: inf")

@@ -1,11 +1,11 @@
 """A node with one of everything, for the tests of the ros2 command; run as a process of its own."""
 
+import contextlib
 import signal
 import sys
 import time
 
 import rclpy
-from magic_interfaces.action import RunStrategy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.executors import MultiThreadedExecutor
@@ -14,6 +14,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+
+from magic_interfaces.action import RunStrategy
 
 
 class SmallNode(Node):
@@ -62,10 +64,8 @@ def main() -> None:
     node = SmallNode()
     executor.add_node(node)
     print("ready", flush=True)
-    try:
+    with contextlib.suppress(KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         executor.spin()
-    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
-        pass
 
 
 if __name__ == "__main__":

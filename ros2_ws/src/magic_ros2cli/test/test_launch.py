@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+
 from magic_ros2cli import launch_file
 from magic_ros2cli.errors import CommandError
 from magic_ros2cli.launch import Launcher, describe

@@ -88,7 +88,7 @@ def test_help_and_unknown_words() -> None:
 
 def test_run_replaces_itself_by_the_executable(tmp_path: Path) -> None:
     assert ros2("run", "no_such_package", "x").stderr == "Package 'no_such_package' not found\n"
-    prefix = fake_package(tmp_path, "#!/bin/sh\necho $$ \"$@\"\nexit 7\n")
+    prefix = fake_package(tmp_path, '#!/bin/sh\necho $$ "$@"\nexit 7\n')
     environment = {**ENVIRONMENT, "AMENT_PREFIX_PATH": f"{prefix}:{ENVIRONMENT['AMENT_PREFIX_PATH']}"}
     with subprocess.Popen([*ROS2, "run", "fake", "tool", "-a", "b c"], env=environment, stdout=subprocess.PIPE, text=True) as process:
         text, _ = process.communicate(timeout=TIMEOUT)

@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from magic_core.shapes.shape import Shape
 
 _PAINTS: tuple[Color, ...] = (
-    (196, 60, 52), (52, 98, 180), (60, 140, 80), (222, 168, 50), (120, 70, 150), (60, 60, 66), (225, 225, 220), (230, 120, 60), (60, 160, 170), (200, 110, 140),
+    (196, 60, 52),
+    (52, 98, 180),
+    (60, 140, 80),
+    (222, 168, 50),
+    (120, 70, 150),
+    (60, 60, 66),
+    (225, 225, 220),
+    (230, 120, 60),
+    (60, 160, 170),
+    (200, 110, 140),
 )
 _METALS: tuple[Color, ...] = ((168, 172, 178), (140, 144, 150), (188, 186, 180), (110, 112, 118))
 _WOODS: tuple[Color, ...] = ((176, 130, 84), (150, 104, 62), (205, 166, 118))
@@ -41,7 +50,9 @@ class Draw:
         value = float(self._random.uniform(low, high))
         given = self._given.get(name, value)
         if isinstance(given, str) or not np.isfinite(given) or given < 0:
-            raise MagicError(Code.BAD_REQUEST, f"{name} of a {self._family}", given, f"a number from 0 up (usually {low:.4g} to {high:.4g})")
+            raise MagicError(
+                Code.BAD_REQUEST, f"{name} of a {self._family}", given, f"a number from 0 up (usually {low:.4g} to {high:.4g})"
+            )
         self.parameters[name] = float(given)
         return float(given)
 
@@ -85,7 +96,9 @@ def recipe(make: Callable[..., Shape]) -> Callable[..., Shape]:
         try:
             return make(seed, **given)
         except (ValueError, ArithmeticError) as error:
-            raise MagicError(Code.BAD_REQUEST, f"{make.__name__} {seed} with {given}", str(error), "sizes that give a closed solid") from error
+            raise MagicError(
+                Code.BAD_REQUEST, f"{make.__name__} {seed} with {given}", str(error), "sizes that give a closed solid"
+            ) from error
 
     checked.__name__, checked.__doc__ = make.__name__, make.__doc__
     return checked

@@ -62,5 +62,7 @@ def fixtures(environment: Mapping[str, Any], target_contact: ArrayLike) -> list[
             pose = transforms.make(translation=foot) @ pose_from_data(entry["from_target"])
             result.append(shape.as_object(str(entry["id"]), pose))
         except (KeyError, TypeError, ValueError) as error:
-            raise MagicError(Code.BAD_STRATEGY, "environment: fixtures", str(error), "id, family, from_target and, if wanted, seed and parameters") from error
+            raise MagicError(
+                Code.BAD_STRATEGY, "environment: fixtures", str(error), "id, family, from_target and, if wanted, seed and parameters"
+            ) from error
     return result

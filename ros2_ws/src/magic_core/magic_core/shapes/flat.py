@@ -60,7 +60,11 @@ def l_hook(seed: int = 0, **given: float | str) -> Shape:
     outline = stroke(np.concatenate([[start], turn, [end]]), width, flat_ends=True)
     regions = {
         "inner": _bend(centre, inner, -np.pi / 2, -np.pi / 2 + bend, True),
-        "tip_inner": _straight(turn[-1] + leave * 0.1 * tip - width / 2 * _turn([leave], -np.pi / 2)[0], end - leave * 0.1 * tip - width / 2 * _turn([leave], -np.pi / 2)[0], _turn([leave], np.pi / 2)[0]),
+        "tip_inner": _straight(
+            turn[-1] + leave * 0.1 * tip - width / 2 * _turn([leave], -np.pi / 2)[0],
+            end - leave * 0.1 * tip - width / 2 * _turn([leave], -np.pi / 2)[0],
+            _turn([leave], np.pi / 2)[0],
+        ),
     }
     return assemble("l_hook", seed, d.parameters, [plate(outline, -thickness / 2, thickness / 2, color)], regions, "top", DOWN, UP)
 
@@ -170,7 +174,12 @@ def scissors(seed: int = 0, **given: float | str) -> Shape:
     grips = grips.difference(shapely.union_all(holes))
     parts = [
         plate(grips, -thickness / 2, thickness / 2, color),
-        plate(steel.difference(grips.buffer(-0.004)) if steel.difference(grips.buffer(-0.004)).geom_type == "Polygon" else steel, -thickness * 0.4, thickness * 0.4, metal),
+        plate(
+            steel.difference(grips.buffer(-0.004)) if steel.difference(grips.buffer(-0.004)).geom_type == "Polygon" else steel,
+            -thickness * 0.4,
+            thickness * 0.4,
+            metal,
+        ),
     ]
     regions = {}
     # Where the inner edges of the blades meet, and half the angle between them.
@@ -219,7 +228,9 @@ def caliper(seed: int = 0, **given: float | str) -> Shape:
     moving = shapely.union_all(
         [
             shapely.box(back - slider, -y - lip, back, y + lip),
-            shapely.Polygon([(back, y), (back, y + jaw), (back - 0.3 * jaw_width, y + jaw), (back - jaw_width, y + jaw * 0.5), (back - jaw_width, y)]),
+            shapely.Polygon(
+                [(back, y), (back, y + jaw), (back - 0.3 * jaw_width, y + jaw), (back - jaw_width, y + jaw * 0.5), (back - jaw_width, y)]
+            ),
             shapely.Polygon([(back, -y), (back, -y - small), (back - 0.3 * jaw_width, -y - small), (back - jaw_width, -y)]),
         ]
     )
@@ -274,7 +285,9 @@ def hammer(seed: int = 0, **given: float | str) -> Shape:
     d.done()
     x0, x1 = handle, handle + head_width
     y = head / 2
-    back = [(x1, y * 0.4), (x1 - head_width * 0.15, y), (x0 + head_width * 0.3, y), (x0, y * 0.4)] if claw == "wedge" else [(x1, y), (x0, y)]
+    back = (
+        [(x1, y * 0.4), (x1 - head_width * 0.15, y), (x0 + head_width * 0.3, y), (x0, y * 0.4)] if claw == "wedge" else [(x1, y), (x0, y)]
+    )
     outline = shapely.Polygon([(x0, -y), (x1, -y), *back])
     parts = [
         plate(stroke([(width / 2, 0), (x0 + head_width * 0.5, 0)], width), -thickness / 2, thickness / 2, color),
@@ -297,13 +310,19 @@ _LETTERS: dict[str, tuple[list[list[tuple[float, float]]], list[tuple[tuple[floa
     "C": ([[(4, 6), (0, 6), (0, 0), (4, 0)]], [((0, 0), 45, 45), ((0, 6), -45, 45)]),
     "E": ([[(4, 6), (0, 6), (0, 0), (4, 0)], [(0, 3), (3, 3)]], [((0, 0), 45, 45), ((0, 6), -45, 45), ((0, 3), 45, 45), ((0, 3), -45, 45)]),
     "F": ([[(4, 6), (0, 6), (0, 0)], [(0, 3), (3, 3)]], [((0, 6), -45, 45), ((0, 3), 45, 45), ((0, 3), -45, 45)]),
-    "H": ([[(0, 0), (0, 6)], [(4, 0), (4, 6)], [(0, 3), (4, 3)]], [((0, 3), 45, 45), ((0, 3), -45, 45), ((4, 3), 135, 45), ((4, 3), -135, 45)]),
+    "H": (
+        [[(0, 0), (0, 6)], [(4, 0), (4, 6)], [(0, 3), (4, 3)]],
+        [((0, 3), 45, 45), ((0, 3), -45, 45), ((4, 3), 135, 45), ((4, 3), -135, 45)],
+    ),
     "I": ([[(0, 0), (0, 6)]], []),
     "L": ([[(0, 6), (0, 0), (4, 0)]], [((0, 0), 45, 45)]),
     "T": ([[(0, 6), (4, 6)], [(2, 6), (2, 0)]], [((2, 6), -45, 45), ((2, 6), -135, 45)]),
     "U": ([[(0, 6), (0, 0), (4, 0), (4, 6)]], [((0, 0), 45, 45), ((4, 0), 135, 45)]),
     "V": ([[(0, 6), (2, 0), (4, 6)]], [((2, 0), 90, float(np.rad2deg(np.arctan2(2, 6))))]),
-    "X": ([[(0, 6), (4, 0)], [(0, 0), (4, 6)]], [((2, 3), a, h) for a, h in ((90, 33.690067526), (-90, 33.690067526), (0, 56.309932474), (180, 56.309932474))]),
+    "X": (
+        [[(0, 6), (4, 0)], [(0, 0), (4, 6)]],
+        [((2, 3), a, h) for a, h in ((90, 33.690067526), (-90, 33.690067526), (0, 56.309932474), (180, 56.309932474))],
+    ),
     "Z": ([[(0, 6), (4, 6), (0, 0), (4, 0)]], [((4, 6), -180 + 28.154966, 28.154966), ((0, 0), 28.154966, 28.154966)]),
 }
 

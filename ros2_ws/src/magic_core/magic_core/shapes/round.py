@@ -52,9 +52,15 @@ def _handle(form: str, low: float, high: float, reach: float, start_x: float, lo
         t = np.linspace(np.pi / 2, -np.pi / 2, 19)
         line = np.column_stack([start_x + reach * np.cos(t), middle + half * np.sin(t)])
     elif form == "D":
-        line = _rounded(np.array([(start_x, high), (start_x + reach, high - 0.05 * half), (start_x + reach, low + 0.35 * half), (low_x, low)]), min(0.45 * reach, 0.6 * half), 7)
+        line = _rounded(
+            np.array([(start_x, high), (start_x + reach, high - 0.05 * half), (start_x + reach, low + 0.35 * half), (low_x, low)]),
+            min(0.45 * reach, 0.6 * half),
+            7,
+        )
     elif form == "square":
-        line = _rounded(np.array([(start_x, high), (start_x + reach, high), (start_x + reach, low), (low_x, low)]), min(0.25 * reach, 0.25 * half), 4)
+        line = _rounded(
+            np.array([(start_x, high), (start_x + reach, high), (start_x + reach, low), (low_x, low)]), min(0.25 * reach, 0.25 * half), 4
+        )
     else:  # ear: wide above, running in to the body below
         t = np.linspace(0, 1, 19)
         x = start_x + reach * np.sin(np.pi * t**0.75) ** 0.75 * (1 - 0.35 * t)
@@ -221,7 +227,11 @@ def mug_tree(seed: int = 0, **given: float | str) -> Shape:
     """A post with inclined pegs, the first towards -x; regions ``peg_1``, ...: the pegs' tops."""
     d = Draw("mug_tree", seed, given)
     height, post = d.real("height", 0.34, 0.42), d.real("post", 0.010, 0.014)
-    peg, length, incline = d.real("peg_radius", 0.005, 0.008), d.real("peg_length", 0.08, 0.12), d.real("incline", np.deg2rad(20), np.deg2rad(45))
+    peg, length, incline = (
+        d.real("peg_radius", 0.005, 0.008),
+        d.real("peg_length", 0.08, 0.12),
+        d.real("incline", np.deg2rad(20), np.deg2rad(45)),
+    )
     count = int(d.choice("pegs", ("1", "2", "4", "6")))
     foot = d.real("foot", 0.07, 0.09)
     color = d.wood()
@@ -289,7 +299,9 @@ def cylinder(seed: int = 0, **given: float | str) -> Shape:
     part = turned([-half, half], [radius, radius], color, sectors=64, piece_sectors=64)
     angle = np.linspace(0, 2 * np.pi, 65)
     normals = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    return assemble("cylinder", seed, d.parameters, [part], {"side": Region(radius * normals, normals, radius, False)}, "top", (0, 0, -1), FORWARD)
+    return assemble(
+        "cylinder", seed, d.parameters, [part], {"side": Region(radius * normals, normals, radius, False)}, "top", (0, 0, -1), FORWARD
+    )
 
 
 def sphere(seed: int = 0, **given: float | str) -> Shape:

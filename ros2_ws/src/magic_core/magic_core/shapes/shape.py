@@ -102,7 +102,9 @@ class Shape:
             raise MagicError(Code.BAD_REQUEST, f"region of a {self.family}", name, tuple(self.regions))
         return self.regions[name]
 
-    def contact(self, name: str, view: CanonicalView | None = None, towards: ArrayLike | None = None, scale: float | None = None) -> Contact:
+    def contact(
+        self, name: str, view: CanonicalView | None = None, towards: ArrayLike | None = None, scale: float | None = None
+    ) -> Contact:
         """A contact in the middle of a region (or where its normal is nearest to ``towards``), from the analytic shape.
 
         scale: motion functional scale in metres; by default 3.5 times the radius, within a twentieth and a quarter of the object.

@@ -37,7 +37,9 @@ class Part:
 
     def moved(self, transform: Array) -> Part:
         """The part mapped by a rigid transform (4, 4)."""
-        return Part(transforms.apply(transform, self.vertices), self.faces, tuple(p.transformed(transform) for p in self.pieces), self.color)
+        return Part(
+            transforms.apply(transform, self.vertices), self.faces, tuple(p.transformed(transform) for p in self.pieces), self.color
+        )
 
 
 def hull(points: ArrayLike) -> Mesh:
@@ -221,7 +223,9 @@ def turned(z: ArrayLike, radius: ArrayLike, color: Color, sectors: int = 48, pie
 
     def rings(count: int) -> Array:
         angle = np.arange(count) * 2 * np.pi / count
-        return np.stack([np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(count, h)]) for h, r in zip(z, radius, strict=True)])
+        return np.stack(
+            [np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(count, h)]) for h, r in zip(z, radius, strict=True)]
+        )
 
     solid = loft(rings(sectors), color)
     pieces = loft(rings(piece_sectors), color).pieces
@@ -265,7 +269,16 @@ def cup(z: Array, outer: Array, inner: Array, floor: float, color: Color, sector
     return Part(vertices, _outward(vertices, np.concatenate(faces)), tuple(pieces), color)
 
 
-def bowl(half: tuple[float, float], depth: float, wall: float, power: float, color: Color, sectors: int = 48, piece_sectors: int = 16, levels: int = 6) -> Part:
+def bowl(
+    half: tuple[float, float],
+    depth: float,
+    wall: float,
+    power: float,
+    color: Color,
+    sectors: int = 48,
+    piece_sectors: int = 16,
+    levels: int = 6,
+) -> Part:
     """An open shell, rim at z = 0 about the origin, bottom of the inside at z = -depth.
 
     Its inside is (|x/a| ^ 2 + |y/b| ^ 2) ^ (power / 2) + |z / depth| ^ power = 1: an ellipsoid
@@ -297,7 +310,10 @@ def bowl(half: tuple[float, float], depth: float, wall: float, power: float, col
     for s in range(rows - 1, 0, -1):
         band((rows + s) * sectors, (rows + s - 1) * sectors)
     low, high = 2 * rows * sectors, 2 * rows * sectors + 1
-    faces += [np.column_stack([np.full(sectors, low), j, i]), np.column_stack([np.full(sectors, high), rows * sectors + i, rows * sectors + j])]
+    faces += [
+        np.column_stack([np.full(sectors, low), j, i]),
+        np.column_stack([np.full(sectors, high), rows * sectors + i, rows * sectors + j]),
+    ]
     coarse = np.linspace(0, np.pi / 2, levels + 1)
     a, b = surface(coarse, piece_sectors, 0.0), surface(coarse, piece_sectors, wall)
     pieces = []
@@ -314,7 +330,10 @@ def ball(radius: float, color: Color, sectors: int = 48) -> Part:
     def rings(count: int) -> Array:
         u = np.linspace(0, np.pi, count // 2 + 1)[1:-1]
         angle = np.arange(count) * 2 * np.pi / count
-        body = np.stack([np.sin(u)[:, None] * np.cos(angle), np.sin(u)[:, None] * np.sin(angle), np.broadcast_to(np.cos(u)[:, None], (len(u), count))], -1)
+        body = np.stack(
+            [np.sin(u)[:, None] * np.cos(angle), np.sin(u)[:, None] * np.sin(angle), np.broadcast_to(np.cos(u)[:, None], (len(u), count))],
+            -1,
+        )
         return np.concatenate([body.reshape(-1, 3), [[0, 0, 1.0], [0, 0, -1.0]]]) * radius
 
     outer = hull(rings(sectors))
@@ -331,7 +350,9 @@ def join(parts: list[Part]) -> Mesh:
     if len(parts) == 1:
         return Mesh(parts[0].vertices, parts[0].faces).painted(parts[0].color)
     solids = [
-        manifold3d.Manifold(manifold3d.Mesh(np.ascontiguousarray(p.vertices, np.float32), np.ascontiguousarray(p.faces, np.uint32))).as_original()
+        manifold3d.Manifold(
+            manifold3d.Mesh(np.ascontiguousarray(p.vertices, np.float32), np.ascontiguousarray(p.faces, np.uint32))
+        ).as_original()
         for p in parts
     ]
     for part, solid in zip(parts, solids, strict=True):
