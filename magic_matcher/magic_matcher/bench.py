@@ -63,7 +63,9 @@ class Case:
 
     def reference(self) -> Reference:
         """The reference contact with its target's size."""
-        return make_reference(self.shown.view, self.contact.pixel, self.contact.normal, self.old / self.shown.view.metres_per_pixel, self.shown.contour)
+        return make_reference(
+            self.shown.view, self.contact.pixel, self.contact.normal, self.old / self.shown.view.metres_per_pixel, self.shown.contour
+        )
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,9 @@ def tile(case: Case, result: matching.MatchResult, works: NDArray[np.bool_]) -> 
     return small
 
 
-def run(name: str = "embedded", weights: str = "", count: int = 6, seed: int = 0, only: str = "", tools: tuple[str, ...] = ()) -> tuple[list[Row], NDArray[np.uint8]]:
+def run(
+    name: str = "embedded", weights: str = "", count: int = 6, seed: int = 0, only: str = "", tools: tuple[str, ...] = ()
+) -> tuple[list[Row], NDArray[np.uint8]]:
     """All variants on all cases: the rows and the contact sheet of ``full``."""
     kept: dict[tuple[str, str, str, str], list[tuple[bool, bool, bool, float]]] = {}
     sheet: dict[tuple[str, str, str], list[NDArray[np.uint8]]] = {}
@@ -196,7 +200,9 @@ def run(name: str = "embedded", weights: str = "", count: int = 6, seed: int = 0
             except MagicError as error:
                 print(f"{variant}: {case.job}, {case.source} to {case.family}: {error}", file=sys.stderr)
                 works, marked, seconds, result = np.zeros(1, bool), False, time.process_time() - start, None
-            kept.setdefault((variant, case.job, case.source, case.family), []).append((bool(works[0]), bool(works[:3].any()), marked, seconds))
+            kept.setdefault((variant, case.job, case.source, case.family), []).append(
+                (bool(works[0]), bool(works[:3].any()), marked, seconds)
+            )
             if variant == "full" and result is not None:
                 sheet.setdefault((case.job, case.source, case.family), []).append(tile(case, result, works))
     rows = [
@@ -236,10 +242,15 @@ def means(rows: list[Row]) -> list[dict[str, Any]]:
 def table(rows: list[Row]) -> str:
     """The figures as Markdown: the variants' means, then ``full`` by category pair."""
     lines = ["| variant | matches | first | first three | first on a marked region |", "| --- | --- | --- | --- | --- |"]
-    lines += [f"| {m['variant']} | {m['matches']} | {100 * m['first']:.1f} | {100 * m['third']:.1f} | {100 * m['marked']:.1f} |" for m in means(rows)]
+    lines += [
+        f"| {m['variant']} | {m['matches']} | {100 * m['first']:.1f} | {100 * m['third']:.1f} | {100 * m['marked']:.1f} |"
+        for m in means(rows)
+    ]
     lines += ["", "| job | reference | tool | n | first | first three | marked |", "| --- | --- | --- | --- | --- | --- | --- |"]
     lines += [
-        f"| {r.job} | {r.reference} | {r.tool} | {r.count} | {100 * r.first:.0f} | {100 * r.third:.0f} | {100 * r.marked:.0f} |" for r in rows if r.variant == "full"
+        f"| {r.job} | {r.reference} | {r.tool} | {r.count} | {100 * r.first:.0f} | {100 * r.third:.0f} | {100 * r.marked:.0f} |"
+        for r in rows
+        if r.variant == "full"
     ]
     return "\n".join(lines)
 

@@ -195,7 +195,9 @@ def connected(distance: NDArray[np.float64], once: NDArray[np.bool_], scales: ND
     return np.concatenate([backward[:, :-1], forward], axis=1)
 
 
-def clearance(contour: Contour, points: NDArray[np.float64], directions: NDArray[np.float64], reach: ArrayLike, steps: int = 64) -> NDArray[np.float64]:
+def clearance(
+    contour: Contour, points: NDArray[np.float64], directions: NDArray[np.float64], reach: ArrayLike, steps: int = 64
+) -> NDArray[np.float64]:
     """Distance (B,) from points (B, 2) on the edge along unit directions (B, 2) to the next edge; ``reach`` where there is none.
 
     The first 1.5 px, in which the ray leaves the edge it starts from, are passed over.
@@ -417,7 +419,9 @@ def estimate(
     if concave is not None and (usable & ((a < 0) == concave)).any():
         usable &= (a < 0) == concave
     if not usable.any():
-        raise MagicError(Code.NO_CURVATURE, "contour points around the contact", int(contour.lengths[contour.loop[index]]), "at least 5 on its edge")
+        raise MagicError(
+            Code.NO_CURVATURE, "contour points around the contact", int(contour.lengths[contour.loop[index]]), "at least 5 on its edge"
+        )
     curvature = arc_curvature(np.nan_to_num(a), extent)
     best, share = _functional_scale(value, usable, (a < 0), indices)
     scale, signed = float(scales[best]), float(curvature[best])

@@ -60,7 +60,10 @@ class Dinov2Features:
         except (OSError, ValueError, RuntimeError, KeyError) as error:
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise MagicError(
-                Code.FEATURE_WEIGHTS, f"weights {weights}: {reason}", None, "a hub name that can be reached, or a folder with config.json and model.safetensors"
+                Code.FEATURE_WEIGHTS,
+                f"weights {weights}: {reason}",
+                None,
+                "a hub name that can be reached, or a folder with config.json and model.safetensors",
             ) from error
         self._weights = str(weights)
         self._patch = int(config.patch_size)

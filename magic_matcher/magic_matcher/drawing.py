@@ -51,8 +51,12 @@ def draw_match(
             ends = [(_fixed(p[0]), _fixed(p[1])) for p in (point - along, point + along)]
             cv2.line(image, *ends, CIRCLE, 1, cv2.LINE_AA, _SHIFT)
         tip = point + 0.09 * side * normal
-        cv2.arrowedLine(image, tuple(int(round(v)) for v in point), tuple(int(round(v)) for v in tip), NORMAL, 2 if first else 1, cv2.LINE_AA, 0, 0.3)
-        cv2.circle(image, (_fixed(point[0]), _fixed(point[1])), _fixed(0.013 * side if first else 0.008 * side), CONTACT, -1, cv2.LINE_AA, _SHIFT)
+        cv2.arrowedLine(
+            image, tuple(int(round(v)) for v in point), tuple(int(round(v)) for v in tip), NORMAL, 2 if first else 1, cv2.LINE_AA, 0, 0.3
+        )
+        cv2.circle(
+            image, (_fixed(point[0]), _fixed(point[1])), _fixed(0.013 * side if first else 0.008 * side), CONTACT, -1, cv2.LINE_AA, _SHIFT
+        )
         if labels and not first:
             at = (int(round(point[0] + 0.015 * side)), int(round(point[1] - 0.015 * side)))
             cv2.putText(image, str(rank + 1), at, cv2.FONT_HERSHEY_SIMPLEX, 0.0012 * side, LABEL, 1, cv2.LINE_AA)

@@ -99,7 +99,9 @@ SIDED = ("well, probe", "well, size")
 LATERAL = ("mass across", "far across")
 
 
-def _sample_pyramid(soft: NDArray[np.float32], centres: NDArray[np.float64], normals: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.float32]:
+def _sample_pyramid(
+    soft: NDArray[np.float32], centres: NDArray[np.float64], normals: NDArray[np.float64], radii: NDArray[np.float64]
+) -> NDArray[np.float32]:
     """Occupancy (B, R, SECTORS) around centres (B, 2) at radii (R,) px, each ring in a picture blurred to its own coarseness."""
     angle = np.arctan2(normals[:, 1], normals[:, 0])[:, None] + np.arange(SECTORS) * (2 * np.pi / SECTORS)
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -149,7 +151,9 @@ def _fit(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.floa
     best = np.zeros(len(points))
     for step in (1.0, 1.2, 1.45):
         at = points + step * probe * normals + margin
-        value = cv2.remap(room, at[None, :, 0].astype(np.float32), at[None, :, 1].astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        value = cv2.remap(
+            room, at[None, :, 0].astype(np.float32), at[None, :, 1].astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         best = np.maximum(best, value[0])
     return np.clip((best + 1.0) / probe, 0.0, 1.0)
 
@@ -243,7 +247,7 @@ def distances(reference: Description, found: Description, flipped: bool) -> NDAr
 
 def default_weights() -> NDArray[np.float64]:
     """Weights (len(DISTANCES),) by hand, for the training to start from."""
-    weights = {name: 1.0 for name in DISTANCES}
+    weights = dict.fromkeys(DISTANCES, 1.0)
     for name in DISTANCES:
         if name.startswith("wide"):
             weights[name] = 2.0
@@ -307,9 +311,7 @@ class EmbeddedFeatures:
         probe = probe_radius(reference.target_radius, size, share)
         return Prepared(describe(reference.contour, index, reference.normal[None], probe), reference.normal, share)
 
-    def dissimilarities(
-        self, prepared: Prepared, contour: Contour, target_radius: float | None
-    ) -> tuple[Description, NDArray[np.float64]]:
+    def dissimilarities(self, prepared: Prepared, contour: Contour, target_radius: float | None) -> tuple[Description, NDArray[np.float64]]:
         """Descriptions of the sampled contour points and their distances (2, B, D) to the reference, kept and mirrored."""
         stride = max(1, len(contour.points) // SAMPLES)
         indices = np.arange(0, len(contour.points), stride)
@@ -326,7 +328,9 @@ class EmbeddedFeatures:
         best = similarity.max(axis=0)
         chosen = suppress(found.points, best, SUPPRESSION * contour.size, count)
         proposals = tuple(
-            Proposal(found.points[i], rotation_between(prepared.normal, found.normals[i], bool(flipped[i])), bool(flipped[i]), float(best[i]))
+            Proposal(
+                found.points[i], rotation_between(prepared.normal, found.normals[i], bool(flipped[i])), bool(flipped[i]), float(best[i])
+            )
             for i in chosen
         )
         return GlobalMatch(proposals, paint(view.mask, found.points, best) if heatmap else None)

@@ -140,20 +140,30 @@ def make_reference(
     index = contour.nearest(pixel)
     away = float(np.hypot(*(contour.points[index] - pixel)))
     if away > 0.1 * contour.size:
-        raise MagicError(Code.POINT_OUTSIDE, "distance of the reference point from the object's edge", f"{away:.1f} px", f"at most {0.1 * contour.size:.1f} px")
+        raise MagicError(
+            Code.POINT_OUTSIDE,
+            "distance of the reference point from the object's edge",
+            f"{away:.1f} px",
+            f"at most {0.1 * contour.size:.1f} px",
+        )
     found = curvature.estimate(contour, index)
     return Reference(
-        view, found.point, found.normal if normal is None else np.asarray(normal, dtype=float), found.concave, found.radius, target_radius, contour
+        view,
+        found.point,
+        found.normal if normal is None else np.asarray(normal, dtype=float),
+        found.concave,
+        found.radius,
+        target_radius,
+        contour,
     )
 
 
 def from_strategy(strategy: Strategy) -> Reference:
     """The reference of a strategy: its tool's view and contact, and the target's radius at p_O."""
     radius = strategy.target_contact.radius / strategy.tool_view.metres_per_pixel
-    reference = make_reference(
+    return make_reference(
         strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius if np.isfinite(radius) else None
     )
-    return reference
 
 
 def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: Any) -> Features:
@@ -165,7 +175,10 @@ def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: 
 
         if not weights:
             raise MagicError(
-                Code.FEATURE_WEIGHTS, "weights", weights, "a hub name such as facebook/dinov2-base, or a folder with config.json and model.safetensors"
+                Code.FEATURE_WEIGHTS,
+                "weights",
+                weights,
+                "a hub name such as facebook/dinov2-base, or a folder with config.json and model.safetensors",
             )
         return Dinov2Features(weights if not Path(weights).expanduser().is_dir() else str(Path(weights).expanduser()), device, **options)
     from magic_matcher.embedded import EmbeddedFeatures

@@ -73,7 +73,9 @@ class PreparedGlobal:
     views: Views
 
 
-def view_matrix(rotation: float, flipped: bool, size: tuple[int, int], centre: NDArray[np.float64], out: int, scale: float) -> NDArray[np.float64]:
+def view_matrix(
+    rotation: float, flipped: bool, size: tuple[int, int], centre: NDArray[np.float64], out: int, scale: float
+) -> NDArray[np.float64]:
     """The affine map (2, 3) from picture pixels to those of a turned, mirrored, square view of side ``out``."""
     c, s = np.cos(rotation), np.sin(rotation)
     linear = scale * np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if flipped else 1.0, 1.0])
@@ -123,7 +125,8 @@ def patch_side(n: int, share: float = PATCH_SHARE) -> int:
 def box_sums(features: NDArray[np.float32], m: int) -> NDArray[np.float32]:
     """Sums (n, n, d) over the m x m neighbourhood of each token of a map (n, n, d), cut off at the border."""
     return np.stack(
-        [cv2.boxFilter(features[..., k], -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT) for k in range(features.shape[-1])], axis=-1
+        [cv2.boxFilter(features[..., k], -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT) for k in range(features.shape[-1])],
+        axis=-1,
     )
 
 
@@ -144,8 +147,12 @@ def aligned_similarity(patches: NDArray[np.float32], inside: NDArray[np.bool_], 
     m = patches.shape[1]
     with torch.inference_mode():
         kernel = torch.from_numpy(np.ascontiguousarray((patches * inside[..., None]).transpose(0, 3, 1, 2)))
-        total = torch.nn.functional.conv2d(torch.from_numpy(np.ascontiguousarray(features.transpose(2, 0, 1)))[None], kernel, padding=m // 2)[0]
-        there = torch.nn.functional.conv2d(torch.ones(1, 1, *features.shape[:2]), torch.from_numpy(inside.astype(np.float32))[:, None], padding=m // 2)[0]
+        total = torch.nn.functional.conv2d(
+            torch.from_numpy(np.ascontiguousarray(features.transpose(2, 0, 1)))[None], kernel, padding=m // 2
+        )[0]
+        there = torch.nn.functional.conv2d(
+            torch.ones(1, 1, *features.shape[:2]), torch.from_numpy(inside.astype(np.float32))[:, None], padding=m // 2
+        )[0]
         # A neighbourhood that the border cuts to a few tokens would win by chance: at least half of the patch counts.
         floor = torch.from_numpy(inside.sum(axis=(1, 2)).astype(np.float32))[:, None, None] / 2
         return (total / torch.maximum(there, floor).clamp(min=1)).numpy()
@@ -183,7 +190,9 @@ def _unit(tokens: NDArray[np.float32]) -> NDArray[np.float32]:
     return tokens / np.maximum(np.linalg.norm(tokens, axis=-1, keepdims=True), 1e-9)
 
 
-def prepare(view: CanonicalView, pixel: NDArray[np.float64], extract: Extract, out: int, views: Views, m_share: float = PATCH_SHARE) -> PreparedGlobal:
+def prepare(
+    view: CanonicalView, pixel: NDArray[np.float64], extract: Extract, out: int, views: Views, m_share: float = PATCH_SHARE
+) -> PreparedGlobal:
     """Features of a reference in all ``views``: patches around the contact, and the moments for the joint PCA."""
     pictures, _, matrices = draw(view, views, out)
     maps = extract(pictures)
@@ -252,7 +261,8 @@ def propose(
     chosen = suppress(flat_points, flat_scores, 0.1 * size, count)
     which = [c // (n * n) for c in chosen]
     proposals = tuple(
-        Proposal(flat_points[c], float(views.rotation[k]), bool(views.flipped[k]), float(flat_scores[c])) for c, k in zip(chosen, which, strict=True)
+        Proposal(flat_points[c], float(views.rotation[k]), bool(views.flipped[k]), float(flat_scores[c]))
+        for c, k in zip(chosen, which, strict=True)
     )
     heat = None
     if heatmap:

@@ -61,9 +61,7 @@ def centres(contour: Contour, radius: float) -> list[tuple[NDArray[np.float64], 
         curve = sampled[0]
         tangent = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
         normal = np.column_stack([tangent[:, 1], -tangent[:, 0]]) / np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
-        inner, outer = (
-            np.clip(np.rint(curve + sign * 2.0 * normal).astype(int), 0, np.array(room.shape)[::-1] - 1) for sign in (-1, 1)
-        )
+        inner, outer = (np.clip(np.rint(curve + sign * 2.0 * normal).astype(int), 0, np.array(room.shape)[::-1] - 1) for sign in (-1, 1))
         if np.sum(room[outer[:, 1], outer[:, 0]] - room[inner[:, 1], inner[:, 0]]) < 0:
             normal = -normal
         result.append((curve - margin, normal))

@@ -48,7 +48,9 @@ def decode(path: str | Path, name: str) -> NDArray[np.uint8]:
     elif data.ndim == 3 and data.shape[2] == 2:  # grey and alpha
         data = np.dstack([data[..., :1].repeat(3, axis=2), data[..., 1]])
     if min(data.shape[:2]) < SMALLEST:
-        raise MagicError(Code.BAD_REQUEST_IMAGE, f"size of {name} {path}", f"{data.shape[1]}x{data.shape[0]}", f"{SMALLEST} px or more a side")
+        raise MagicError(
+            Code.BAD_REQUEST_IMAGE, f"size of {name} {path}", f"{data.shape[1]}x{data.shape[0]}", f"{SMALLEST} px or more a side"
+        )
     return data
 
 
@@ -69,7 +71,9 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.bool_]:
         grey = cv2.cvtColor(np.ascontiguousarray(data[..., :3]), cv2.COLOR_BGR2GRAY)
         data = np.where(data[..., 3] > 127, grey, 0) if data.shape[2] == 4 else grey
     if data.shape != size:
-        raise MagicError(Code.BAD_REQUEST_IMAGE, f"size of mask {path}", f"{data.shape[1]}x{data.shape[0]}", f"that of its picture, {size[1]}x{size[0]}")
+        raise MagicError(
+            Code.BAD_REQUEST_IMAGE, f"size of mask {path}", f"{data.shape[1]}x{data.shape[0]}", f"that of its picture, {size[1]}x{size[0]}"
+        )
     if not data.any():
         raise MagicError(Code.EMPTY_MASK, f"mask {path}", "black all over", "a mask that is 255 on the object")
     return data > data.max() / 2
@@ -98,7 +102,10 @@ def mask_from_background(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     spread = float(np.percentile(distance[~inner], 100 * PLAIN_SHARE))
     if spread > 18:
         raise MagicError(
-            Code.EMPTY_MASK, "the picture's background is not plain: four fifths of its border differ from their median by up to", f"{spread:.0f} (CIELAB)", "18, or give a mask"
+            Code.EMPTY_MASK,
+            "the picture's background is not plain: four fifths of its border differ from their median by up to",
+            f"{spread:.0f} (CIELAB)",
+            "18, or give a mask",
         )
     threshold = max(12.0, 3 * spread)
     mask = (distance > threshold).astype(np.uint8)
@@ -107,9 +114,19 @@ def mask_from_background(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     if found is None:
         found = _large(_enclosed(image))
     if found is None:
-        raise MagicError(Code.EMPTY_MASK, "objects that stand out from the picture's plain background, by colour or by an outline", 0, "one, or give a mask")
+        raise MagicError(
+            Code.EMPTY_MASK,
+            "objects that stand out from the picture's plain background, by colour or by an outline",
+            0,
+            "one, or give a mask",
+        )
     if found.mean() > 0.95:
-        raise MagicError(Code.EMPTY_MASK, "share of the picture that stands out from its border", round(float(found.mean()), 3), "at most 0.95, or give a mask")
+        raise MagicError(
+            Code.EMPTY_MASK,
+            "share of the picture that stands out from its border",
+            round(float(found.mean()), 3),
+            "at most 0.95, or give a mask",
+        )
     return found
 
 

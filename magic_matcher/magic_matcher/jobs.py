@@ -145,7 +145,6 @@ class Example:
             result[i] = bool(np.any((distance < 1.6 * radius) & (offset @ normal > 0.75 * distance)))
         return result
 
-
     def works(self, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
         """Which contacts (N, 2) with outward normals would do the job with a target of ``radius`` px."""
         if self.job.needs == "region":
@@ -180,7 +179,9 @@ def example(job: str, family: str, seed: int, rough: bool = False) -> Example:
     if not rough:
         return Example(shape, view, true, JOBS[job], true)
     mask = roughen(view.mask, seed)
-    view = CanonicalView(np.where(mask[..., None], view.image, 0).astype(np.uint8), mask, view.metres_per_pixel, view.object_from_view, view.kind)
+    view = CanonicalView(
+        np.where(mask[..., None], view.image, 0).astype(np.uint8), mask, view.metres_per_pixel, view.object_from_view, view.kind
+    )
     return Example(shape, view, contours.extract(mask), JOBS[job], true)
 
 

@@ -69,7 +69,9 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     first = images.view(given.reference, given.reference_mask)
     second = images.view(given.target, given.target_mask)
     reference = features.make_reference(first, np.array(given.reference_point, dtype=float))
-    matcher = matching.Matcher(features.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None)
+    matcher = matching.Matcher(
+        features.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None
+    )
     contact = matching.to_contact(first, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
     result = matcher.match_views(reference, contact, [matching.Tool("target", second)], None, given.top, heatmap=True)
     data = {
@@ -84,7 +86,11 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
             "mask_pixels": int(first.mask.sum()),
         },
         "candidates": [record(reference, candidate) for candidate in result.candidates],
-        "target": {"size": [second.mask.shape[1], second.mask.shape[0]], "mask": "file" if given.target_mask else "background", "mask_pixels": int(second.mask.sum())},
+        "target": {
+            "size": [second.mask.shape[1], second.mask.shape[0]],
+            "mask": "file" if given.target_mask else "background",
+            "mask_pixels": int(second.mask.sum()),
+        },
         "units": "pixels and radians; normals point out of the material, v down",
         "features": result.features,
         "seconds": result.seconds,
@@ -93,7 +99,9 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     (out / "match.json").write_text(json.dumps(data, indent=1) + "\n")
     shown = [drawing.draw_match(first, contact), drawing.draw_match(second, [c.tool for c in result.candidates], result.heatmap)]
-    picture = drawing.side_by_side(shown, ("reference", f"target, best score {result.candidates[0].score:.3f}"), height=max(384, second.mask.shape[0]))
+    picture = drawing.side_by_side(
+        shown, ("reference", f"target, best score {result.candidates[0].score:.3f}"), height=max(384, second.mask.shape[0])
+    )
     files = {"match.png": cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)}
     if result.heatmap is not None:
         files["heatmap.png"] = np.rint(255 * np.clip(result.heatmap, 0, 1)).astype(np.uint8)
@@ -109,7 +117,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(prog="match_images", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--reference", required=True, metavar="R.png", help="picture of the reference tool")
-    p.add_argument("--reference-point", required=True, nargs=2, type=float, metavar=("U", "V"), help="its contact point, pixels right and down")
+    p.add_argument(
+        "--reference-point", required=True, nargs=2, type=float, metavar=("U", "V"), help="its contact point, pixels right and down"
+    )
     p.add_argument("--reference-mask", metavar="M.png", help="its mask, 255 on the tool; without one the background must be plain")
     p.add_argument("--target", required=True, metavar="T.png", help="picture of the new tool")
     p.add_argument("--target-mask", metavar="M.png", help="its mask")
@@ -135,7 +145,9 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(2)
     for k, candidate in enumerate(data["candidates"]):
         u, v = candidate["pixel"]
-        print(f"{k + 1}: pixel ({u:.1f}, {v:.1f})  score {candidate['score']:.3f}  s_dino {candidate['s_dino']:.3f}  s_curv {candidate['s_curv']:.3f}")
+        print(
+            f"{k + 1}: pixel ({u:.1f}, {v:.1f})  score {candidate['score']:.3f}  s_dino {candidate['s_dino']:.3f}  s_curv {candidate['s_curv']:.3f}"
+        )
 
 
 if __name__ == "__main__":

@@ -104,7 +104,9 @@ def parser() -> argparse.ArgumentParser:
     shown = p.add_mutually_exclusive_group(required=True)
     shown.add_argument("--strategy", help="name or folder of a strategy whose contact is carried over")
     shown.add_argument("--reference", metavar="MESH", help="mesh on which the contact is shown")
-    p.add_argument("--reference-point", nargs=2, type=float, metavar=("U", "V"), default=(0.0, 0.0), help="its contact, pixels of its canonical view")
+    p.add_argument(
+        "--reference-point", nargs=2, type=float, metavar=("U", "V"), default=(0.0, 0.0), help="its contact, pixels of its canonical view"
+    )
     p.add_argument("--reference-radius", type=float, help="radius of the target that the reference meets, m (default: --radius)")
     p.add_argument("--kind", default="side", choices=("top", "side", "section"), help="view, with --reference (default: side)")
     p.add_argument("--radius", type=float, required=True, help="radius of the target that the tools shall meet, m")

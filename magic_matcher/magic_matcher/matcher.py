@@ -7,9 +7,6 @@ import threading
 from pathlib import Path
 
 import numpy as np
-from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
-from magic_interfaces.msg import SceneObjectArray
-from magic_interfaces.srv import MatchContact
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 
@@ -20,6 +17,9 @@ from magic_core.mesh import Mesh
 from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.strategy import Strategy
+from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
+from magic_interfaces.msg import SceneObjectArray
+from magic_interfaces.srv import MatchContact
 from magic_matcher import features, matching
 from magic_matcher.cache import Cache
 from magic_matcher.features import BACKENDS
@@ -39,22 +39,32 @@ class MatcherNode(Node):
 
     def __init__(self) -> None:
         super().__init__("matcher")
-        name = nodes.parameter(self, "features", "auto", "feature backend: auto takes dinov2 where weights are named", choices=BACKENDS, read_only=True)
+        name = nodes.parameter(
+            self, "features", "auto", "feature backend: auto takes dinov2 where weights are named", choices=BACKENDS, read_only=True
+        )
         weights = nodes.parameter(self, "weights", "", "hub name or local folder of DINOv2 or DINOv3 weights", read_only=True)
         device = nodes.parameter(self, "device", "cpu", "torch device of the network", read_only=True)
         nodes.parameter(self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50)
-        weight = nodes.parameter(self, "curvature_weight", matching.score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True)
+        weight = nodes.parameter(
+            self, "curvature_weight", matching.score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True
+        )
         self._root = nodes.parameter(self, "strategies", "", "folder of strategies; empty: the installed ones", read_only=True)
-        cache = nodes.parameter(self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True)
+        cache = nodes.parameter(
+            self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True
+        )
         self._matcher = matching.Matcher(features.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
         self._scene: Scene | None = None
         self._strategies: dict[str, tuple[int, Strategy]] = {}
         self._lock = threading.Lock()
         # Requests run side by side; the objects come in beside them.
-        self.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=MutuallyExclusiveCallbackGroup())
+        self.create_subscription(
+            SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=MutuallyExclusiveCallbackGroup()
+        )
         self._warm_up()
         self.create_service(MatchContact, "match_contact", self._on_match, callback_group=ReentrantCallbackGroup())
-        self.get_logger().info(f"ready: features {self._matcher.backend.name}; waiting for objects on {self.resolve_topic_name('objects')} (requests with images need none)")
+        self.get_logger().info(
+            f"ready: features {self._matcher.backend.name}; waiting for objects on {self.resolve_topic_name('objects')} (requests with images need none)"
+        )
 
     def _warm_up(self) -> None:
         """Prepare the installed strategies' references, so that the first request is as quick as the rest."""
@@ -73,7 +83,10 @@ class MatcherNode(Node):
             # One match of a demonstration with itself, and one picture of a mesh, load what requests need beyond that.
             found = self._strategy(names[0])
             self._matcher.match(found, [matching.Tool("warm_up", found.tool_view)], found.target_view, 1)
-            corner = Mesh(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+            corner = Mesh(
+                np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]),
+                np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+            )
             canonical_view(corner, np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]), "top")
         except (IndexError, MagicError) as error:  # a request will be answered with the reason
             self.get_logger().debug(f"warm-up: {error}")
@@ -89,7 +102,9 @@ class MatcherNode(Node):
             try:
                 path = (Path(self._root) if self._root else strategy.installed_folder()) / name / "strategy.yaml"
             except LookupError as error:
-                raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, "the path of a strategy folder (magic_bringup is not installed)") from error
+                raise MagicError(
+                    Code.UNKNOWN_STRATEGY, "strategy", name, "the path of a strategy folder (magic_bringup is not installed)"
+                ) from error
         stamp = path.stat().st_mtime_ns if path.is_file() else 0
         with self._lock:
             kept = self._strategies.get(name)
@@ -161,7 +176,10 @@ class MatcherNode(Node):
     def _objects(self) -> Scene:
         if self._scene is None:
             raise MagicError(
-                Code.UNKNOWN_OBJECT, "objects", "none received yet", f"a SceneObjectArray on {self.resolve_topic_name('objects')}, or images in the request"
+                Code.UNKNOWN_OBJECT,
+                "objects",
+                "none received yet",
+                f"a SceneObjectArray on {self.resolve_topic_name('objects')}, or images in the request",
             )
         return self._scene
 

@@ -111,14 +111,18 @@ def target_contact(strategy: Strategy, view: CanonicalView, world_from_object: N
     normal = world_from_object[:3, :3].T @ strategy.target_normal
     picture = normal @ view.object_from_view[:3, :2]
     if np.linalg.norm(picture) < 0.1:
-        raise MagicError(Code.BAD_STRATEGY, "target normal", strategy.target_normal.round(3).tolist(), "a direction that is seen in the target's view")
+        raise MagicError(
+            Code.BAD_STRATEGY, "target normal", strategy.target_normal.round(3).tolist(), "a direction that is seen in the target's view"
+        )
     direction = picture / np.linalg.norm(picture)
     contour = contours.extract(view.mask)
     found = curvature.estimate(contour, support_point(contour, direction))
     contact = to_contact(view, found)
     # The normal asked for is the one acted along; the picture's own differs from it by raster noise only.
     if float(contact.normal @ direction) > np.cos(np.deg2rad(20)):
-        contact = Contact(contact.pixel, direction, contact.radius, contact.concave, contact.scale, contact_frame(view, contact.pixel, direction))
+        contact = Contact(
+            contact.pixel, direction, contact.radius, contact.concave, contact.scale, contact_frame(view, contact.pixel, direction)
+        )
     return contact
 
 
@@ -177,7 +181,7 @@ class Matcher:
         if key not in self._prepared:
             if len(self._prepared) >= 16:  # memory stays flat over any number of different references
                 self._prepared.pop(next(iter(self._prepared)))
-            make = lambda: self.backend.prepare(reference)  # noqa: E731
+            make = lambda: self.backend.prepare(reference)
             self._prepared[key] = self.cache.get(key, make) if self.cache is not None else make()
         return self._prepared[key]
 
@@ -241,7 +245,9 @@ class Matcher:
         if not found:
             if len(failures) == 1:
                 raise failures[0]
-            raise MagicError(Code.NO_MATCH, "tools without a usable contact", "; ".join(f.message for f in failures), "a tool with an edge to follow")
+            raise MagicError(
+                Code.NO_MATCH, "tools without a usable contact", "; ".join(f.message for f in failures), "a tool with an edge to follow"
+            )
         found.sort(key=lambda pair: -pair[0].score)
         return MatchResult(
             candidates=tuple(candidate for candidate, _ in found),
@@ -289,7 +295,9 @@ class Matcher:
                 )
             )
         if not candidates:
-            raise MagicError(Code.NO_MATCH, f"usable contacts on {tool.id or 'the tool'}", 0, "a tool with an edge of at least 5 points to fit")
+            raise MagicError(
+                Code.NO_MATCH, f"usable contacts on {tool.id or 'the tool'}", 0, "a tool with an edge of at least 5 points to fit"
+            )
         points = np.array([c.tool.pixel for c in candidates])
         order = features.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, top_k)
         return [candidates[i] for i in order]
@@ -320,7 +328,9 @@ def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id:
     else:
         rest = [item for item in scene.objects if item.id not in set(tool_ids)]
         if not rest:
-            raise MagicError(Code.UNKNOWN_OBJECT, "objects left to be the target", 0, "name a target_id, or have one more object on the table")
+            raise MagicError(
+                Code.UNKNOWN_OBJECT, "objects left to be the target", 0, "name a target_id, or have one more object on the table"
+            )
         target = choose_target(strategy, rest)
     if target.id in set(tool_ids):
         raise MagicError(Code.BAD_REQUEST, "target_id", target.id, "an object that is not one of tool_ids")
@@ -333,4 +343,18 @@ def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id:
     return tools, target
 
 
-__all__ = ["MatchResult", "Matcher", "Proposal", "Target", "Tool", "choose_target", "likeness", "match", "select", "support_point", "target_contact", "target_view", "tool_view"]
+__all__ = [
+    "MatchResult",
+    "Matcher",
+    "Proposal",
+    "Target",
+    "Tool",
+    "choose_target",
+    "likeness",
+    "match",
+    "select",
+    "support_point",
+    "target_contact",
+    "target_view",
+    "tool_view",
+]

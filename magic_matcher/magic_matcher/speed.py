@@ -92,7 +92,11 @@ def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[s
         match(matcher, tools[k % len(tools)])
     gc.collect()
     memory.append(resident())
-    result["memory"] = {"requests": requests, "resident_mb": [round(m, 1) for m in memory], "growth_mb": round(memory[-1] - memory[min(1, len(memory) - 1)], 1)}
+    result["memory"] = {
+        "requests": requests,
+        "resident_mb": [round(m, 1) for m in memory],
+        "growth_mb": round(memory[-1] - memory[min(1, len(memory) - 1)], 1),
+    }
     return result
 
 

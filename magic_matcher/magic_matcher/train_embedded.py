@@ -130,7 +130,12 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("embedded_weights.json"))
-    parser.add_argument("--left-out", type=Path, default=Path(__file__).with_name("embedded_left_out.json"), help="where the weights go that never saw one family")
+    parser.add_argument(
+        "--left-out",
+        type=Path,
+        default=Path(__file__).with_name("embedded_left_out.json"),
+        help="where the weights go that never saw one family",
+    )
     parser.add_argument("--per-family", type=int, default=20)
     parser.add_argument("--steps", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
@@ -163,7 +168,11 @@ def main() -> None:
         given.left_out.write_text(json.dumps({**about, "weights": kept}) + "\n")
     print("| job | tool | by hand | left out | fitted |\n| --- | --- | --- | --- | --- |")
     for job, family in sorted(by_hand):
-        print(f"| {job} | {family} | " + " | ".join(f"{100 * t.get((job, family), float('nan')):.0f}" for t in (by_hand, left_out, everything)) + " |")
+        print(
+            f"| {job} | {family} | "
+            + " | ".join(f"{100 * t.get((job, family), float('nan')):.0f}" for t in (by_hand, left_out, everything))
+            + " |"
+        )
     print("| mean | | " + " | ".join(f"{100 * np.mean(list(t.values()) or [np.nan]):.1f}" for t in (by_hand, left_out, everything)) + " |")
 
 

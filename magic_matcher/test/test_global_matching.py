@@ -51,7 +51,7 @@ def test_joint_pca_is_that_of_all_tokens():
     prepared = gm.PreparedGlobal(np.zeros((1, 1, 1, 6), np.float32), np.ones((1, 1, 1), bool), mean, scatter, count, gm.Views.all(1, False))
     centre, w = gm.joint_pca(prepared, b, 3)
     tokens = np.concatenate([a, b]).astype(float)
-    values, vectors = np.linalg.eigh(np.cov(tokens.T, bias=True))
+    _values, vectors = np.linalg.eigh(np.cov(tokens.T, bias=True))
     assert centre == pytest.approx(tokens.mean(axis=0), abs=1e-4)
     assert np.abs(np.sum(w * vectors[:, ::-1][:, :3], axis=0)) == pytest.approx(np.ones(3), abs=1e-3)
 

@@ -93,7 +93,9 @@ def test_meshes_from_files(tmp_path, capsys):
     tool = match_meshes.draw(tmp_path / "l_hook.obj", "top", True)
     point = shapes.make("l_hook", 4).contact("inner", tool.view).pixel
     common = ["--reference", str(tmp_path / "l_hook.obj"), "--kind", "top", "--as-is", "--radius", "0.02", "--out", str(tmp_path / "out")]
-    match_meshes.main([*common, "--reference-point", *map(str, point), "--tools", str(tmp_path / "caliper.obj"), str(tmp_path / "l_hook.obj")])
+    match_meshes.main(
+        [*common, "--reference-point", *map(str, point), "--tools", str(tmp_path / "caliper.obj"), str(tmp_path / "l_hook.obj")]
+    )
     data = json.loads((tmp_path / "out" / "matches.json").read_text())
     assert [len(row["candidates"]) > 0 for row in data["matches"]] == [True, True]
     assert np.hypot(*(np.array(data["matches"][1]["candidates"][0]["pixel"]) - point)) < 12

@@ -38,7 +38,9 @@ def moved(view: CanonicalView, angle, mirror):
 
 def test_the_reference_matches_itself(matcher):
     reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
-    result = matcher.match_views(reference, contact, [matching.Tool("same", reference.view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025)
+    result = matcher.match_views(
+        reference, contact, [matching.Tool("same", reference.view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025
+    )
     best = result.candidates[0]
     assert np.hypot(*(best.tool.pixel - contact.pixel)) < 4
     assert best.s_dino > 0.75 and best.s_curv > 0.8 and not best.flipped
@@ -50,7 +52,9 @@ def test_the_reference_matches_itself(matcher):
 def test_the_match_turns_with_the_tool(matcher, angle, mirror):
     reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
     view, linear, middle = moved(reference.view, angle, mirror)
-    result = matcher.match_views(reference, contact, [matching.Tool("t", view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025)
+    result = matcher.match_views(
+        reference, contact, [matching.Tool("t", view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025
+    )
     best = result.candidates[0]
     expected = linear @ (contact.pixel - middle) + middle + 100
     assert np.hypot(*(best.tool.pixel - expected)) < 5
@@ -61,7 +65,9 @@ def test_the_match_turns_with_the_tool(matcher, angle, mirror):
 def test_a_mirrored_match_aligns_the_turned_frame(matcher):
     reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
     view, _, _ = moved(reference.view, 0.0, True)
-    best = matcher.match_views(reference, contact, [matching.Tool("t", view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025).candidates[0]
+    best = matcher.match_views(
+        reference, contact, [matching.Tool("t", view)], jobs.disc_target(0.025, "top"), reference_target_radius=0.025
+    ).candidates[0]
     assert best.tool_from_reference @ contact.object_from_contact == pytest.approx(turned_over(best.tool.object_from_contact), abs=1e-9)
 
 
@@ -95,7 +101,9 @@ def test_contacts_go_to_the_functionally_same_place(matcher, job, family, region
 def test_candidates_are_different_places_best_first(matcher):
     reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
     tool = jobs.example("hooking", "caliper", 4)
-    result = matcher.match_views(reference, contact, [matching.Tool("c", tool.view)], jobs.disc_target(0.02, "top"), 5, reference_target_radius=0.025, heatmap=True)
+    result = matcher.match_views(
+        reference, contact, [matching.Tool("c", tool.view)], jobs.disc_target(0.02, "top"), 5, reference_target_radius=0.025, heatmap=True
+    )
     scores = [c.score for c in result.candidates]
     assert scores == sorted(scores, reverse=True) and len(scores) <= 5
     for i, a in enumerate(result.candidates):
@@ -147,7 +155,11 @@ def test_target_and_tools_are_chosen_where_none_is_named(demonstration):
     assert target.id == "cylinder" and [t.id for t in tools] == ["caliper", "l_hook"]
     tools, target = matching.select(scene, found, ["l_hook"], "")
     assert target.id == "cylinder" and [t.id for t in tools] == ["l_hook"]
-    for ids, name, code in ((["nothing"], "", Code.UNKNOWN_OBJECT), ([], "nothing", Code.UNKNOWN_OBJECT), (["cylinder"], "cylinder", Code.BAD_REQUEST)):
+    for ids, name, code in (
+        (["nothing"], "", Code.UNKNOWN_OBJECT),
+        ([], "nothing", Code.UNKNOWN_OBJECT),
+        (["cylinder"], "cylinder", Code.BAD_REQUEST),
+    ):
         with pytest.raises(MagicError) as caught:
             matching.select(scene, found, ids, name)
         assert caught.value.code == code

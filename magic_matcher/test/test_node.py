@@ -13,15 +13,15 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("magic_interfaces.srv")
 
-from magic_interfaces.msg import SceneObjectArray  # noqa: E402
-from magic_interfaces.srv import MatchContact  # noqa: E402
-from rclpy.executors import MultiThreadedExecutor  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
 
-from magic_core import conversions, qos, shapes, strategy, transforms  # noqa: E402
-from magic_core.errors import Code, MagicError  # noqa: E402
-from magic_core.scene import Scene  # noqa: E402
-from magic_matcher.matcher import MatcherNode  # noqa: E402
+from magic_core import conversions, qos, shapes, strategy, transforms
+from magic_core.errors import Code, MagicError
+from magic_core.scene import Scene
+from magic_interfaces.msg import SceneObjectArray
+from magic_interfaces.srv import MatchContact
+from magic_matcher.matcher import MatcherNode
 
 
 def until(condition, seconds=20.0):
@@ -166,6 +166,10 @@ def _with_parameter(monkeypatch, name, value):
 
     original = Node.__init__
     monkeypatch.setattr(
-        Node, "__init__", lambda self, node_name, **rest: original(self, "second", parameter_overrides=[Parameter(name, value=value)], use_global_arguments=False, **rest)
+        Node,
+        "__init__",
+        lambda self, node_name, **rest: original(
+            self, "second", parameter_overrides=[Parameter(name, value=value)], use_global_arguments=False, **rest
+        ),
     )
     MatcherNode().destroy_node()
