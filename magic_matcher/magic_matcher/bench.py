@@ -87,7 +87,9 @@ class Row:
 class _Remembering(embedded.EmbeddedFeatures):
     """Embedded features that describe a tool once for all variants."""
 
-    memory: dict[Any, Any] = {}
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.memory: dict[Any, Any] = {}
 
     def dissimilarities(self, prepared: embedded.Prepared, contour: Contour, target_radius: float | None) -> Any:
         key = (prepared.description.wide.tobytes(), prepared.description.probe.tobytes(), contour.points.tobytes(), target_radius)

@@ -132,7 +132,8 @@ def main(argv: list[str] | None = None) -> None:
         print(f"match_meshes: {error}", file=sys.stderr)
         sys.exit(2)
     for row in data["matches"]:
-        print(f"{row['tool']}: {row['code'] if 'code' in row else 'score %.3f' % row['candidates'][0]['score']}")
+        outcome = row["code"] if "code" in row else f"score {row['candidates'][0]['score']:.3f}"
+        print(f"{row['tool']}: {outcome}")
 
 
 if __name__ == "__main__":

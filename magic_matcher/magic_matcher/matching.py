@@ -181,8 +181,11 @@ class Matcher:
         if key not in self._prepared:
             if len(self._prepared) >= 16:  # memory stays flat over any number of different references
                 self._prepared.pop(next(iter(self._prepared)))
-            make = lambda: self.backend.prepare(reference)
-            self._prepared[key] = self.cache.get(key, make) if self.cache is not None else make()
+
+            def make() -> Any:
+                return self.backend.prepare(reference)
+
+            self._prepared[key] = make() if self.cache is None else self.cache.get(key, make)
         return self._prepared[key]
 
     def match(
