@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import signal
 import sys
 from pathlib import Path
 
 import pytest
+
+# A shell that starts the tests in the background has them ignore SIGINT, and what the tests start would inherit that.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # In importlib mode pytest names a test module after its path, ``magic_planner.test.test_x``, and would make an empty ``magic_planner`` for
 # it that hides the installed package. Importing the packages at the repository's root first prevents that.

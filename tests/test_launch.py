@@ -21,7 +21,7 @@ LAUNCH = Path(__file__).resolve().parents[1] / "ros2_ws/src/magic_bringup/launch
 def test_what_launch_files_name_exists(path):
     root = ElementTree.parse(path).getroot()
     for argument in root.iter("arg"):
-        if "value" not in argument:
+        if "value" not in argument.attrib:
             assert argument.get("description"), argument.get("name")
     for node in root.iter("node"):
         if node.get("pkg").startswith("magic_"):
