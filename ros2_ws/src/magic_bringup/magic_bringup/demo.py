@@ -250,6 +250,7 @@ class Watcher:
             target_id=options.target,
             seed=options.seed,
             timeout=options.timeout,
+            want_pictures=True,
         )
         return Pending(self, self.client.send_goal_async(goal, feedback_callback=self._on_feedback))
 

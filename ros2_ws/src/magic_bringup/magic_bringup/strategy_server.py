@@ -64,7 +64,6 @@ class StrategyServer(Node):
         self._repetitions = parameter(
             self, "repetitions", 1, "simulations of one motion; above 1: perturbed ones", low=1, high=1000, read_only=True
         )
-        self._film = parameter(self, "film", True, "return the film strip of the last simulation", read_only=True)
         self._timeout = parameter(self, "timeout", 120.0, "s for a whole run where the goal does not say", **seconds, read_only=True)
         self._presence = parameter(self, "server_timeout", 5.0, "s to wait for a server that is not there", **seconds, read_only=True)
         self._objects_timeout = parameter(self, "objects_timeout", 10.0, "s to wait for objects", **seconds, read_only=True)
@@ -241,7 +240,7 @@ class StrategyServer(Node):
             timeout=goal.timeout or self._timeout,
             allow_unverified=goal.allow_unverified,
         )
-        stages = _Stages(self, token, needs_verifier=strategy.simulatable)
+        stages = _Stages(self, token, needs_verifier=strategy.simulatable, heatmap=goal.want_pictures)
 
         def notify(progress: pipeline.Progress) -> None:
             self.get_logger().info(f"{progress.stage}: {progress.message}")
@@ -275,7 +274,7 @@ class StrategyServer(Node):
             self._marker_pub.publish(
                 markers.run_markers(stages.scene, list(stages.matches.candidates), outcome.target_id, outcome.reports, plan)
             )
-        if self._film:
+        if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()
         ending = f"{goal.strategy} ({goal.variant}) ended with {outcome.code.name}: {outcome.message}"
         if outcome.code == Code.OK:  # rclpy wants one severity for one line of code
@@ -324,8 +323,9 @@ class StrategyServer(Node):
 class _Stages:
     """The stages of :mod:`magic_bringup.pipeline`, done by the other nodes; messages pass through as they came."""
 
-    def __init__(self, node: StrategyServer, token: Token, needs_verifier: bool) -> None:
+    def __init__(self, node: StrategyServer, token: Token, needs_verifier: bool, heatmap: bool) -> None:
         self._node = node
+        self._heatmap = heatmap
         self._token = token
         self._needs_verifier = needs_verifier
         self.scene: SceneObjectArray | None = None
@@ -396,7 +396,7 @@ class _Stages:
             tool_ids=[request.tool_id] if request.tool_id else [],
             target_id=request.target_id,
             top_k=request.top_k,
-            want_heatmap=True,
+            want_heatmap=self._heatmap,
         )
         deadline = time.monotonic() + min(timeout, node._match_timeout)
         patience = time.monotonic() + OBJECTS_LAG

@@ -33,7 +33,7 @@ class Bench:
     def __init__(self, folder, services=("match", "plan", "verify"), **parameters):
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=free_domain())  # two benches may be open at once
-        values = {"film": False, "strategies": str(folder), "server_timeout": 2.0, "objects_timeout": 1.0, "grace": 0.5, **parameters}
+        values = {"strategies": str(folder), "server_timeout": 2.0, "objects_timeout": 1.0, "grace": 0.5, **parameters}
         arguments = ["--ros-args"] + [x for k, v in values.items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
         original = Node.__init__
         context = self.context
@@ -304,7 +304,7 @@ def test_a_server_that_never_finishes(folder):
 
 
 def test_the_film_is_made_after_the_trajectory_is_out(folder):
-    bench = Bench(folder, film=True)
+    bench = Bench(folder)
     try:
         bench.fakes.publish(fakes.scene())
         published = []
@@ -318,7 +318,7 @@ def test_the_film_is_made_after_the_trajectory_is_out(folder):
             return result
 
         bench.fakes.on_verify = verify
-        result, _ = bench.run()
+        result, _ = bench.run(want_pictures=True)
         assert (result.code, result.simulations, result.film.width) == (0, 1, 8)
         assert published == [True]
     finally:

@@ -16,7 +16,7 @@ T = TypeVar("T")
 #: How long a named node, topic or service may take to be discovered, s.
 DISCOVERY = 5.0
 #: The graph counts as known when it has not changed for this long, s.
-SETTLED = 0.6
+SETTLED = 1.0
 #: And as empty when no other node has been seen for this long, s.
 EMPTY = 1.5
 

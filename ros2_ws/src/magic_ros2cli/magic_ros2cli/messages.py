@@ -43,10 +43,10 @@ def to_dict(message: Any, truncate: int | None = None, no_arr: bool = False, no_
 
 
 def _plain(value: Any, type_text: str, slot: Any, truncate: int | None, no_arr: bool, no_str: bool) -> Any:
+    if isinstance(value, np.generic):  # before float, which numpy's float64 is as well
+        return value.item()
     if isinstance(value, (bool, int, float)):
         return value
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, bytes):
         value = value.decode("latin-1")
     if isinstance(value, str):
