@@ -176,7 +176,7 @@ def test_nothing_unverified_is_published(bench):
 
 
 def test_goals_carry_what_the_servers_need(bench):
-    bench.run(variant="arm", seed=7)
+    bench.run(variant="arm", seed=7, want_pictures=True)
     names = [name for name, _ in bench.fakes.goals]
     assert names == ["match", "plan_motion", "verify_motion"]
     request, plan, verify = (goal for _, goal in bench.fakes.goals)
