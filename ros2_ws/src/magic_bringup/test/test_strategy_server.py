@@ -176,11 +176,11 @@ def test_nothing_unverified_is_published(bench):
 
 
 def test_goals_carry_what_the_servers_need(bench):
-    bench.run(variant="arm", seed=7, want_pictures=True)
+    bench.run(variant="arm", seed=7)
     names = [name for name, _ in bench.fakes.goals]
     assert names == ["match", "plan_motion", "verify_motion"]
     request, plan, verify = (goal for _, goal in bench.fakes.goals)
-    assert request.want_heatmap
+    assert not request.want_heatmap  # pictures only on request
     assert (plan.tool.id, plan.target.id, plan.variant, plan.seed, plan.reflection) == ("object_1", "object_2", "arm", 7, "keep")
     assert verify.plan.arm_trajectory.points
     assert 0 < plan.timeout <= 30.0
