@@ -22,7 +22,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "matcher = magic_matcher.matcher:main",
+            "matcher = magic_matcher.node:main",
             "match_images = magic_matcher.match_images:main",
             "match_meshes = magic_matcher.match_meshes:main",
             "bench = magic_matcher.bench:main",

@@ -21,7 +21,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.scene import Scene
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
-from magic_matcher.matcher import MatcherNode
+from magic_matcher.node import MatcherNode
 
 
 def until(condition, seconds=20.0):
