@@ -19,7 +19,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "perception = magic_perception.perception:main",
+            "perception = magic_perception.node:main",
             "perceive_images = magic_perception.perceive_images:main",
             "evaluate = magic_perception.evaluate:main",
         ]

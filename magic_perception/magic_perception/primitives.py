@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.mesh import Mesh
+from magic_perception.solids import Reconstruction
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,43 @@ def fit_cylinder(points: NDArray[np.float64]) -> Cylinder | None:
     ):
         return None
     return Cylinder(centre, radius, height, float(np.percentile(distance, 90)))
+
+
+def recognise(points: NDArray[np.float64], height: float, noise: float) -> Reconstruction | None:
+    """The ball or upright cylinder that the points (N, 3) lie on; ``None`` where they tell of something else.
+
+    height: of the points above the table; noise: standard deviation of the heights; metres.
+    """
+    if height < 0.012 or height > 0.3:
+        return None
+    sample = points[:: max(1, len(points) // 1500)]
+    sample = sample[sample[:, 2] > min(0.004, 0.1 * height)]
+    if len(sample) < 60:
+        return None
+    limit = max(0.0025, 2.5 * noise)
+    ball = fit_sphere(sample)
+    tin = fit_cylinder(sample)
+    if ball is not None and not (
+        0.006 < ball.radius < 0.12 and ball.residual < limit and abs(ball.centre[2] - ball.radius) < max(0.005, 0.2 * ball.radius)
+    ):
+        ball = None
+    if tin is not None and not (tin.residual < limit and tin.radius < 0.08 and tin.height > 0.3 * tin.radius):
+        tin = None
+    if ball is not None and (tin is None or ball.residual < tin.residual):
+        # It touches the table: its height above it is its radius, to which both measurements count.
+        radius = (ball.radius + (ball.centre[2] + ball.radius) / 2) / 2
+        ball = Sphere(np.array([*ball.centre[:2], radius]), radius, ball.residual)
+        mesh = sphere_mesh(ball)
+        return Reconstruction(mesh, (sphere_mesh(ball, 2),), "sphere", _trust(ball.residual, limit))
+    if tin is not None:
+        profile = np.array([[tin.radius, 0], [tin.radius, tin.height]])
+        mesh = revolve(profile, tin.centre)
+        return Reconstruction(mesh, (mesh,), "cylinder", _trust(tin.residual, limit))
+    return None
+
+
+def _trust(residual: float, limit: float) -> float:
+    return float(np.clip(1.0 - 0.5 * residual / limit, 0.3, 1.0))
 
 
 def sphere_mesh(sphere: Sphere, subdivisions: int = 3) -> Mesh:

@@ -313,13 +313,13 @@ def test_empty_table_and_bad_frames():
 
 
 def test_tiles_of_a_slab_become_one_piece_and_an_l_two():
-    from magic_perception.reconstruction import _joined
+    from magic_perception.solids import joined
 
     tiles = [box((0.01, 0.01, 0.004), 0.01 * i, 0.01 * j).vertices for i in range(6) for j in range(3)]
-    (whole,) = _joined(tiles)
+    (whole,) = joined(tiles)
     assert tight(whole).volume == pytest.approx(0.06 * 0.03 * 0.004)
     arms = [box((0.02, 0.1, 0.02), 0, 0).vertices, box((0.1, 0.02, 0.02), 0.06, -0.04).vertices]
-    assert len(_joined(arms)) == 2
+    assert len(joined(arms)) == 2
     # A hemispherical shell: few pieces, and its hollow stays.
     angles = np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi / 2, 7)
     shell = []
@@ -335,7 +335,7 @@ def test_tiles_of_a_slab_become_one_piece_and_an_l_two():
                     ]
                 )
             )
-    pieces = _joined(shell)
+    pieces = joined(shell)
     assert len(pieces) <= 40
     middle = np.array([0, 0, -0.02])
     for piece in pieces:

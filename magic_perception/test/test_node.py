@@ -2,7 +2,6 @@
 
 import os
 
-os.environ["ROS_DOMAIN_ID"] = "41"
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 import time
@@ -23,8 +22,8 @@ from magic_core import conversions as cv
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene
 from magic_interfaces.msg import SceneObjectArray
+from magic_perception.node import Perception
 from magic_perception.parameters import Parameters
-from magic_perception.perception import Perception
 from magic_perception.pipeline import perceive
 
 tf2_msgs = pytest.importorskip("tf2_msgs.msg")
@@ -34,7 +33,7 @@ class Bench:
     """One perception node and a tester that plays two cameras."""
 
     def __init__(self, **parameters):
-        rclpy.init()
+        rclpy.init(domain_id=scenes.free_domain())
         values = {"average": 1, "rate": 10.0, "camera_timeout": 1.0, **parameters}
         self.node = _with_overrides(values)
         self.tester = rclpy.create_node("tester")
@@ -299,7 +298,7 @@ def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
 
 
 def test_a_bad_start_is_refused():
-    rclpy.init()
+    rclpy.init(domain_id=scenes.free_domain())
     try:
         from magic_core.errors import Code, MagicError
 

@@ -1,0 +1,215 @@
+"""Lying things: flat ones carved from the masks, others as a height field or a shell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh, concatenate
+from magic_perception import polygons
+from magic_perception.parameters import Parameters
+from magic_perception.segmentation import open_by_two
+from magic_perception.sight import Sight, carve
+from magic_perception.solids import Reconstruction, extruded, joined
+
+
+@dataclass(frozen=True)
+class Grid:
+    """An upright height map: origin (2,) of cell (0, 0)'s centre, cell size, top (rows, columns) metres, NaN empty."""
+
+    origin: NDArray[np.float64]
+    cell: float
+    top: NDArray[np.float32]
+
+    def centres(self) -> NDArray[np.float64]:
+        """(rows, columns, 2): x, y of the cells."""
+        rows, columns = self.top.shape
+        y, x = np.mgrid[0:rows, 0:columns]
+        return np.stack([x, y], axis=-1) * self.cell + self.origin
+
+
+def height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> Grid:
+    """The highest points (N, 3) over each cell; gaps of two cells closed, threads of one cell dropped."""
+    low = points[:, :2].min(axis=0) - margin * cell
+    size = np.ceil((points[:, :2].max(axis=0) - low) / cell).astype(int) + margin + 1
+    if size.max() > 1200:
+        raise MagicError(
+            Code.RECONSTRUCTION_FAILED, "extent of one object in metres", np.round(size * cell, 2).tolist(), f"below {1200 * cell}"
+        )
+    index = np.round((points[:, :2] - low) / cell).astype(int)
+    flat = index[:, 1] * size[0] + index[:, 0]
+    order = np.argsort(points[:, 2], kind="stable")
+    top = np.full(size[0] * size[1], np.nan, np.float32)
+    top[flat[order]] = points[order, 2]  # the last, highest, wins
+    top = top.reshape(size[1], size[0])
+    occupied = np.isfinite(top).astype(np.uint8)
+    closed = cv2.morphologyEx(occupied, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
+    closed = open_by_two(closed > 0)
+    filled = nearest(top, occupied > 0)
+    filled = cv2.medianBlur(filled, 5)
+    return Grid(low, cell, np.where(closed, filled, np.nan).astype(np.float32))
+
+
+def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Values everywhere: where unknown, those of the nearest known cell."""
+    if not known.any():
+        return np.zeros_like(values)
+    _, index = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    table = np.zeros(int(index.max()) + 1, np.float32)
+    table[index[known]] = values[known]
+    return table[index]
+
+
+def build_lying(sights: list[Sight], points: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction:
+    """A thing that lies: carved where it is flat, else a height field down to the table, or a shell where it is seen to be hollow."""
+    grid = height_map(points, parameters.resolution)
+    occupied = np.isfinite(grid.top)
+    inner = cv2.erode(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
+    # Heights along the middle lines: the round edge of a wire does not make it a relief.
+    depth = cv2.distanceTransform(np.pad(occupied, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    ridge = occupied & (depth >= 0.85 * cv2.dilate(depth, np.ones((7, 7), np.uint8))) & (depth > 1.2)
+    sample = grid.top[ridge] if ridge.sum() > 30 else grid.top[occupied]
+    low, middle, high = np.percentile(sample, [8, 60, 96])
+    flat = high - low < max(0.004, 0.2 * high, 3.0 * noise)
+    centres = grid.centres()
+    thickness = float(max(middle if flat else high, 0.002))
+    if flat and thickness < 0.06:
+        columns = [
+            np.concatenate([centres, np.full((*centres.shape[:2], 1), z)], axis=-1)
+            for z in np.linspace(0, thickness, 2 + int(thickness / 0.006))
+        ]
+        field = carve(sights, columns)
+        near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+        field = cv2.GaussianBlur(field * near, (0, 0), 0.8)
+    else:
+        columns = [np.concatenate([centres, np.nan_to_num(grid.top)[..., None]], axis=-1)]
+        # The top of each cell must be seen; two pixels of grace for errors of height and calibration.
+        seen = np.ones(occupied.shape, bool)
+        for sight in sights:
+            wide = Sight(
+                sight.intrinsics,
+                sight.table_from_camera,
+                cv2.dilate(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0,
+                sight.hidden,
+                sight.depth,
+                sight.heights,
+                sight.sigma,
+            )
+            seen &= wide.sample(columns[0])[0] > 0.3
+        field = polygons.smooth_field(occupied & seen, 1.8)
+    parts = [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > 4e-5]
+    if not parts:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
+    parts = [p for p in parts if p.area > 0.08 * parts[0].area]
+    if flat:
+        return extruded(parts, thickness, "flat", 0.9)
+    # Smooth over 3 mm, over the thing's own cells only.
+    weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
+    smooth = cv2.GaussianBlur(np.where(occupied, grid.top, 0).astype(np.float32), (0, 0), 2.0) / np.maximum(weight, 1e-6)
+    top = nearest(smooth.astype(np.float32), occupied)
+    depression = _filled(np.where(occupied, top, 0)) - top
+    hollow = (depression > max(0.004, 3 * noise)) & inner
+    if hollow.sum() * grid.cell**2 > 1.5e-4:
+        spread = int(np.ceil(parameters.wall / grid.cell / 2))
+        # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
+        reach = 2 * int(0.012 / grid.cell) + 1
+        width = 2 * grid.cell * cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+        thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
+        bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
+        bottom = np.clip(bottom, 0, top - 0.001)
+        shape = "shell"
+    else:
+        bottom = np.zeros_like(top)
+        shape = "height field"
+    meshes, pieces = [], []
+    for part in parts:
+        meshes.append(relief(part, grid, top, bottom))
+        pieces += relief_pieces(part, grid, top, bottom)
+    return Reconstruction(concatenate(meshes), tuple(pieces), shape, 0.8)
+
+
+def _filled(top: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A height map with its depressions filled to their lowest rim, in steps of a millimetre."""
+    result = top.copy()
+    for level in np.arange(0.001, float(top.max()) + 0.001, 0.001):
+        above = (top >= level).astype(np.uint8)
+        outside = np.pad(1 - above, 1, constant_values=1)
+        cv2.floodFill(outside, None, (0, 0), 2)
+        closed = outside[1:-1, 1:-1] == 1
+        result[closed] = np.maximum(result[closed], level)
+    return result
+
+
+def _at(field: NDArray[np.float32], grid: Grid, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A field over the grid at points (N, 2), interpolated."""
+    local = ((xy - grid.origin) / grid.cell).astype(np.float32)
+    return cv2.remap(field, local[:, 0:1], local[:, 1:2], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(float)
+
+
+def relief(part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], step: float = 0.003) -> Mesh:
+    """The solid between two height maps over a polygon: Delaunay over its rings and a lattice inside, with walls; watertight."""
+    from scipy.spatial import Delaunay
+
+    ring = polygons.ring_points(part, step * 0.8)
+    x0, y0, x1, y1 = part.bounds
+    y, x = np.mgrid[y0:y1:step, x0:x1:step]
+    lattice = np.column_stack([x.ravel(), y.ravel()])
+    lattice = lattice[shapely.contains_xy(part.buffer(-0.6 * step), lattice)]
+    flat = np.concatenate([ring, lattice])
+    faces = Delaunay(flat).simplices.astype(np.int64)
+    middle = flat[faces].mean(axis=1)
+    p = flat[faces]
+    turn = (p[:, 1, 0] - p[:, 0, 0]) * (p[:, 2, 1] - p[:, 0, 1]) - (p[:, 1, 1] - p[:, 0, 1]) * (p[:, 2, 0] - p[:, 0, 0])
+    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    faces = faces[shapely.contains_xy(part, middle) & (np.abs(turn) > 1e-12)]
+    used, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    flat = flat[used]
+    n = len(flat)
+    high = np.maximum(_at(top, grid, flat), 0.001)
+    low = np.minimum(_at(bottom, grid, flat), high - 0.001)
+    vertices = np.concatenate([np.column_stack([flat, low]), np.column_stack([flat, high])])
+    return Mesh(vertices, np.concatenate([faces[:, ::-1], faces + n, *polygons._walls(faces, n)]))
+
+
+def relief_pieces(
+    part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.011
+) -> list[Mesh]:
+    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide;
+    then neighbours are joined again where that fills little."""
+    clouds = []
+    queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.001), 0.001)]
+    while queue:
+        cell, depth = queue.pop()
+        box = np.array(cell.bounds)
+        size = box[2:] - box[:2]
+        n = np.maximum(np.ceil(size / 0.0025).astype(int), 2)
+        y, x = np.meshgrid(np.linspace(box[1], box[3], n[1]), np.linspace(box[0], box[2], n[0]), indexing="ij")
+        lattice = np.column_stack([x.ravel(), y.ravel()])
+        lattice = lattice[shapely.contains_xy(cell, lattice)]
+        xy = np.concatenate([np.asarray(cell.exterior.coords)[:-1], lattice])
+        high, low = np.maximum(_at(top, grid, xy), 0.001), _at(bottom, grid, xy)
+        if depth < 10 and size.max() > least and max(_bend(xy, high), _bend(xy, low)) > tolerance:
+            long = int(np.argmax(size))
+            half = (box[long] + box[long + 2]) / 2
+            first, second = box.copy(), box.copy()
+            first[long + 2], second[long] = half, half
+            for b in (first, second):
+                queue += [(p, depth + 1) for p in polygons.parts_of(shapely.clip_by_rect(cell, *b)) if p.area > 1e-6]
+            continue
+        low = np.minimum(low, high - 0.001)
+        clouds.append(np.concatenate([np.column_stack([xy, low]), np.column_stack([xy, high])]))
+    return joined(clouds)
+
+
+def _bend(xy: NDArray[np.float64], z: NDArray[np.float64]) -> float:
+    """Largest distance of points (xy, z) from the plane that fits them best along z, perpendicular to it: a steep wall is flat too."""
+    a = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
+    plane = np.linalg.lstsq(a, z, rcond=None)[0]
+    return float(np.max(np.abs(a @ plane - z)) / np.sqrt(1 + plane[0] ** 2 + plane[1] ** 2))

@@ -1,0 +1,150 @@
+"""Closed solids and their convex pieces: hulls joined where that fills little, prisms, lofts through rings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from magic_core.mesh import Mesh, concatenate
+from magic_perception import polygons
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """mesh and convex pieces in the table frame; ``shape`` names how they came about; confidence 0..1."""
+
+    mesh: Mesh
+    pieces: tuple[Mesh, ...]
+    shape: str
+    confidence: float
+
+
+def hull_of(points: NDArray[np.float64]) -> Mesh | None:
+    """The convex hull of points (N, 3), faces outward; ``None`` where they are flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    vertices = points[used]
+    p = vertices[faces]
+    normals = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    inward = np.sum(normals * hull.equations[:, :3], axis=1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return Mesh(vertices, faces)
+
+
+def joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: int = 40, limit: float = 0.0025) -> list[Mesh]:
+    """Hulls of clouds (N, 3), neighbours joined, the pair that fills least first.
+
+    Two are joined where the volume that their common hull fills, over half of its surface, is at most ``tolerance``
+    metres; with more than ``most`` left the tolerance grows up to ``limit``.
+    """
+    import heapq
+
+    from scipy.spatial import ConvexHull, QhullError
+
+    def solid(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
+        try:
+            hull = ConvexHull(points)
+        except (QhullError, ValueError):
+            return None
+        return points[hull.vertices], hull.volume, hull.area
+
+    parts: dict[int, tuple[NDArray[np.float64], float, float]] = {}
+    filled: dict[int, float] = {}
+    boxes: dict[int, NDArray[np.float64]] = {}
+    for cloud in clouds:
+        made = solid(cloud)
+        if made is not None:
+            i = len(parts)
+            parts[i], filled[i], boxes[i] = made, made[1], np.stack([made[0].min(axis=0), made[0].max(axis=0)])
+    queue: list[tuple[float, int, int]] = []
+    hulls: dict[tuple[int, int], tuple[NDArray[np.float64], float, float]] = {}
+
+    def offer(i: int, others: list[int]) -> None:
+        if not others:
+            return
+        box = np.stack([boxes[j] for j in others])
+        near = np.all((box[:, 0] < boxes[i][1] + 5e-4) & (box[:, 1] > boxes[i][0] - 5e-4), axis=1)
+        for j in np.array(others)[near].tolist():
+            made = solid(np.concatenate([parts[i][0], parts[j][0]]))
+            if made is not None:
+                excess = (made[1] - filled[i] - filled[j]) / (made[2] / 2)
+                if excess < limit:
+                    hulls[i, j] = made
+                    heapq.heappush(queue, (excess, i, j))
+
+    for i in list(parts):
+        offer(i, [j for j in parts if j > i])
+    following = len(parts)
+    while queue:
+        excess, i, j = heapq.heappop(queue)
+        made = hulls.pop((i, j))
+        if i not in parts or j not in parts:
+            continue
+        if excess > tolerance and len(parts) <= most:
+            break
+        k, following = following, following + 1
+        parts[k], filled[k], boxes[k] = made, filled[i] + filled[j], np.stack([made[0].min(axis=0), made[0].max(axis=0)])
+        for gone in (i, j):
+            del parts[gone], filled[gone], boxes[gone]
+        offer(k, [m for m in parts if m != k])
+    return [mesh for points, _, _ in parts.values() if (mesh := hull_of(points)) is not None]
+
+
+def extruded(parts: list[Polygon], height: float, shape: str, confidence: float, tolerance: float = 0.0004) -> Reconstruction:
+    """Polygons pulled up from the table, with the prisms of their convex parts."""
+    pieces = [polygons.prism(ring, 0.0, height) for part in parts for ring in polygons.convex_parts(part.simplify(0.0005), tolerance)]
+    return Reconstruction(concatenate([polygons.extrude(part, 0.0, height) for part in parts]), tuple(pieces), shape, confidence)
+
+
+def lofted(rings: NDArray[np.float64]) -> Mesh:
+    """The closed solid through rings (L, K, 3), counter-clockwise, from the bottom up."""
+    levels, k = rings.shape[:2]
+    i = np.arange(k)
+    j = (i + 1) % k
+    faces = []
+    for row in range(levels - 1):
+        a, b = row * k, (row + 1) * k
+        faces += [np.column_stack([a + i, a + j, b + j]), np.column_stack([a + i, b + j, b + i])]
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(axis=0, keepdims=True), rings[-1].mean(axis=0, keepdims=True)])
+    last = (levels - 1) * k
+    faces.append(np.column_stack([np.full(k, levels * k), j, i]))
+    faces.append(np.column_stack([np.full(k, levels * k + 1), last + i, last + j]))
+    return Mesh(vertices, np.concatenate(faces))
+
+
+def loft_pieces(rings: NDArray[np.float64], tolerance: float = 0.004) -> list[Mesh]:
+    """Convex hulls of runs of rings (L, K, 3): a run grows upwards as long as its hull keeps within ``tolerance`` metres of the rings in it."""
+    pieces = []
+    start = 0
+    flat = rings[..., :2]
+    area = np.array([polygons.area_of(ring) for ring in flat])
+    perimeter = np.array([np.linalg.norm(ring - np.roll(ring, 1, axis=0), axis=1).sum() for ring in flat])
+    while start < len(rings) - 1:
+        stop = start + 1
+        while stop + 1 < len(rings):
+            fits = True
+            a, b = flat[start], flat[stop + 1]
+            for row in range(start + 1, stop + 1):
+                # The hull's section between the run's ends holds at least their blend.
+                share = (row - start) / (stop + 1 - start)
+                blend = polygons.area_of(polygons.convex_hull(np.concatenate([(1 - share) * a + share * b, flat[row]])))
+                if blend - area[row] > tolerance * perimeter[row] / 2:
+                    fits = False
+                    break
+            if not fits:
+                break
+            stop += 1
+        hull = hull_of(rings[start : stop + 1].reshape(-1, 3))
+        if hull is not None:
+            pieces.append(hull)
+        start = stop
+    return pieces

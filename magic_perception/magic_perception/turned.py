@@ -1,0 +1,352 @@
+"""Things that stand on a round body (mugs, cans, bands): a body of revolution, open where it was seen to be, and a handle."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.mesh import Mesh, concatenate
+from magic_perception import clusters, polygons, primitives
+from magic_perception.parameters import Parameters
+from magic_perception.sight import Sight, carve
+from magic_perception.solids import Reconstruction, hull_of
+
+
+@dataclass(frozen=True)
+class Body:
+    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not, or through and through (a band)."""
+
+    axis: NDArray[np.float64]
+    profile: NDArray[np.float64]
+    open: bool
+    through: bool = False
+
+    def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(z, self.profile[:, 1], self.profile[:, 0])
+
+
+def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, seed: int) -> Body | None:
+    """The body of revolution on which most of the side points lie, or ``None``.
+
+    x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in a parabola q, so that conical and bulged bodies fit at once.
+    """
+    index = np.nonzero((points[:, 2] > 0.08 * height) & (points[:, 2] < 0.94 * height))[0]
+    if len(index) < 150:
+        return None
+    rng = np.random.default_rng(seed)
+    index = index[rng.permutation(len(index))[:5000]]
+    sample, eye = points[index], eyes[index]
+    band = max(0.003, 2 * noise)
+    slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
+    members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
+    members = [m for m in members if len(m) > 20]
+    if not members:
+        return None
+    # Circles through three points of one level, all hypotheses at once.
+    picked = np.stack([sample[members[i][rng.integers(len(members[i]), size=3)], :2] for i in rng.integers(len(members), size=160)])
+    a = 2 * (picked[:, 1:] - picked[:, :1])
+    rhs = np.sum(picked[:, 1:] ** 2, axis=2) - np.sum(picked[:, :1] ** 2, axis=2)
+    det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    sound = np.abs(det) > 1e-7
+    a, rhs, det, first = a[sound], rhs[sound], det[sound], picked[sound, 0]
+    centres = (
+        np.column_stack([rhs[:, 0] * a[:, 1, 1] - rhs[:, 1] * a[:, 0, 1], a[:, 0, 0] * rhs[:, 1] - a[:, 1, 0] * rhs[:, 0]]) / det[:, None]
+    )
+    radii = np.hypot(*(first - centres).T)
+    sound = (radii > 0.01) & (radii < 0.12)
+    centres, radii = centres[sound], radii[sound]
+    if len(radii) == 0:
+        return None
+    few = sample[:1200]
+    rho = np.hypot(few[:, 0] - centres[:, :1], few[:, 1] - centres[:, 1:])
+    i = int(np.argmax(np.count_nonzero(np.abs(rho - radii[:, None]) < band * 1.5, axis=1)))
+    best = (centres[i], radii[i])
+    origin = best[0]
+    # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
+    out, ray = sample[:, :2] - origin, eye[:, :2] - sample[:, :2]
+    cosine = np.sum(ray * out, axis=1) / np.maximum(np.linalg.norm(ray, axis=1) * np.linalg.norm(out, axis=1), 1e-9)
+    inner_share = float(np.mean(cosine < 0))
+    # At grazing incidence stereo rounds the silhouette off backwards, which would make the body wider.
+    sample = sample[cosine > 0.35]
+    near = np.abs(np.linalg.norm(sample[:, :2] - origin, axis=1) - best[1]) < max(0.008, 0.15 * best[1])
+    axis, model = origin, None
+    for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
+        p = sample[near]
+        if len(p) < 60:
+            return None
+        local, z = p[:, :2] - origin, p[:, 2] / height
+        matrix = np.column_stack([2 * local, np.ones(len(p)), z, z**2])
+        model = np.linalg.lstsq(matrix, np.sum(local**2, axis=1), rcond=None)[0]
+        axis = origin + model[:2]
+        z = sample[:, 2] / height
+        radius = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6))
+        residual = np.linalg.norm(sample[:, :2] - axis, axis=1) - radius
+        near = np.abs(residual) < width
+    seen = sample[:, :2] - axis
+    widest = max(float(np.ptp(seen @ np.array([np.cos(t), np.sin(t)]))) for t in np.linspace(0, np.pi, 12, endpoint=False))
+    if 2 * float(np.median(radius)) > 1.12 * widest:
+        return None  # a broad face bent a little, not a round body
+    share = float(near.mean())
+    angles = np.arctan2(*(sample[near, :2] - axis).T[::-1])
+    coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
+    # What reaches beyond the body must be little: a box's corner reaches 0.4 r beyond its inscribed circle.
+    if share < 0.5 or coverage < 0.28 or inner_share > 0.7:
+        return None
+    top = float(np.percentile(sample[near, 2], 99))
+    around = points[np.abs(np.linalg.norm(points[:, :2] - axis, axis=1) - float(np.median(radius))) < 0.012]
+    top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 20 else top)
+    levels = np.linspace(0, top, max(4, int(top / 0.008)) + 1)
+    zs = levels / height
+    radii = np.sqrt(np.maximum(model[2] + model[3] * zs + model[4] * zs**2 + model[:2] @ model[:2], 1e-6))
+    rho = np.linalg.norm(sample[:, :2] - axis, axis=1)
+    for i, level in enumerate(levels):
+        here = rho[(np.abs(sample[:, 2] - level) < 0.006) & (np.abs(rho - radii[i]) < 2.5 * band)]
+        if len(here) > 15:
+            radii[i] = 0.5 * radii[i] + 0.5 * np.median(here)
+    inside = points[np.linalg.norm(points[:, :2] - axis, axis=1) < 0.6 * radii[-1]]
+    hollow = len(inside) > 25 and np.median(inside[:, 2]) < top - max(0.012, 0.15 * top)
+    return Body(axis, np.column_stack([radii, levels]), bool(hollow))
+
+
+def fit_to_silhouettes(body: Body, sights: list[Sight], reach: float = 0.008) -> Body:
+    """The body moved and scaled to the masks' edges, which the colour image puts to a pixel, where depth rounds them off.
+
+    At each level the two tangent rays of every camera tell the radius on the camera's left and right; where both are
+    seen, half of their difference moves the axis sideways.  A side without an edge near (a handle) says nothing.  The
+    far rim's upper edge tells the height.
+    """
+    axis, profile = body.axis, body.profile
+    levels = profile[:, 1]
+    inner = (levels > 0.1 * levels[-1]) & (levels < 0.97 * levels[-1])
+    steps = np.arange(-reach, reach + 2.5e-4, 5e-4)
+
+    def crossing(values: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The offset (N,) at which rows of mask values (N, S) fall below a half once and for all; NaN where they do not."""
+        below = values < 0.5
+        index = below.argmax(axis=1)
+        rows = np.arange(len(values))
+        sound = below.any(axis=1) & (index > 0) & ~(~below & (np.arange(values.shape[1]) > index[:, None])).any(axis=1)
+        before, after = values[rows, np.maximum(index - 1, 0)], values[rows, index]
+        share = np.clip((before - 0.5) / np.maximum(before - after, 1e-6), 0, 1)
+        return np.where(sound, steps[np.maximum(index - 1, 0)] + share * 5e-4, np.nan)
+
+    for _ in range(2):
+        radii = body.radius(levels)
+        sides, moves = [], []
+        for sight in sights:
+            away = axis - sight.eye[:2]
+            distance = max(float(np.linalg.norm(away)), 1e-6)
+            away = away / distance
+            right = np.array([away[1], -away[0]])
+            found = []
+            for sign in (-1, 1):
+                rho = radii[:, None] + steps
+                sine = np.clip(rho / distance, 0, 0.9)
+                tangent = axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * right)
+                inside, blind, _, _ = sight.sample(
+                    np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2)
+                )
+                edge = crossing(inside)
+                edge[blind.any(axis=1) | ~inner] = np.nan
+                found.append(edge)
+            middle = np.nanmedian(np.concatenate(found)) if np.isfinite(np.concatenate(found)).any() else 0.0
+            # Where a handle begins its edge is taken for the body's.
+            found = [np.where(np.abs(edge - middle) < 0.003, edge, np.nan) for edge in found]
+            sides += found
+            both = np.isfinite(found[0]) & np.isfinite(found[1])
+            if both.sum() >= 2:
+                moves.append((right, float(np.median((found[1] - found[0])[both]) / 2)))
+        if moves:
+            matrix = np.array([right for right, _ in moves] + [[0.05, 0], [0, 0.05]])
+            axis = axis + np.linalg.lstsq(matrix, np.array([move for _, move in moves] + [0, 0]), rcond=None)[0]
+        edges = np.stack(sides)
+        told = np.isfinite(edges)
+        if told.sum() >= 4:
+            # A line, so that the mask's ragged edge does not ruffle the profile.
+            where = np.broadcast_to(levels / levels[-1], edges.shape)[told]
+            slope, offset = np.polyfit(where, edges[told], 1) if np.ptp(where) > 0.4 else (0.0, float(np.median(edges[told])))
+            radii = np.maximum(radii + offset + slope * levels / levels[-1], 0.004)
+            profile = np.column_stack([radii, levels])
+        body = replace(body, axis=axis, profile=profile)
+    tops = []
+    for sight in sights:
+        away = axis - sight.eye[:2]
+        bearing = np.arctan2(away[1], away[0]) + np.linspace(-0.5, 0.5, 9)
+        rim = axis + profile[-1, 0] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+        heights = profile[-1, 1] + steps
+        spots = np.concatenate(
+            [np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2
+        )
+        inside, blind, _, _ = sight.sample(spots)
+        edge = crossing(inside)
+        edge[blind.any(axis=1)] = np.nan
+        tops += edge[np.isfinite(edge)].tolist()
+    if len(tops) >= 5:
+        profile = profile.copy()
+        profile[:, 1] *= 1 + float(np.median(tops)) / profile[-1, 1]
+        body = replace(body, profile=profile)
+    return body
+
+
+def build_round(
+    sights: list[Sight], points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, parameters: Parameters
+) -> Reconstruction | None:
+    """A round body with or without a handle; ``None`` where the points tell of something else.
+
+    points (N, 3) with the camera (N, 3) that saw each; height and noise as for :func:`magic_perception.primitives.recognise`.
+    """
+    body = round_body(points, eyes, height, noise, parameters.seed)
+    if body is None:
+        return None
+    if height > body.profile[-1, 1] + 0.012:
+        return None
+    body = fit_to_silhouettes(body, sights)
+    # Of a band some part of the table inside shows to some camera.
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    spots = np.array(
+        [[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)]
+    )
+    if max(float(np.mean(carve([sight], [spots]) < 0.3)) for sight in sights) > 0.12:
+        body = Body(body.axis, body.profile, True, True)
+    top = body.profile[-1, 1]
+    away = points[:, :2] - body.axis
+    rho = np.linalg.norm(away, axis=1)
+    beyond = rho - body.radius(points[:, 2])
+    out = points[beyond > max(0.005, 2.5 * noise)]
+    over = points[(points[:, 2] > top + 0.012) & (beyond < 0)]
+    if len(over) > 0.08 * len(points):
+        return None  # more than a body of revolution with a flat end, a bottle's neck say
+    handle = None
+    if len(out) > 60:
+        out = out[clusters.largest(out, 0.012, 4, 0.003)]
+        reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
+        if np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010 and len(out) > 0.02 * len(points):
+            handle = handle_of(sights, out, body, parameters)
+            if handle is None and len(out) > 0.15 * len(points):
+                return None
+        elif len(out) > 0.2 * len(points):
+            return None
+    wall = max(parameters.wall, 0.0035)
+    mesh, pieces = turned_body(body, wall)
+    if handle is None:
+        return Reconstruction(mesh, tuple(pieces), "round", 0.85)
+    bars, handle_pieces = handle
+    try:
+        import trimesh
+
+        joined = trimesh.boolean.union([mesh.to_trimesh(), *[b.to_trimesh() for b in bars]], engine="manifold")
+        mesh = Mesh(joined.vertices, joined.faces)
+    except Exception:  # the boolean library refuses a degenerate solid: overlapping closed parts still bound the same solid
+        mesh = concatenate([mesh, *bars])
+    return Reconstruction(mesh, tuple(pieces + handle_pieces), "round with handle", 0.85)
+
+
+def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mesh]]:
+    """Mesh and convex pieces of a round body: a stack of frusta, or a floor and wall sectors where it is open."""
+    profile = body.profile
+    simple = np.asarray(shapely.LineString(profile).simplify(0.0008).coords)
+    if not body.open or profile[:, 0].min() < 2.5 * wall:
+        mesh = primitives.revolve(profile, body.axis)
+        pieces = [primitives.revolve(simple[i : i + 2], body.axis, 24) for i in range(len(simple) - 1)]
+        chord = np.interp(profile[:, 1], profile[[0, -1], 1], profile[[0, -1], 0])
+        if np.all(profile[:, 0] > chord - 0.001) and np.all(np.diff(profile[:, 0], 2) < 0.0015):
+            hull = hull_of(primitives.revolve(simple, body.axis, 32).vertices)
+            pieces = [hull] if hull is not None else pieces
+        return mesh, pieces
+    floor = 0.0 if body.through else min(0.006, 0.2 * profile[-1, 1])
+    inner = np.column_stack([profile[:, 0] - wall, profile[:, 1]])
+    pieces: list[Mesh] = []
+    if body.through:
+        mesh = primitives.turn_ring(np.vstack([profile, inner[::-1]]), body.axis)
+    else:
+        inner = np.vstack([[np.interp(floor, inner[:, 1], inner[:, 0]), floor], inner[inner[:, 1] > floor + 0.001]])
+        mesh = primitives.revolve(np.vstack([profile, inner[::-1]]), body.axis)
+        ends = np.array([[np.interp(z, simple[:, 1], simple[:, 0]), z] for z in (0.0, floor)])
+        pieces.append(primitives.revolve(ends, body.axis, 24))
+    levels = simple[:, 1].copy()
+    levels[0] = floor
+    levels = levels[(levels >= floor)]
+    angles = np.linspace(0, 2 * np.pi, sectors + 1)
+    for z0, z1 in itertools.pairwise(levels):
+        outer0, outer1 = np.interp([z0, z1], simple[:, 1], simple[:, 0])
+        for a, b in itertools.pairwise(angles):
+            corners = [
+                [body.axis[0] + r * np.cos(t), body.axis[1] + r * np.sin(t), z]
+                for t in (a, b)
+                for r, z in ((outer0, z0), (outer0 - wall, z0), (outer1, z1), (outer1 - wall, z1))
+            ]
+            hull = hull_of(np.array(corners))
+            if hull is not None:
+                pieces.append(hull)
+    return mesh, pieces
+
+
+def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, parameters: Parameters) -> tuple[list[Mesh], list[Mesh]] | None:
+    """A handle as bars in the upright plane through the body's axis: meshes and convex pieces, or ``None`` if nothing is left after carving."""
+    local = out[:, :2] - body.axis
+    direction = local.mean(axis=0)
+    angle = float(np.arctan2(direction[1], direction[0]))
+    for _ in range(3):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        low, high = np.percentile(local @ across, [4, 96])
+        angle += float(np.arctan2((low + high) / 2, np.median(local @ along)))
+    thickness = float(np.clip(high - low, 0.005, 0.03))
+    along = np.array([np.cos(angle), np.sin(angle)])
+    e_s, e_z = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
+    e_n = np.cross(e_s, e_z)
+    cell = 0.001
+    reach = float(np.percentile(local @ along, 99.5))
+    start = float(body.profile[:, 0].min()) - 0.004
+    top = float(max(body.profile[-1, 1], np.percentile(out[:, 2], 99))) + 0.004
+    s = np.arange(start, reach + 0.006, cell)
+    z = np.arange(0.0, top, cell)
+    grid_s, grid_z = np.meshgrid(s, z)
+    base = np.array([*body.axis, 0.0])
+    plane = base + grid_s[..., None] * e_s + grid_z[..., None] * e_z
+    facing = [
+        abs(float((plane.mean(axis=(0, 1)) - sight.eye) @ e_n)) / np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye) for sight in sights
+    ]
+    useful = [sight for sight, f in zip(sights, facing, strict=True) if f > 0.25]
+    splat = np.zeros(grid_s.shape, np.uint8)
+    column = np.round((local @ along - start) / cell).astype(int)
+    row = np.round(out[:, 2] / cell).astype(int)
+    good = (column >= 0) & (column < len(s)) & (row >= 0) & (row < len(z))
+    splat[row[good], column[good]] = 1
+    near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
+    if useful:
+        # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
+        columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
+        field = carve(useful, columns, max(0.02, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
+    else:
+        field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
+    within = grid_s < body.radius(grid_z)
+    attach = within & (grid_s > body.radius(grid_z) - 0.0025) & (grid_z < body.profile[-1, 1])
+    solid = (field > 0.5) & near & ~within
+    # Where the bar meets the body its points are few: join them over 5 mm.
+    reachable = cv2.dilate(attach.astype(np.uint8), np.ones((1, 11), np.uint8)) > 0
+    solid |= reachable & (field > 0.5) & ~within & (cv2.dilate(solid.astype(np.uint8), np.ones((5, 11), np.uint8)) > 0)
+    touching = attach & (cv2.dilate(solid.astype(np.uint8), np.ones((3, 7), np.uint8)) > 0)
+    solid |= touching
+    solid = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    parts = [
+        p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5
+    ]
+    # Only what reaches farther out than noise is a handle.
+    parts = [p for p in parts if p.bounds[2] - float(body.radius(np.array((p.bounds[1] + p.bounds[3]) / 2))) > 0.008]
+    if not parts:
+        return None
+    frame = transforms.make(np.column_stack([e_s, e_z, e_n]), base)
+    bars = [polygons.extrude(p, -thickness / 2, thickness / 2).transformed(frame) for p in parts]
+    pieces = [
+        polygons.prism(ring, -thickness / 2, thickness / 2).transformed(frame)
+        for p in parts
+        for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)
+    ]
+    return bars, pieces
