@@ -5,31 +5,52 @@ from __future__ import annotations
 import os
 import random
 import socket
+from pathlib import Path
 
 #: Domains whose ports lie below Linux's ephemeral ports (REP of ROS 2: 0 to 101).
 SAFE = range(1, 102)
 
+#: The first port of domain 0, and how many a domain has (RTPS 2.2, 9.6.1.1).
+FIRST_PORT, PORTS = 7400, 250
 
-def port(domain: int, participant: int = 0) -> int:
-    """The unicast discovery port of a participant (RTPS 2.2, 9.6.1.1: 7400 + 250 d + 10 + 2 p)."""
-    return 7400 + 250 * domain + 10 + 2 * participant
+#: Where Fast DDS keeps its shared memory.
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def ports(domain: int) -> range:
+    """The UDP ports of a domain (RTPS 2.2, 9.6.1.1): each participant takes two of them, the first free ones."""
+    return range(FIRST_PORT + PORTS * domain, FIRST_PORT + PORTS * (domain + 1))
 
 
 def is_free(domain: int) -> bool:
-    """Whether no participant of this machine has taken the domain's first places."""
-    for participant in range(2):
+    """Whether no participant of this machine holds a port of the domain, be it the last of many that has been left behind."""
+    for port in ports(domain):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             try:
-                sock.bind(("0.0.0.0", port(domain, participant)))
+                sock.bind(("0.0.0.0", port))
             except OSError:
                 return False
     return True
 
 
+def unclean() -> set[int]:
+    """The domains of which shared memory still holds something.
+
+    Fast DDS names its shared memory ports after the UDP ports.  What a killed process leaves of them is
+    not always recovered by the next one, which then hears nothing (Fast DDS issues 3535, 5469).
+    """
+    names = (path.name.removeprefix("fastrtps_port") for path in SHARED_MEMORY.glob("fastrtps_port*"))
+    return {(int(name) - FIRST_PORT) // PORTS for name in names if name.isdigit()}
+
+
 def free_domain(exclude: tuple[int, ...] = ()) -> int:
-    """A domain in which nobody on this machine is at work, drawn at random so that neighbours starting now differ."""
+    """A domain in which nobody on this machine is at work, drawn at random so that neighbours starting now differ.
+
+    Domains that a killed process has left something of are taken only where there are no others.
+    """
     domains = [d for d in SAFE if d not in exclude]
     random.SystemRandom().shuffle(domains)
+    domains.sort(key=unclean().__contains__)
     for domain in domains:
         if is_free(domain):
             return domain
