@@ -110,6 +110,24 @@ def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
     return tuple(t.name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)), (info.end - info.start) * 1e-9
 
 
+def first_images(bag: Path) -> dict[str, Any]:
+    """The first image of each camera topic of a bag, as messages: what the report shows.  Raises BAD_BAG."""
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import Image
+
+    from magic_bringup import bag_file
+
+    found: dict[str, Any] = {}
+    with bag_file.open_bag(bag) as reader:
+        connections = [c for c in reader.connections if c.msgcount and c.topic.endswith("/image_raw") and CAMERA_TOPIC.match(c.topic)]
+        for connection, _, data in reader.messages(connections) if connections else ():
+            if connection.topic not in found:
+                found[connection.topic] = deserialize_message(bytes(data), Image)
+            if len(found) == len(connections):
+                break
+    return found
+
+
 def perceive_seconds(heard: Mapping[str, float], topics: Collection[str], objects_at: float, replay_at: float) -> float:
     """Seconds from the first whole set of one camera's ``topics`` to ``objects_at``; ``heard``: topic -> moment of its first message."""
     cameras: dict[str, list[str]] = {}
@@ -124,7 +142,7 @@ def perceive_seconds(heard: Mapping[str, float], topics: Collection[str], object
 
 
 class Watcher:
-    """The demo's own node: hears images and objects as they pass, and runs the action.  Spins in a thread of its own."""
+    """The demo's own node: hears cameras and objects as they pass, and runs the action.  Spins in a thread of its own."""
 
     def __init__(self, topics: Sequence[str], say: Any) -> None:
         import rclpy
@@ -133,6 +151,7 @@ class Watcher:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
         from rclpy.signals import SignalHandlerOptions
+        from sensor_msgs.msg import CameraInfo
         from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
         from magic_core import qos
@@ -146,8 +165,9 @@ class Watcher:
         self.node = Node("demo")
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.changed = threading.Condition()
-        self._topics = tuple(topics)
-        self.first: dict[str, tuple[float, bytes]] = {}
+        # The camera_info of an image goes out with it and is small: hearing it tells when the image went, and burdens nobody.
+        self._topics = tuple(t for t in topics if t.endswith("camera_info"))
+        self.first: dict[str, float] = {}
         self.scene: Any = None
         self.objects_at: float | None = None
         self.complained_at: float | None = None
@@ -158,23 +178,16 @@ class Watcher:
         self.node.create_subscription(JointTrajectory, "verified_trajectory", self._on_trajectory, qos.LATCHED)
         self.node.create_subscription(MultiDOFJointTrajectory, "verified_tool_trajectory", self._on_trajectory, qos.LATCHED)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE)
-        self._camera_subs = {}
-        from sensor_msgs.msg import CameraInfo, Image
-
-        for topic in topics:
-            kind = Image if topic.endswith("image_raw") else CameraInfo
-            self._camera_subs[topic] = self.node.create_subscription(
-                kind, topic, lambda data, t=topic: self._on_raw(t, data), qos.SENSOR, raw=True
-            )
+        for topic in self._topics:
+            self.node.create_subscription(CameraInfo, topic, lambda _, t=topic: self._on_camera(t), qos.SENSOR, raw=True)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
 
-    def _on_raw(self, topic: str, data: bytes) -> None:
+    def _on_camera(self, topic: str) -> None:
         with self.changed:
-            self.first.setdefault(topic, (time.monotonic(), data))
-            self.changed.notify_all()
+            self.first.setdefault(topic, time.monotonic())
 
     def _on_objects(self, message: Any) -> None:
         with self.changed:
@@ -203,27 +216,15 @@ class Watcher:
             self.trajectory = message
             self.changed.notify_all()
 
-    def forget_cameras(self) -> None:
-        """Stop listening to the cameras once each topic was heard: their images are large."""
-        for topic in [t for t in self._camera_subs if t in self.first]:
-            self.node.destroy_subscription(self._camera_subs.pop(topic))
-
-    def images(self) -> dict[str, Any]:
-        """The first image of each image topic."""
-        from rclpy.serialization import deserialize_message
-        from sensor_msgs.msg import Image
-
-        return {t: deserialize_message(data, Image) for t, (_, data) in self.first.items() if t.endswith("image_raw")}
-
     def perceive_seconds(self) -> float:
-        """From the first moment at which a camera had sent colour, depth and camera_info, to the first objects seen by a camera; 0 without any.
+        """From the first moment at which a camera had sent colour and depth to the first objects seen by a camera; 0 without any.
 
         Where they came before this node had heard a whole set, which best-effort messages do not
         exclude: from the first that it had heard, or else from the start of the replay.
         """
         if self.objects_at is None:
             return 0.0
-        return perceive_seconds({t: at for t, (at, _) in self.first.items()}, set(self._topics), self.objects_at, self.replay_at)
+        return perceive_seconds(dict(self.first), self._topics, self.objects_at, self.replay_at)
 
     def ready(self) -> list[str]:
         """What of the graph is still missing."""
@@ -381,7 +382,6 @@ class Demo:
             # What is known by now is enough; the replay would only take time from the stages after it.
             player.sample()
             player.signal(signal.SIGINT)
-        watcher.forget_cameras()
         pending = watcher.send(options)
         if not self._wait(graph, watcher, lambda: pending.result is not None, options.timeout + 30.0):
             raise MagicError(Code.SERVER_TIMEOUT, f"the strategy_server (run_strategy) did not answer within {options.timeout + 30:g} s")
@@ -413,7 +413,7 @@ class Demo:
         memory = graph.peak_memory_mb()
         memory["demo"] = round(peak_memory(os.getpid()), 1)
         self.record.summary["peak_memory_mb"] = memory
-        self.record.images = watcher.images()
+        self.record.images = first_images(self.options.bag)
         self.record.scene = watcher.scene
 
 
