@@ -7,6 +7,7 @@ picture is drawn with v down, so "left of the walk" is meant as seen in the pict
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -46,40 +47,54 @@ class Contour:
     size: float
     centroid: NDArray[np.float64]
 
+    @cached_property
+    def flat(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """u, v and the normals' u, v (N,) each, single precision, points from the centroid: what many neighbourhoods are cut from."""
+        u, v = (np.ascontiguousarray(a, dtype=np.float32) for a in (self.points - self.centroid).T)
+        nu, nv = (np.ascontiguousarray(a, dtype=np.float32) for a in self.normals.T)
+        return u, v, nu, nv
+
     def nearest(self, pixel: ArrayLike) -> int:
         """Index of the contour point nearest to a pixel (2,)."""
-        return int(np.argmin(np.sum((self.points - np.asarray(pixel, dtype=float)) ** 2, axis=1)))
+        offset = self.points - np.asarray(pixel, dtype=float)
+        return int(np.argmin(np.einsum("ni,ni->n", offset, offset)))
 
-    def window(self, indices: NDArray[np.int64], half: int, stride: int = 1) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Neighbours along the loop, every ``stride``-th: indices (B, 2 half + 1) and which of them are there once.
+    def window(self, indices: NDArray[np.int64], offsets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Neighbours along the loop at ``offsets`` (K,), ascending steps of the walk: indices (B, K) and which of them are there once.
 
-        Column ``half`` is the point itself; a short loop is covered once, not again and again.
+        A short loop is covered once, not again and again.
         """
-        offsets = np.arange(-half, half + 1) * stride
         loop = self.loop[indices]
         start, length = self.starts[loop][:, None], self.lengths[loop][:, None]
-        position = (indices[:, None] - start + offsets) % length
         once = (offsets >= -((length - 1) // 2)) & (offsets <= length // 2)
-        return start + position, once
+        position = (indices[:, None] - start) + offsets
+        # What is there once is at most one turn away; the rest may be anywhere on the loop.
+        position += length * (position < 0)
+        position -= length * (position >= length)
+        np.clip(position, 0, length - 1, out=position)
+        position += start
+        return position, once
 
-    def sample(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The blurred mask at points (..., 2), bilinear, 0 outside the picture."""
-        flat = np.ascontiguousarray(points.reshape(-1, 2), dtype=np.float32)
-        # remap limits the sides of its maps to 32767
-        rows = -(-len(flat) // 4096)
-        padded = np.zeros((rows * 4096, 2), np.float32)
-        padded[: len(flat)] = flat
-        grid = padded.reshape(rows, 4096, 2)
-        values = cv2.remap(self.soft, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return values.ravel()[: len(flat)].reshape(points.shape[:-1])
+    def sample(self, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The blurred mask at points (R, C), sides below 32768, bilinear, 0 outside the picture."""
+        return cv2.remap(self.soft, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def level_lines(picture: NDArray[np.float32], level: float) -> list[NDArray[np.float64]]:
+    """Lines (K, 2) of one level of a picture (H, W), closed where they do not end at its border."""
+    height, width = picture.shape
+    u = np.broadcast_to(np.arange(width, dtype=float), (height, width))
+    v = np.broadcast_to(np.arange(height, dtype=float)[:, None], (height, width))
+    # For one level of one picture the oldest algorithm is the quickest by far; the others prepare for many.
+    return contour_generator(u, v, picture.astype(np.float64), name="mpl2005").lines(level)[0]
 
 
 def resample(line: NDArray[np.float64], spacing: float) -> tuple[NDArray[np.float64], float] | None:
     """A closed polyline at even steps of about ``spacing`` pixels."""
-    steps = np.hypot(*np.diff(line, axis=0).T)
-    keep = np.concatenate([[True], steps > 1e-9])
-    line = line[keep]
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    steps = np.hypot(np.diff(line[:, 0]), np.diff(line[:, 1]))
+    moved = steps > 1e-9
+    line, steps = line[np.concatenate([[True], moved])], steps[moved]
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
     total = float(arc[-1])
     if total < SMALLEST_LOOP:
         return None
@@ -99,9 +114,17 @@ def extract(mask: NDArray[np.bool_], spacing: float = 1.0, blur: float = BLUR) -
     mask = mask.astype(bool)
     if not mask.any():
         raise MagicError(Code.EMPTY_MASK, "pixels of the mask that are on the object", 0, "at least 16")
-    padded = np.pad(mask.astype(np.float32), _MARGIN)
-    soft = cv2.GaussianBlur(padded, (0, 0), blur) if blur > 0 else padded
-    lines = contour_generator(z=soft).lines(0.5)
+    rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
+    top, left = int(rows[0]), int(columns[0])
+    cut = mask[top : rows[-1] + 1, left : columns[-1] + 1]
+    moments = cv2.moments(cut.view(np.uint8), binaryImage=True)
+    whole = np.zeros((mask.shape[0] + 2 * _MARGIN, mask.shape[1] + 2 * _MARGIN), np.float32)
+    soft = whole[top : top + cut.shape[0] + 2 * _MARGIN, left : left + cut.shape[1] + 2 * _MARGIN]
+    soft[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = cut
+    if blur > 0:
+        soft[:] = cv2.GaussianBlur(soft, (0, 0), blur)
+    lines = level_lines(soft, 0.5)
+    corner = np.array([left, top], dtype=float)
     points: list[NDArray[np.float64]] = []
     normals: list[NDArray[np.float64]] = []
     spacings: list[float] = []
@@ -121,7 +144,7 @@ def extract(mask: NDArray[np.bool_], spacing: float = 1.0, blur: float = BLUR) -
         inside, outside = np.clip(probe, 0, limit), np.clip(ahead, 0, limit)
         if np.sum(soft[outside[:, 1], outside[:, 0]] - soft[inside[:, 1], inside[:, 0]]) > 0:
             loop, normal = loop[::-1], -normal[::-1]
-        points.append(loop)
+        points.append(loop + corner)
         normals.append(normal)
         spacings.append(step)
     if not points:
@@ -130,7 +153,6 @@ def extract(mask: NDArray[np.bool_], spacing: float = 1.0, blur: float = BLUR) -
     points, normals = [points[i] for i in order], [normals[i] for i in order]
     lengths = np.array([len(p) for p in points])
     everything = np.concatenate(points)
-    v, u = np.nonzero(mask)
     return Contour(
         points=everything,
         normals=np.concatenate(normals),
@@ -138,7 +160,7 @@ def extract(mask: NDArray[np.bool_], spacing: float = 1.0, blur: float = BLUR) -
         starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]),
         lengths=lengths,
         spacing=np.array([spacings[i] for i in order]),
-        soft=np.ascontiguousarray(soft[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]),
+        soft=np.ascontiguousarray(whole[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]),
         size=float(np.hypot(*(everything.max(axis=0) - everything.min(axis=0)))),
-        centroid=np.array([u.mean(), v.mean()]),
+        centroid=corner + np.array([moments["m10"], moments["m01"]]) / moments["m00"],
     )

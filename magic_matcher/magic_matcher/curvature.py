@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,6 +67,9 @@ NEAR = 5.0
 #: A radius beyond this many object sizes is a straight edge.
 STRAIGHT = 50.0
 
+#: A bow lower than this over a whole scale, px, is none.
+STRAIGHT_SAGITTA = 2e-3
+
 #: s / r this near to alpha has met it; see _functional_scale.
 TIE = 0.75
 
@@ -78,6 +82,8 @@ FAR = 2.0
 EXPLAINED_FLOOR = 10.0
 
 _RAYS, _RAY_STEPS = 96, 56
+#: Neighbourhoods whose rays are sampled at a time.
+_BLOCK = 16
 
 
 @dataclass(frozen=True)
@@ -136,63 +142,107 @@ def pyramid(size: float, count: int = SCALES) -> NDArray[np.float64]:
     return np.geomspace(low, max(LARGEST_SCALE * size, 1.5 * low), count)
 
 
-def fit(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    use: NDArray[np.bool_],
-    centres: NDArray[np.float64],
-    scales: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Parabola coefficients and normals of B neighbourhoods.
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Contour points around B centres on a walk of K steps, single precision.
 
-    points, normals (B, K, 2) of the contour, use (B, K), centres (B, 2), scales (B,)
+    u, v, distance (B, K): offsets from the centre and how far they are, px; nu, nv (B, K): the contour's normals;
+    once (B, K): which of them are there, each once; middle: the column of the centres.
+    """
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    distance: NDArray[np.float32]
+    nu: NDArray[np.float32]
+    nv: NDArray[np.float32]
+    once: NDArray[np.bool_]
+    middle: int
+
+
+def neighbourhood(contour: Contour, indices: NDArray[np.int64], offsets: NDArray[np.int64]) -> Neighbourhood:
+    """The contour points at steps ``offsets`` (K,), ascending and with 0 among them, from ``indices`` (B,)."""
+    window, once = contour.window(indices, offsets)
+    u, v, nu, nv = contour.flat
+    du, dv = u[window], v[window]
+    du -= u[indices][:, None]
+    dv -= v[indices][:, None]
+    return Neighbourhood(du, dv, np.sqrt(du * du + dv * dv), nu[window], nv[window], once, int(np.searchsorted(offsets, 0)))
+
+
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.einsum("bk,bk->b", a, b).astype(np.float64)
+
+
+def fit(around: Neighbourhood, use: NDArray[np.bool_], scales: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Parabola coefficients and normals of B neighbourhoods, of which the points ``use`` (B, K) within ``scales`` (B,) are fitted.
+
     -> a (B,), positive where convex, NaN with fewer than five points; normal (B, 2)
     outward.  The tangent is the principal component of the points within s / 2; where
     an acute tip would turn it by 90 degrees, the component that is square to the mean
     of the contour's own normals.
     """
-    u, v = points[..., 0] - centres[:, :1], points[..., 1] - centres[:, 1:]
-    near = use & (u * u + v * v <= (scales[:, None] / 2) ** 2)
-    near = np.where(near.sum(axis=1, keepdims=True) >= 5, near, use)
-    weight = near / np.maximum(near.sum(axis=1, keepdims=True), 1)
+    u, v = around.u, around.v
+    near = use & (around.distance <= (0.5 * scales).astype(np.float32)[:, None])
+    count = np.count_nonzero(near, axis=1)
+    few = count < 5
+    if few.any():
+        near[few] = use[few]
+        count[few] = np.count_nonzero(use[few], axis=1)
+    weight = near.astype(np.float32)
+    count = np.maximum(count, 1)
     # First and second moments; the centre is near the points, so that nothing is lost by subtracting them.
-    mean_u, mean_v = np.sum(weight * u, axis=1), np.sum(weight * v, axis=1)
-    uu = np.sum(weight * u * u, axis=1) - mean_u**2
-    vv = np.sum(weight * v * v, axis=1) - mean_v**2
-    uv = np.sum(weight * u * v, axis=1) - mean_u * mean_v
+    wu, wv = weight * u, weight * v
+    mean_u, mean_v = _dot(wu, weight) / count, _dot(wv, weight) / count
+    uu = _dot(wu, u) / count - mean_u**2
+    vv = _dot(wv, v) / count - mean_v**2
+    uv = _dot(wu, v) / count - mean_u * mean_v
     angle = 0.5 * np.arctan2(2 * uv, uu - vv)
     tangent = np.column_stack([np.cos(angle), np.sin(angle)])
-    outward = np.column_stack([np.sum(weight * normals[..., 0], axis=1), np.sum(weight * normals[..., 1], axis=1)])
+    outward = np.column_stack([_dot(weight, around.nu), _dot(weight, around.nv)]) / count[:, None]
     length = np.linalg.norm(outward, axis=1)
     along = np.abs(np.sum(outward * tangent, axis=1))
     turned = (along > 0.75 * length) & (length > 0.2)
     tangent = np.where(turned[:, None], np.column_stack([-tangent[:, 1], tangent[:, 0]]), tangent)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    own = normals[np.arange(len(points)), points.shape[1] // 2]
-    side = np.where(length > 0.2, np.sum(normal * outward, axis=1), np.sum(normal * own, axis=1))
+    own = np.column_stack([around.nu[:, around.middle], around.nv[:, around.middle]])
+    side = np.sum(normal * np.where((length > 0.2)[:, None], outward, own), axis=1)
     normal = np.where(side[:, None] < 0, -normal, normal)
-    x = u * tangent[:, :1] + v * tangent[:, 1:]
-    y = u * normal[:, :1] + v * normal[:, 1:]
-    x2 = np.where(use, x * x, 0.0)
-    fourth = np.sum(x2 * x2, axis=1)
+    t, n = tangent.astype(np.float32), normal.astype(np.float32)
+    x = u * t[:, :1] + v * t[:, 1:]
+    y = u * n[:, :1] + v * n[:, 1:]
+    np.multiply(x, x, out=x)
+    np.multiply(x, use, out=x)
+    fourth = _dot(x, x)
     with np.errstate(divide="ignore", invalid="ignore"):
-        a = -np.sum(x2 * y, axis=1) / fourth
-    return np.where((use.sum(axis=1) >= 5) & (fourth > 0), a, np.nan), normal
+        a = -_dot(x, y) / fourth
+    # A straight edge has no sign: what single precision leaves of it is not to be taken for one.
+    a = np.where(np.abs(a) * scales**2 < STRAIGHT_SAGITTA, 0.0, a)
+    return np.where((np.count_nonzero(use, axis=1) >= 5) & (fourth > 0), a, np.nan), normal
 
 
-def connected(distance: NDArray[np.float64], once: NDArray[np.bool_], scales: NDArray[np.float64], gap: int = GAP) -> NDArray[np.bool_]:
-    """Which points (B, K) the walk from the middle column reaches inside the disc; see ``GAP``."""
-    half = distance.shape[1] // 2
-    inside = once & (distance <= scales[:, None])
+def connected(
+    distance: NDArray[np.floating[Any]], once: NDArray[np.bool_], scales: NDArray[np.float64], middle: int, gap: int = GAP
+) -> NDArray[np.bool_]:
+    """Which points (B, K) the walk from the column ``middle`` reaches inside the disc; see ``GAP``."""
+    inside = distance <= scales[:, None].astype(distance.dtype)
+    inside &= once
 
-    def walk(part: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        position = np.arange(part.shape[1])
-        last = np.maximum.accumulate(np.where(part, position, 0), axis=1)
-        return part & ~np.logical_or.accumulate(position - last > gap, axis=1)
+    def walk(part: NDArray[np.bool_]) -> None:
+        # Here ``part`` is a view: what lies behind the first wide gap is taken out of it.
+        position = np.arange(part.shape[1], dtype=np.int32)
+        if gap == 0:
+            broken = ~part
+            broken[:, 0] = False
+        else:
+            last = np.maximum.accumulate(part * position, axis=1)
+            broken = position - last > gap
+        first = np.argmax(broken, axis=1)
+        there = np.nonzero(first)[0]
+        part[there] &= position < first[there, None]
 
-    forward = walk(inside[:, half:])
-    backward = walk(inside[:, half::-1])[:, ::-1]
-    return np.concatenate([backward[:, :-1], forward], axis=1)
+    walk(inside[:, middle:])
+    walk(inside[:, middle::-1])
+    return inside
 
 
 def clearance(
@@ -203,30 +253,49 @@ def clearance(
     The first 1.5 px, in which the ray leaves the edge it starts from, are passed over.
     """
     reach = np.broadcast_to(np.asarray(reach, dtype=float), (len(points),))
-    at = 1.5 + np.linspace(0.0, 1.0, steps) * np.maximum(reach - 1.5, 0.5)[:, None]
-    material = contour.sample(points[:, None, :] + at[..., None] * directions[:, None, :]) > 0.5
-    changed = material != material[:, :1]
-    first = np.argmax(changed, axis=1)
-    return np.where(changed.any(axis=1), at[np.arange(len(points)), first], reach)
+    at = (1.5 + np.linspace(0.0, 1.0, steps) * np.maximum(reach - 1.5, 0.5)[:, None]).astype(np.float32)
+    start, step = points.astype(np.float32), directions.astype(np.float32)
+    material = contour.sample(start[:, :1] + at * step[:, :1], start[:, 1:] + at * step[:, 1:]) > 0.5
+    first = np.argmax(material != material[:, :1], axis=1)
+    return np.where(first > 0, at[np.arange(len(points)), first], reach)
 
 
-def visible(contour: Contour, sources: NDArray[np.float64], points: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (B, K, 2) are hit first by rays from their source (B, 2), out to ``reach`` (B,) pixels."""
+@lru_cache(maxsize=1)
+def _rays() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     angles = (np.arange(_RAYS) + 0.5) * (2 * np.pi / _RAYS)
-    rays = np.column_stack([np.cos(angles), np.sin(angles)])
-    radii = np.linspace(0.0, 1.0, _RAY_STEPS) * reach[:, None]
-    grid = sources[:, None, None, :] + radii[:, None, :, None] * rays[None, :, None, :]
-    material = contour.sample(grid) > 0.5
-    changed = material != material[:, :, :1]
-    first = np.where(changed.any(axis=2), np.argmax(changed, axis=2), _RAY_STEPS)
+    return np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
+
+
+def visible(
+    contour: Contour,
+    sources: NDArray[np.float64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    reach: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Which points (B, K), given by their offsets u, v from their source (B, 2), its rays hit first, out to ``reach`` (B,) pixels."""
+    cosine, sine = _rays()
+    radii = (np.linspace(0.0, 1.0, _RAY_STEPS) * reach[:, None]).astype(np.float32)[:, None, :]
+    start = sources.astype(np.float32)
+    first = np.empty((len(sources), _RAYS), np.int64)
+    for part in range(0, len(sources), _BLOCK):  # so that what is sampled stays in the processor's cache
+        rows = slice(part, part + _BLOCK)
+        grid_u = radii[rows] * cosine[:, None]
+        grid_v = radii[rows] * sine[:, None]
+        grid_u += start[rows, 0, None, None]
+        grid_v += start[rows, 1, None, None]
+        material = contour.sample(grid_u.reshape(-1, _RAY_STEPS), grid_v.reshape(-1, _RAY_STEPS)) > 0.5
+        first[rows] = np.argmax(material != material[:, :1], axis=1).reshape(-1, _RAYS)
+    first[first == 0] = _RAY_STEPS
     hit = first * (reach / (_RAY_STEPS - 1))[:, None]
     # A ray that grazes an edge may meet it anywhere between its neighbours' hits.
     hit = np.maximum(hit, np.maximum(np.roll(hit, 1, axis=1), np.roll(hit, -1, axis=1)))
-    offset = points - sources[:, None, :]
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    column = ((np.arctan2(offset[..., 1], offset[..., 0]) % (2 * np.pi)) * (_RAYS / (2 * np.pi))).astype(int) % _RAYS
-    slack = 2.0 + (reach / (_RAY_STEPS - 1))[:, None]
-    return distance <= np.take_along_axis(hit, column, axis=1) + slack
+    hit = (hit + (2.0 + reach / (_RAY_STEPS - 1))[:, None]).astype(np.float32)
+    column = (np.arctan2(v, u) * np.float32(_RAYS / (2 * np.pi))).astype(np.int32)
+    # Truncated towards zero: one less for what is negative is its floor but on a ray's very border.
+    column -= v < 0
+    column %= _RAYS
+    return np.sqrt(u * u + v * v) <= np.take_along_axis(hit, column, axis=1)
 
 
 def measure(
@@ -246,24 +315,22 @@ def measure(
     S lies ``NEAR`` px along the normal on the side that sign asks for.  suppress=False
     stops after the first estimate (ablation).
     """
-    order = np.argsort(scales)
-    if len(order) > 4 and scales[order[-1]] > 3 * scales[order[0]]:
+    levels = np.unique(scales)
+    if len(levels) > 4 and levels[-1] > 3 * levels[0]:
         # Small and large scales apart: neither needs the other's reach or the other's density.
         a, normal, extent = np.empty(len(scales)), np.empty((len(scales), 2)), np.empty(len(scales))
-        for part in np.array_split(order, 2):
+        large = scales >= levels[(len(levels) + 1) // 2]
+        for part in (~large, large):
             a[part], normal[part], extent[part] = measure(contour, indices[part], scales[part], concave, suppress)
         return a, normal, extent
     # Any arc that stays within s and can be taken for one edge is shorter than a full circle of radius s.
-    stride = max(1, int(scales.min() / DENSITY))
-    half = int(np.ceil(min(np.pi * float(scales.max()), float(contour.lengths.max())) / stride)) + 1
+    stride = max(1, int(levels[0] / DENSITY))
+    half = int(np.ceil(min(np.pi * float(levels[-1]), float(contour.lengths.max())) / stride)) + 1
     gap = max(1, GAP // stride)
-    window, once = contour.window(indices, half, stride)
-    points, normals = contour.points[window], contour.normals[window]
-    centres = contour.points[indices]
-    distance = np.hypot(*(points - centres[:, None, :]).transpose(2, 0, 1))
-    use = connected(distance, once, scales, gap)
-    a, normal = fit(points, normals, use, centres, scales)
-    extent = _extent(distance, use)
+    around = neighbourhood(contour, indices, np.arange(-half, half + 1) * stride)
+    use = connected(around.distance, around.once, scales, half, gap)
+    a, normal = fit(around, use, scales)
+    extent = _extent(around.distance, use, half)
     if not suppress:
         return a, normal, extent
     curvature = arc_curvature(np.nan_to_num(a), extent)
@@ -272,39 +339,37 @@ def measure(
     direction = np.where(outside[:, None], normal, -normal)
     delta = np.where(agrees, 0.5 / np.maximum(np.abs(curvature), 1e-9), NEAR)
     delta = np.minimum(delta, 0.5 * scales)
+    centres = contour.points[indices]
     free = clearance(contour, centres, direction, 2 * delta + 3.0)
     delta = np.maximum(np.minimum(delta, 0.5 * free), 1.0)
-    sources = centres + delta[:, None] * direction
-    seen = visible(contour, sources, points, scales + delta)
+    shift = delta[:, None] * direction
+    near = shift.astype(np.float32)
+    seen = visible(contour, centres + shift, around.u - near[:, :1], around.v - near[:, 1:], scales + delta)
     seen[:, half] = True
-    second = use & seen
     # Suppression may open gaps: what lies behind one is another edge.
-    second = connected(np.where(second, distance, np.inf), once, scales, gap)
-    enough = second.sum(axis=1) >= np.maximum(5, 0.25 * use.sum(axis=1))
-    second = np.where(enough[:, None], second, use)
-    return *fit(points, normals, second, centres, scales), _extent(distance, second)
+    second = connected(around.distance, use & seen, scales, half, gap)
+    enough = np.count_nonzero(second, axis=1) >= np.maximum(5, 0.25 * np.count_nonzero(use, axis=1))
+    second[~enough] = use[~enough]
+    return *fit(around, second, scales), _extent(around.distance, second, half)
 
 
-def _extent(distance: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _extent(distance: NDArray[np.float32], use: NDArray[np.bool_], middle: int) -> NDArray[np.float64]:
     """How far (B,) the used points reach; unequal sides are joined as they weigh in the fit, with the fifth power."""
-    half = distance.shape[1] // 2
-    reached = np.where(use, distance, 0.0)
-    sides = np.stack([reached[:, : half + 1].max(axis=1), reached[:, half:].max(axis=1)])
+    reached = distance * use
+    sides = np.stack([reached[:, : middle + 1].max(axis=1), reached[:, middle:].max(axis=1)]).astype(np.float64)
     return np.maximum(np.mean(sides**5, axis=0) ** 0.2, 1e-6)
 
 
 def curvature_map(contour: Contour, indices: NDArray[np.int64], scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Signed curvature (B,) 1/px and normals (B, 2) at many contour points and one scale, without suppression."""
     half = int(np.ceil(min(np.pi * scale, float(contour.lengths.max())))) + 1
-    window, once = contour.window(indices, half)
     # 32 points a side tell as much as all of them.
-    columns = half + np.unique(np.rint(np.linspace(-half, half, 65)).astype(int))
-    window, once = window[:, columns], once[:, columns]
-    points, centres = contour.points[window], contour.points[indices]
-    distance = np.hypot(points[..., 0] - centres[:, :1], points[..., 1] - centres[:, 1:])
-    use = connected(distance, once, np.full(len(indices), float(scale)), 0)
-    a, normal = fit(points, contour.normals[window], use, centres, np.full(len(indices), float(scale)))
-    return arc_curvature(np.nan_to_num(a), _extent(distance, use)), normal
+    offsets = np.unique(np.rint(np.linspace(-half, half, 65)).astype(int))
+    around = neighbourhood(contour, indices, offsets)
+    scales = np.full(len(indices), float(scale))
+    use = connected(around.distance, around.once, scales, around.middle, 0)
+    a, normal = fit(around, use, scales)
+    return arc_curvature(np.nan_to_num(a), _extent(around.distance, use, around.middle)), normal
 
 
 def _search(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -314,7 +379,7 @@ def _search(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.fl
     best = np.full(len(indices), np.inf)
     for sign in (1.0, -1.0):
         distance = clearance(contour, points, sign * normals, reach)
-        there = (distance < reach - 1e-6) & (distance < best)
+        there = (distance < reach - 1e-4) & (distance < best)
         for i in np.nonzero(there)[0]:
             result[i] = contour.nearest(points[i] + sign * distance[i] * normals[i])
         best = np.where(there, distance, best)
@@ -347,42 +412,59 @@ def _bend(a: float, b: float, c: float, d: float, e: float) -> float:
     return float((2 * a * fy * fy - 2 * c * fx * fy + 2 * b * fx * fx) / (fx * fx + fy * fy) ** 1.5)
 
 
+def _models(
+    x: NDArray[np.float64], y: NDArray[np.float64], use: NDArray[np.bool_], scales: NDArray[np.float64], circle: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Curvatures (J,), 1/px, and root mean squares of what is left (J,), px, of a circle or a conic through points x, y (K,),
+    y along the inward normal, fitted to those of ``use`` (J, K) within ``scales`` (J,)."""
+    one = np.ones_like(x)
+    basis = np.stack((x * x + y * y, x, one) if circle else (x * x, y * y, x * y, x, one), axis=1)
+    number = basis.shape[1]
+    products = np.column_stack([(basis[:, :, None] * basis[:, None, :]).reshape(len(x), -1), basis * y[:, None], y * y])
+    sums = use.astype(np.float64) @ products
+    count = np.maximum(use.sum(axis=1), 1)
+    # In units of the scale, so that all unknowns weigh alike.
+    units = scales[:, None] ** np.array([2, 1, 0] if circle else [2, 2, 2, 1, 0])
+    left = sums[:, : number**2].reshape(-1, number, number) / (units[:, :, None] * units[:, None, :])
+    right = sums[:, number**2 : -1] / (units * scales[:, None])
+    fitted = np.linalg.solve(left + 1e-7 * count[:, None, None] * np.eye(number), right[..., None])[..., 0]
+    square = sums[:, -1] / scales**2 - 2 * np.sum(fitted * right, axis=1) + np.einsum("ji,jik,jk->j", fitted, left, fitted)
+    residue = scales * np.sqrt(np.maximum(square, 0.0) / count)
+    bends = [_bend(f[0], f[0], 0.0, f[1], f[2]) if circle else _bend(*f) for f in fitted.tolist()]
+    return np.array(bends) / scales, residue
+
+
 def explained(contour: Contour, index: int, normal: NDArray[np.float64], scales: NDArray[np.float64]) -> tuple[float, float] | None:
     """Signed curvature (1/px, positive: convex) at the largest of ``scales`` at which a circle or a conic explains the edge,
     and that scale; ``None`` where there is none.  ``normal`` (2,) is the contact's, outward."""
-    scales = np.sort(scales[scales >= EXPLAINED_FLOOR])
+    scales = np.sort(scales[scales >= EXPLAINED_FLOOR])[::-1]
     if not len(scales):
         return None
-    half = int(np.ceil(min(np.pi * float(scales[-1]), float(contour.lengths.max())))) + 1
-    window, once = contour.window(np.array([index]), half)
+    half = int(np.ceil(min(np.pi * float(scales[0]), float(contour.lengths.max())))) + 1
+    window, once = contour.window(np.array([index]), np.arange(-half, half + 1))
     local = contour.points[window[0]] - contour.points[index]
-    distance = np.hypot(*local.T)
-    use = connected(np.broadcast_to(distance, (len(scales), len(distance))), np.broadcast_to(once, (len(scales), len(distance))), scales)
+    distance = np.hypot(local[:, 0], local[:, 1])
+    use = connected(np.broadcast_to(distance, (len(scales), len(distance))), once, scales, half)
+    # Where a side is shorter the edge ends within the scale.
+    whole = np.minimum(np.count_nonzero(use[:, :half], axis=1), np.count_nonzero(use[:, half + 1 :], axis=1)) >= 0.5 * scales
+    if not whole.any():
+        return None
+    largest = float(scales[0])
+    scales, use = scales[whole], use[whole]
     tangent = np.array([-normal[1], normal[0]])
-    curve: tuple[float, float] | None = None
-    for scale, part in zip(scales[::-1], use[::-1], strict=True):
-        if curve is not None and scale < curve[1] / FAR:
-            break
-        sides = part[:half].sum(), part[half + 1 :].sum()
-        if min(sides) < 0.5 * scale:  # the edge ends within the scale
-            continue
-        x, y = local[part] @ tangent / scale, -(local[part] @ normal) / scale
-        one = np.ones(len(x))
-        for columns in ((x * x + y * y, x, one), (x * x, y * y, x * y, x, one)):
-            if len(columns) > 3 and curve is not None:
-                break
-            basis = np.column_stack(columns)
-            fitted = np.linalg.solve(basis.T @ basis + 1e-7 * len(x) * np.eye(len(columns)), basis.T @ y)
-            if scale * float(np.sqrt(np.mean((y - basis @ fitted) ** 2))) > RESIDUE:
-                continue
-            if len(columns) == 3:
-                return _bend(fitted[0], fitted[0], 0.0, *fitted[1:]) / scale, float(scale)
-            bend = _bend(*fitted)
-            if abs(bend) <= ALPHA:  # else it is a corner's arms that look like a hyperbola
-                curve = bend / scale, float(scale)
-        if curve is not None and curve[1] == scales[-1]:  # all there is to see
-            break
-    return curve
+    x, y = local @ tangent, -(local @ normal)
+    circles, left = _models(x, y, use, scales, True)
+    circle = int(np.argmax(left <= RESIDUE)) if (left <= RESIDUE).any() else len(scales)
+    if circle == 0:
+        return float(circles[0]), float(scales[0])
+    conics, left = _models(x, y, use[:circle], scales[:circle], False)
+    # More bent than this it is a corner's arms that look like a hyperbola.
+    fits = (left <= RESIDUE) & (np.abs(conics) * scales[:circle] <= ALPHA)
+    if fits.any():
+        conic = int(np.argmax(fits))
+        if circle == len(scales) or scales[circle] < scales[conic] / FAR or scales[conic] == largest:
+            return float(conics[conic]), float(scales[conic])
+    return (float(circles[circle]), float(scales[circle])) if circle < len(scales) else None
 
 
 def estimate(
@@ -398,31 +480,66 @@ def estimate(
     the convexity search, scale by scale, and only scales with that sign are accepted,
     if there is one.  Raises ``NO_CURVATURE`` where no scale has enough points.
     """
+    found = estimate_many(contour, np.array([int(index)]), concave, scales, two_step)[0]
+    if found is None:
+        raise MagicError(
+            Code.NO_CURVATURE, "contour points around the contact", int(contour.lengths[contour.loop[index]]), "at least 5 on its edge"
+        )
+    return found
+
+
+def estimate_many(
+    contour: Contour,
+    starts: NDArray[np.int64],
+    concave: bool | None = None,
+    scales: NDArray[np.float64] | None = None,
+    two_step: bool = True,
+) -> list[Estimate | None]:
+    """As :func:`estimate` at several contour points (P,) together; ``None`` where no scale has enough points."""
     scales = pyramid(contour.size) if scales is None else np.asarray(scales, dtype=float)
-    indices = np.full(len(scales), int(index))
-    a, normal, extent = measure(contour, indices, scales, concave, suppress=two_step)
+    if not len(starts):
+        return []
+    indices, level = np.repeat(np.asarray(starts, dtype=np.int64), len(scales)), np.tile(scales, len(starts))
+    a, normal, extent = measure(contour, indices, level, concave, suppress=two_step)
     if concave is not None and two_step:
         wrong = np.isfinite(a) & ((a < 0) != concave)
-        if wrong.any() and not (np.isfinite(a) & ~wrong).any():
+        right = (np.isfinite(a) & ~wrong).reshape(len(starts), -1).any(axis=1)
+        wrong &= ~np.repeat(right, len(scales))
+        if wrong.any():
             moved = indices.copy()
-            moved[wrong] = _search(contour, indices[wrong], normal[wrong], np.maximum(scales[wrong], 2 * NEAR))
+            moved[wrong] = _search(contour, indices[wrong], normal[wrong], np.maximum(level[wrong], 2 * NEAR))
             retry = np.nonzero(moved != indices)[0]
             if len(retry):
-                a2, normal2, extent2 = measure(contour, moved[retry], scales[retry], concave)
+                a2, normal2, extent2 = measure(contour, moved[retry], level[retry], concave)
                 better = np.isfinite(a2) & ((a2 < 0) == concave)
                 accepted = retry[better]
                 indices[accepted], a[accepted] = moved[accepted], a2[better]
                 normal[accepted], extent[accepted] = normal2[better], extent2[better]
+    curvature = arc_curvature(np.nan_to_num(a), extent)
+    shape = (len(starts), len(scales))
+    parts = (indices.reshape(shape), a.reshape(shape), normal.reshape(*shape, 2), extent.reshape(shape), curvature.reshape(shape))
+    return [_accept(contour, scales, concave, two_step, *row) for row in zip(*parts, strict=True)]
+
+
+def _accept(
+    contour: Contour,
+    scales: NDArray[np.float64],
+    concave: bool | None,
+    two_step: bool,
+    indices: NDArray[np.int64],
+    a: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    extent: NDArray[np.float64],
+    curvature: NDArray[np.float64],
+) -> Estimate | None:
+    """The best across the scales (J,) of one contour point, ``None`` where none has enough points."""
     with np.errstate(invalid="ignore"):
         value = extent * 2 * np.abs(a)
     usable = np.isfinite(value)
     if concave is not None and (usable & ((a < 0) == concave)).any():
         usable &= (a < 0) == concave
     if not usable.any():
-        raise MagicError(
-            Code.NO_CURVATURE, "contour points around the contact", int(contour.lengths[contour.loop[index]]), "at least 5 on its edge"
-        )
-    curvature = arc_curvature(np.nan_to_num(a), extent)
+        return None
     best, share = _functional_scale(value, usable, (a < 0), indices)
     scale, signed = float(scales[best]), float(curvature[best])
     direction = normal[best]

@@ -100,23 +100,32 @@ LATERAL = ("mass across", "far across")
 
 
 def _sample_pyramid(
-    soft: NDArray[np.float32], centres: NDArray[np.float64], normals: NDArray[np.float64], radii: NDArray[np.float64]
+    contour: Contour, centres: NDArray[np.float64], normals: NDArray[np.float64], radii: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Occupancy (B, R, SECTORS) around centres (B, 2) at radii (R,) px, each ring in a picture blurred to its own coarseness."""
-    angle = np.arctan2(normals[:, 1], normals[:, 0])[:, None] + np.arange(SECTORS) * (2 * np.pi / SECTORS)
-    cosine, sine = np.cos(angle), np.sin(angle)
+    soft = contour.soft
+    # Normal and tangent turned through the sectors.
+    angle = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    cosine = normals[:, :1] * np.cos(angle) - normals[:, 1:] * np.sin(angle)
+    sine = normals[:, 1:] * np.cos(angle) + normals[:, :1] * np.sin(angle)
+    cosine, sine = cosine.astype(np.float32), sine.astype(np.float32)
+    low, high = contour.points.min(axis=0), contour.points.max(axis=0)
     result = np.empty((len(centres), len(radii), SECTORS), np.float32)
     for ring, radius in enumerate(radii):
         sigma = float(np.clip(0.22 * radius, 0.6, 24.0))
         # Wide blurs are taken from a smaller picture: the blur has removed what that loses.
         step = int(max(1, 2 ** int(np.log2(max(sigma / 2.0, 1.0)))))
-        picture = cv2.resize(soft, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else soft
+        # Beyond where the blur carries the object there is nothing; the cut keeps to the smaller picture's pixels.
+        left, top = (max(0, int(a - 4 * sigma) // step * step) for a in low)
+        right, bottom = (int(a + 4 * sigma) // step * step + step for a in high)
+        cut = np.ascontiguousarray(soft[top:bottom, left:right])
+        picture = cv2.resize(cut, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else cut
         picture = cv2.GaussianBlur(picture, (0, 0), max(sigma / step, 0.5), borderType=cv2.BORDER_CONSTANT)
-        u = (centres[:, 0:1] + radius * cosine + 0.5) / step - 0.5
-        v = (centres[:, 1:2] + radius * sine + 0.5) / step - 0.5
-        result[:, ring] = cv2.remap(
-            picture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-        )
+        u = cosine * np.float32(radius / step)
+        u += ((centres[:, 0:1] - left + 0.5) / step - 0.5).astype(np.float32)
+        v = sine * np.float32(radius / step)
+        v += ((centres[:, 1:2] - top + 0.5) / step - 0.5).astype(np.float32)
+        result[:, ring] = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return result
 
 
@@ -124,37 +133,39 @@ def _wells(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.flo
     """Depth (B, 2) px of the hollow to the left and right of the contact: the highest rise along
     the normal on the walk along the edge before it falls below the contact."""
     result = np.zeros((len(indices), 2))
-    tolerance, points = 0.015 * contour.size, contour.points
+    tolerance = np.float32(0.015 * contour.size)
+    u, v, _, _ = contour.flat
+    out = normals.astype(np.float32)
     for loop in np.unique(contour.loop[indices]):
         rows = np.nonzero(contour.loop[indices] == loop)[0]
         start, length = int(contour.starts[loop]), int(contour.lengths[loop])
         stride = max(1, length // 360)
         steps = np.arange(0, length, stride)
+        here = indices[rows]
+        # The loop twice, so that a walk once around from anywhere needs no turning back.
+        twice = slice(start, start + length)
+        u2, v2 = np.concatenate([u[twice], u[twice]]), np.concatenate([v[twice], v[twice]])
+        level = (u[here] * out[rows, 0] + v[here] * out[rows, 1])[:, None]
         for side, sign in enumerate((1, -1)):
-            walk = start + (indices[rows, None] - start + sign * steps) % length
-            here, out = contour.points[indices[rows]], normals[rows]
-            height = (points[walk, 0] - here[:, :1]) * out[:, :1] + (points[walk, 1] - here[:, 1:]) * out[:, 1:]
-            fallen = np.logical_or.accumulate(height < -tolerance, axis=1)
-            result[rows, side] = np.maximum(np.where(fallen, 0.0, height).max(axis=1), 0.0)
+            walk = (here - start if sign > 0 else here - start + length)[:, None] + sign * steps
+            height = u2[walk]
+            height *= out[rows, :1]
+            height += v2[walk] * out[rows, 1:]
+            height -= level
+            fallen = np.argmax(height < -tolerance, axis=1)
+            fallen = np.where(fallen > 0, fallen, len(steps))
+            height[np.arange(len(steps)) >= fallen[:, None]] = 0.0
+            result[rows, side] = np.maximum(height.max(axis=1), 0.0)
     return result
 
 
-def _fit(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.float64], probe: float) -> NDArray[np.float64]:
+def _fit(around: holding.Room, points: NDArray[np.float64], normals: NDArray[np.float64], probe: float) -> NDArray[np.float64]:
     """Share (B,) of the disc's radius that is free before the contact, 0..1.
 
     The disc need not touch the very point: in a sharp corner its centre stands off by
     more than its radius, sqrt(2) times in a right angle.
     """
-    margin = int(np.ceil(2 * probe)) + 2
-    free = (np.pad(contour.soft, margin) <= 0.5).astype(np.uint8)
-    room = cv2.distanceTransform(free, cv2.DIST_L2, 3)
-    best = np.zeros(len(points))
-    for step in (1.0, 1.2, 1.45):
-        at = points + step * probe * normals + margin
-        value = cv2.remap(
-            room, at[None, :, 0].astype(np.float32), at[None, :, 1].astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        best = np.maximum(best, value[0])
+    best = np.max([around.at(points + step * probe * normals) for step in (1.0, 1.2, 1.45)], axis=0)
     return np.clip((best + 1.0) / probe, 0.0, 1.0)
 
 
@@ -163,21 +174,23 @@ def describe(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.f
     size = contour.size
     points = contour.points[indices]
     left = np.column_stack([-normals[:, 1], normals[:, 0]])
-    wide = _sample_pyramid(contour.soft, points, normals, WIDE_RADII * size)
-    around = _sample_pyramid(contour.soft, points + probe * normals, normals, PROBE_RADII * probe)
+    wide = _sample_pyramid(contour, points, normals, WIDE_RADII * size)
+    around = _sample_pyramid(contour, points + probe * normals, normals, PROBE_RADII * probe)
     bends = []
     for scale in (*(s * size for s in BEND_SIZE), *(s * probe for s in BEND_PROBE)):
         scale = float(np.clip(scale, 4.0, 0.5 * size))
         bends.append(np.tanh(curvature.curvature_map(contour, indices, scale)[0] * scale))
     mass = contour.centroid - points
+    # The farthest of the contour's points: |q|^2 - 2 p q is greatest for it.
     spread = contour.points[:: max(1, len(contour.points) // 200)]
-    gaps = np.hypot(*(spread[None] - points[:, None]).transpose(2, 0, 1))
-    far = spread[np.argmax(gaps, axis=1)] - points
+    away = spread - contour.centroid
+    far = spread[np.argmax(np.sum(away * away, axis=1) - 2 * (points - contour.centroid) @ away.T, axis=1)] - points
     thickness = curvature.clearance(contour, points, -normals, 0.5 * size, 96)
     way = curvature.clearance(contour, points, normals, 0.7 * size, 96)
     wells = _wells(contour, indices, normals)
     shallow = wells.min(axis=1)
-    held = holding.hold(contour, points, normals, probe)
+    around_tool = holding.room(contour, probe)
+    held = holding.hold(contour, points, normals, probe, around_tool)
     scalars = np.column_stack(
         [
             *bends,
@@ -190,7 +203,7 @@ def describe(contour: Contour, indices: NDArray[np.int64], normals: NDArray[np.f
             np.tanh(way / (4 * probe)),
             np.tanh(shallow / (1.5 * probe)),
             np.tanh(shallow / (0.15 * size)),
-            _fit(contour, points, normals, probe),
+            _fit(around_tool, points, normals, probe),
             np.tanh(np.minimum(held.gap, 9.0)),
             np.tanh(np.minimum(held.drift, 9.0)),
             np.tanh(held.press / 0.8),

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from contourpy import contour_generator
 from numpy.typing import NDArray
 
-from magic_matcher.contour import Contour, resample
+from magic_matcher.contour import Contour, level_lines, resample
 
 #: Rises and falls below this share of the radius (and of a pixel or two) are the raster's.
 TOLERANCE = 0.04
@@ -45,14 +44,38 @@ class Held:
     start: NDArray[np.float64]
 
 
-def centres(contour: Contour, radius: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+@dataclass(frozen=True)
+class Room:
+    """How much room is around a tool: distance (H, W) float32 px to it, 0 on it; corner (2,): the picture's pixel (0, 0) in it."""
+
+    distance: NDArray[np.float32]
+    corner: NDArray[np.float64]
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """The room (B,) at points (B, 2); beyond the border as on it."""
+        u, v = (np.ascontiguousarray(a[None], dtype=np.float32) for a in (points + self.corner).T)
+        return cv2.remap(self.distance, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+
+
+def room(contour: Contour, radius: float) -> Room:
+    """The room around a tool, as far as a disc of ``radius`` px can be from touching it."""
+    margin = int(np.ceil(radius)) + 4
+    low = np.floor(contour.points.min(axis=0)).astype(int) - 1
+    high = np.ceil(contour.points.max(axis=0)).astype(int) + 2
+    first, last = np.maximum(low, 0), np.minimum(high, np.array(contour.soft.shape)[::-1])
+    free = np.ones(tuple((high - low)[::-1] + 2 * margin), np.uint8)
+    left, top = first - low + margin
+    cut = contour.soft[first[1] : last[1], first[0] : last[0]]
+    free[top : top + cut.shape[0], left : left + cut.shape[1]] = cut <= 0.5
+    return Room(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), (margin - low).astype(float))
+
+
+def centres(around: Room, radius: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Closed curves (K, 2) of the centres of touching discs, px, and their unit normals (K, 2) into the open."""
-    margin = int(np.ceil(2 * radius)) + 4
-    free = (np.pad(contour.soft, margin) <= 0.5).astype(np.uint8)
-    room = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # Distances are to the nearest pixel of the tool, half a pixel beyond its edge.
-    lines = contour_generator(z=room).lines(max(0.97 * radius + 0.5, 0.75))
+    lines = level_lines(around.distance, max(0.97 * radius + 0.5, 0.75))
     spacing = max(1.5, radius / 7)
+    limit = np.array(around.distance.shape)[::-1] - 1
     result = []
     for line in lines:
         sampled = resample(line, spacing) if len(line) > 3 else None
@@ -60,88 +83,118 @@ def centres(contour: Contour, radius: float) -> list[tuple[NDArray[np.float64], 
             continue
         curve = sampled[0]
         tangent = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
-        normal = np.column_stack([tangent[:, 1], -tangent[:, 0]]) / np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
-        inner, outer = (np.clip(np.rint(curve + sign * 2.0 * normal).astype(int), 0, np.array(room.shape)[::-1] - 1) for sign in (-1, 1))
-        if np.sum(room[outer[:, 1], outer[:, 0]] - room[inner[:, 1], inner[:, 0]]) < 0:
+        normal = np.column_stack([tangent[:, 1], -tangent[:, 0]]) / np.maximum(np.hypot(tangent[:, 0], tangent[:, 1]), 1e-9)[:, None]
+        inner, outer = (np.clip(np.rint(curve + sign * 2.0 * normal).astype(int), 0, limit) for sign in (-1, 1))
+        if np.sum(around.distance[outer[:, 1], outer[:, 0]] - around.distance[inner[:, 1], inner[:, 0]]) < 0:
             normal = -normal
-        result.append((curve - margin, normal))
+        result.append((curve - around.corner, normal))
     return result
 
 
-def _descend(height: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _walks(heights: NDArray[np.float32], start: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
+    """Heights (B, K) met on walks once around a curve from ``start`` (B,), forwards or backwards; ``heights`` (B, K), or (1, K) for all alike."""
+    count = heights.shape[1]
+    if sign < 0:
+        # Backwards from k is forwards from K - 1 - k on the reversed curve.
+        heights, start = heights[:, ::-1], count - 1 - start
+    doubled = np.concatenate([heights, heights[:, :-1]], axis=1)
+    row, column = doubled.strides
+    # Every walk is a stretch of its own row: seen, not copied.
+    stretches = np.lib.stride_tricks.as_strided(doubled, (len(doubled), count, count), (row, column, column), writeable=False)
+    return stretches[np.arange(len(start)) if len(heights) > 1 else 0, start]
+
+
+def _descend(height: NDArray[np.float32], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Step (B,) and height (B,) of the lowest point of walks (B, K) before they climb by more than ``tolerance`` above it."""
     lowest = np.minimum.accumulate(height, axis=1)
-    climbed = np.logical_or.accumulate(height > lowest + tolerance, axis=1)
-    reachable = np.where(climbed, np.inf, height)
-    step = np.argmin(reachable, axis=1)
-    return step, reachable[np.arange(len(height)), step]
+    climbed = height - lowest > tolerance
+    last = np.argmax(climbed, axis=1)
+    last = np.where(last > 0, last, height.shape[1]) - 1
+    value = lowest[np.arange(len(height)), last]
+    return np.argmax(height <= value[:, None], axis=1), value
 
 
-def _climb(height: NDArray[np.float64], base: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+def _climb(height: NDArray[np.float32], base: NDArray[np.float32], tolerance: float) -> NDArray[np.float32]:
     """Highest rise (B,) above ``base`` on walks (B, K) before they fall below it."""
-    rise = height - base[:, None]
-    fallen = np.logical_or.accumulate(rise < -tolerance, axis=1)
-    return np.maximum(np.where(fallen, 0.0, rise).max(axis=1), 0.0)
+    fallen = height < (base - tolerance)[:, None]
+    last = np.argmax(fallen, axis=1)
+    last = np.where(last > 0, last, height.shape[1])
+    highest = np.where(np.arange(height.shape[1]) < last[:, None], height, -np.inf).max(axis=1)
+    return np.maximum(highest - base, 0.0)
 
 
 def _settle(
-    curve: NDArray[np.float64], at: NDArray[np.int64], value: NDArray[np.float64], tolerance: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Index (B,) where discs come to rest that start ``at`` (B,) on a curve with heights ``value`` (B, K), and the depths (B, 2)."""
+    curve: NDArray[np.float64],
+    free: NDArray[np.float64],
+    up: NDArray[np.float64],
+    at: NDArray[np.int64],
+    value: NDArray[np.float32],
+    tolerance: float,
+    by_place: bool,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Index (B,) where discs come to rest that start ``at`` (B,) on a curve (K, 2) with heights ``value`` (B, K).
+
+    Also the depths (B, 2) of the hollows, px, and whether (B,) the discs lie in them: a
+    lowest place that hangs over is none, the disc left the tool before it.  There ``free`` (K, 2),
+    the ways into the open, do not point up, along unit directions ``up`` (B, 2).  by_place:
+    heights (1, K) and ``up`` (K, 2) belong to the places and are the same for all discs.
+    """
     count = len(curve)
-    rows = np.arange(len(at))
-    steps = np.arange(count)
-
-    def walk(start: NDArray[np.int64], sign: int) -> NDArray[np.float64]:
-        return np.take_along_axis(value, (start[:, None] + sign * steps) % count, axis=1)
-
-    (ahead, low_ahead), (back, low_back) = (_descend(walk(at, sign), tolerance) for sign in (1, -1))
+    (ahead, low_ahead), (back, low_back) = (_descend(_walks(value, at, sign), tolerance) for sign in (1, -1))
     rest = np.where(low_ahead <= low_back, at + ahead, at - back) % count
-    base = value[rows, rest]
-    return rest, np.column_stack([_climb(walk(rest, sign), base, tolerance) for sign in (1, -1)])
+    lies = np.sum(free[rest] * (up[rest] if by_place else up), axis=1) > LIES
+    depth = np.zeros((len(at), 2))
+    rows = np.nonzero(lies)[0]
+    if len(rows):
+        there = value if by_place else value[rows]
+        base = there[0 if by_place else np.arange(len(there)), rest[rows]]
+        depth[rows] = np.column_stack([_climb(_walks(there, rest[rows], sign), base, tolerance) for sign in (1, -1)])
+    return rest, depth, lies
 
 
-def hold(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float) -> Held:
-    """Press a disc of ``radius`` px against contacts (B, 2) with outward normals (B, 2)."""
+def hold(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float, around: Room | None = None) -> Held:
+    """Press a disc of ``radius`` px against contacts (B, 2) with outward normals (B, 2); ``around`` is :func:`room` where it is known."""
     number = len(points)
     gap, drift, start = np.full(number, np.inf), np.zeros(number), np.full(number, -1.0)
     press, swing = np.zeros((number, 2)), np.zeros((number, 2))
-    curves = centres(contour, radius)
+    curves = centres(room(contour, radius) if around is None else around, radius)
     if not curves:
         return Held(gap, drift, press, swing, start)
     lengths = [len(curve) for curve, _ in curves]
     everything = np.concatenate([curve for curve, _ in curves])
     which = np.repeat(np.arange(len(curves)), lengths)
     first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    u, v = everything[:, 0] - points[:, :1], everything[:, 1] - points[:, 1:]
-    along = u * normals[:, :1] + v * normals[:, 1:]
-    across = np.abs(u * normals[:, 1:] - v * normals[:, :1])
-    beyond = along - radius
+    # Along and across the normals, from the centroid, so that single precision is enough.
+    places, here = (everything - contour.centroid).astype(np.float32), points - contour.centroid
+    beside = np.column_stack([normals[:, 1], -normals[:, 0]])
+    beyond = normals.astype(np.float32) @ places.T
+    beyond -= (np.sum(here * normals, axis=1) + radius).astype(np.float32)[:, None]
+    across = beside.astype(np.float32) @ places.T
+    across -= np.sum(here * beside, axis=1).astype(np.float32)[:, None]
     # The disc comes from outside: standing off along the normal is what a narrow corner makes it do.
-    cost = np.hypot(across, np.where(beyond > 0, 0.5 * beyond, beyond))
+    cost = np.minimum(beyond, 0.5 * beyond)
+    cost *= cost
+    cost += across * across
     chosen = np.argmin(cost, axis=1)
     rows = np.arange(number)
-    gap = np.hypot(across[rows, chosen], beyond[rows, chosen]) / radius
+    gap = np.hypot(across[rows, chosen], beyond[rows, chosen]).astype(np.float64) / radius
     tolerance = max(TOLERANCE * radius, 0.6)
     for k, (curve, free) in enumerate(curves):
         part = np.nonzero(which[chosen] == k)[0]
         if not len(part):
             continue
         at = chosen[part] - first[k]
-        height = curve @ normals[part].T
-        rest, depth = _settle(curve, at, height.T, tolerance)
-        # A lowest place that hangs over is none: the disc left the tool before it.
-        lies = np.sum(free[rest] * normals[part], axis=1) > LIES
-        press[part] = np.where(lies[:, None], np.sort(depth, axis=1) / radius, 0.0)
+        height = beyond[part, first[k] : first[k] + lengths[k]]
+        rest, depth, lies = _settle(curve, free, normals[part], at, height, tolerance, False)
+        press[part] = np.sort(depth, axis=1) / radius
         moved = curve[rest] - curve[at]
-        drift[part] = np.where(lies, np.hypot(*moved.T) / radius, np.inf)
+        drift[part] = np.where(lies, np.hypot(moved[:, 0], moved[:, 1]) / radius, np.inf)
         inward = contour.centroid - curve
-        distance = np.maximum(np.hypot(*inward.T), 1e-9)
+        distance = np.maximum(np.hypot(inward[:, 0], inward[:, 1]), 1e-9)
         # This height is the same for all contacts: each start is followed once.
         starts, which_start = np.unique(at, return_inverse=True)
-        rest, depth = _settle(curve, starts, np.broadcast_to(-distance, (len(starts), len(curve))), tolerance)
-        rest, depth = rest[which_start], depth[which_start]
-        lies = np.sum(free[rest] * inward[rest], axis=1) > LIES * distance[rest]
-        swing[part] = np.where(lies[:, None], np.sort(depth, axis=1) / radius, 0.0)
+        rest, depth, lies = _settle(curve, free, inward / distance[:, None], starts, -distance[None].astype(np.float32), tolerance, True)
+        rest, depth, lies = rest[which_start], depth[which_start], lies[which_start]
+        swing[part] = np.sort(depth, axis=1) / radius
         start[part] = np.where(lies, swing[part, 0] - (distance[rest] - distance[at]) / radius, -1.0)
     return Held(gap, drift, press, swing, start)

@@ -276,10 +276,10 @@ class Matcher:
     ) -> list[ContactCandidate]:
         """The local stage on each proposal, the score, and the best ``top_k`` different places."""
         candidates: list[ContactCandidate] = []
-        for proposal in proposals.proposals:
-            try:
-                local = curvature.estimate(contour, contour.nearest(proposal.pixel), reference.concave, two_step=self.two_step)
-            except MagicError:
+        starts = np.array([contour.nearest(proposal.pixel) for proposal in proposals.proposals], dtype=int)
+        found = curvature.estimate_many(contour, starts, reference.concave, two_step=self.two_step)
+        for proposal, local in zip(proposals.proposals, found, strict=True):
+            if local is None:
                 continue
             contact = to_contact(tool.view, local)
             s_curv = score.curvature_score(ratio, contact.radius / scale, contact.concave == reference.concave)
