@@ -18,14 +18,34 @@ def thin(points: NDArray[np.floating], voxel: float) -> tuple[NDArray[np.float64
 
 
 def cluster(points: NDArray[np.floating], eps: float, min_points: int, voxel: float | None = None) -> NDArray[np.int64]:
-    """DBSCAN labels (N,) of points (N, 3): -1 noise, clusters from 0.  With ``voxel`` the cloud is thinned first."""
+    """DBSCAN labels (N,) of points (N, 3): -1 noise, clusters from 0.  With ``voxel`` the cloud is thinned first.
+
+    A point with at least ``min_points`` points within ``eps`` metres, itself among them, is a core; cores within ``eps`` of
+    each other are one cluster; another point belongs to the cluster of its first core within ``eps``.
+    """
     if len(points) == 0:
         return np.zeros(0, np.int64)
-    import open3d as o3d
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
     mean, index = thin(points, voxel) if voxel else (np.asarray(points, float), np.arange(len(points)))
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean))
-    return np.asarray(cloud.cluster_dbscan(eps, min_points), dtype=np.int64)[index]
+    n = len(mean)
+    a, b = cKDTree(mean, balanced_tree=False, compact_nodes=False).query_pairs(eps, output_type="ndarray").T
+    core = np.bincount(a, minlength=n) + np.bincount(b, minlength=n) + 1 >= min_points
+    both = core[a] & core[b]
+    _, labels = connected_components(coo_matrix((np.ones(int(both.sum()), np.int8), (a[both], b[both])), shape=(n, n)), directed=False)
+    labels = labels.astype(np.int64)
+    labels[~core] = -1
+    first = np.full(n, n)
+    for here, there in ((a, b), (b, a)):
+        reached = ~core[here] & core[there]
+        np.minimum.at(first, here[reached], there[reached])
+    border = first < n
+    labels[border] = labels[first[border]]
+    used, compact = np.unique(labels, return_inverse=True)
+    labels = compact - int(used[0] < 0)
+    return labels[index]
 
 
 def largest(points: NDArray[np.floating], eps: float, min_points: int, voxel: float | None = None) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from magic_core.mesh import Mesh, concatenate
 from magic_perception import polygons
 from magic_perception.parameters import Parameters
 from magic_perception.segmentation import open_by_two
-from magic_perception.sight import Sight, carve
+from magic_perception.sight import Sight, carve, surfaces
 from magic_perception.solids import Reconstruction, extruded, joined
 
 
@@ -66,9 +66,9 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
     return table[index]
 
 
-def build_lying(sights: list[Sight], points: NDArray[np.float64], height: float, noise: float, parameters: Parameters) -> Reconstruction:
+def build_lying(sights: list[Sight], noise: float, parameters: Parameters) -> Reconstruction:
     """A thing that lies: carved where it is flat, else a height field down to the table, or a shell where it is seen to be hollow."""
-    grid = height_map(points, parameters.resolution)
+    grid = height_map(surfaces(sights, 2)[0], parameters.resolution)
     occupied = np.isfinite(grid.top)
     inner = cv2.erode(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
     # Heights along the middle lines: the round edge of a wire does not make it a relief.

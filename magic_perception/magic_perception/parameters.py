@@ -28,7 +28,8 @@ class Parameters:
     wall: assumed wall thickness of things that are seen to be hollow from above.
     use_color: refine masks by the colour difference to the table.
     split: part touching objects where a long concave seam and their forms say that they are two (:class:`magic_perception.convexity.Evidence`).
-    max_objects: the largest ones are kept.  workers: threads for cameras and objects.
+    max_objects: the largest ones are kept.  workers: threads for cameras and objects; most of the
+    work holds Python's lock, so that one is the quickest and needs the least memory.
     method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
     """
 
@@ -50,7 +51,7 @@ class Parameters:
     split: bool = True
     method: str = "completed"
     max_objects: int = 24
-    workers: int = 2
+    workers: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -23,13 +25,24 @@ from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _fr
 
 @dataclass
 class Report:
-    """What perceive() can tell besides the scene: seconds by stage, and what it left out and why."""
+    """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of all processors.
+
+    Stages: ``table``, ``masks``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
+    cpu: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     labels: list[NDArray[np.int32]] = field(default_factory=list)
     shapes: dict[str, str] = field(default_factory=dict)
     pixels: dict[str, int] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Take the time of what runs inside."""
+        start, used = time.perf_counter(), time.process_time()
+        yield
+        self.seconds[name], self.cpu[name] = time.perf_counter() - start, time.process_time() - used
 
 
 def perceive(
@@ -63,47 +76,57 @@ def perceive(
             Code.NO_DEPTH, "pixels with depth", {f.camera: int(np.isfinite(f.depth).sum()) for f in frames}, "at least 100 in one camera"
         )
     frames = seeing
-    start = time.perf_counter()
-    table, own = find_table(frames, parameters)
-    world_from_table = _frame_on(table, np.eye(4))
-    if (
-        parameters.snap_height > 0
-        and table.tilt() < parameters.snap_tilt
-        and abs(table.heights(np.zeros(3))) < parameters.snap_height + 0.0
-    ):
-        world_from_table = np.eye(4)
-    looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(frames, own, strict=True)), parameters.workers)
-    report.seconds["table"] = time.perf_counter() - start
+    with report.stage("table"):
+        table, own = find_table(frames, parameters)
+        world_from_table = _frame_on(table, np.eye(4))
+        if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and abs(table.heights(np.zeros(3))) < parameters.snap_height:
+            world_from_table = np.eye(4)
+        looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(frames, own, strict=True)), parameters.workers)
 
-    start = time.perf_counter()
-    fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
-    labels = segmenter.segment(looks, fixtures, parameters)
-    report.labels = labels
-    report.seconds["segment"] = time.perf_counter() - start
+    with report.stage("masks"):
+        fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
+        labels = segmenter.segment(looks, fixtures, parameters)
+        report.labels = labels
 
-    start = time.perf_counter()
-
-    def build(label: int) -> tuple[SceneObject, str, int] | MagicError:
+    def build(label: int) -> _Built | MagicError:
         try:
             return _build(label, looks, labels, world_from_table, parameters)
         except MagicError as error:
             return error
 
-    objects = []
-    found = range(1, max((int(image.max()) for image in labels), default=0) + 1)
-    for label, built in zip(found, each(build, list(found), parameters.workers), strict=True):
-        if isinstance(built, MagicError):
-            report.notes.append(f"cluster {label} left out: {built.message}")
-            for image in labels:
-                image[image == label] = 0
-            continue
-        item = replace(built[0], id=f"object_{len(objects) + 1}")
-        report.shapes[item.id], report.pixels[item.id] = built[1:]
-        objects.append(item)
-    report.seconds["objects"] = time.perf_counter() - start
+    with report.stage("meshes"):
+        numbers = list(range(1, max((int(image.max()) for image in labels), default=0) + 1))
+        solids: list[_Built] = []
+        for label, built in zip(numbers, each(build, numbers, parameters.workers), strict=True):
+            if isinstance(built, MagicError):
+                report.notes.append(f"cluster {label} left out: {built.message}")
+                for image in labels:
+                    image[image == label] = 0
+            else:
+                solids.append(built)
+
+    with report.stage("views"):
+        objects = []
+        for built, item in zip(solids, each(lambda b: _as_object(b, world_from_table), solids, parameters.workers), strict=True):
+            item = replace(item, id=f"object_{len(objects) + 1}")
+            report.shapes[item.id], report.pixels[item.id] = built.solid.shape, built.pixels
+            objects.append(item)
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
     stamp = max(frame.stamp for frame in frames)
     return Scene((*objects, *known), plane, stamp)
+
+
+@dataclass(frozen=True)
+class _Built:
+    """A solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, and its pixels there."""
+
+    solid: Reconstruction
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    mask: NDArray[np.bool_]
+    camera: str
+    confidence: float
+    pixels: int
 
 
 def _build(
@@ -112,8 +135,8 @@ def _build(
     labels: list[NDArray[np.int32]],
     world_from_table: NDArray[np.float64],
     parameters: Parameters,
-) -> tuple[SceneObject, str, int]:
-    """The object with that label, how its shape was found, and its pixels in the camera that saw most of it."""
+) -> _Built:
+    """The solid of the object with that label, and what was seen of it."""
     table_from_world = transforms.inverse(world_from_table)
     sights, clouds, paints, counts = [], [], [], []
     for looked, image in zip(looks, labels, strict=True):
@@ -136,34 +159,32 @@ def _build(
                 sigma,
             )
         )
-        seen = mask[cut] & np.isfinite(looked.heights[cut])
-        clouds.append(looked.points[cut][seen])
-        paints.append(looked.frame.color[cut][seen])
+        rows, columns = np.nonzero(mask[cut] & np.isfinite(looked.heights[cut]))
+        clouds.append(looked.points(rows + y, columns + x))
+        paints.append(looked.frame.color[rows + y, columns + x])
     if not sights:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "pixels of the object", max(counts), "at least 20 in one camera")
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
-    built = reconstruct(sights, parameters)
+    solid = reconstruct(sights, parameters)
     best = int(np.argmax(counts))
-    item = _as_object(f"cluster_{label}", built, points, colors, world_from_table)
-    cut = _cut_by_border(labels[best] == label)
-    item = replace(item, mask=labels[best] == label, camera=looks[best].frame.camera, confidence=built.confidence * (0.6 if cut else 1.0))
-    return item, built.shape, counts[best]
+    mask = labels[best] == label
+    confidence = solid.confidence * (0.6 if _cut_by_border(mask) else 1.0)
+    return _Built(solid, points, colors, mask, looks[best].frame.camera, confidence, counts[best])
 
 
 def _cut_by_border(mask: NDArray[np.bool_]) -> bool:
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def _as_object(
-    name: str, built: Reconstruction, points: NDArray[np.float64], colors: NDArray[np.uint8], world_from_table: NDArray[np.float64]
-) -> SceneObject:
-    """Object frame at the centre of the smallest upright box, z up, x along its longer horizontal side (towards +x, else +y, of the world)."""
-    mesh = built.mesh
+def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObject:
+    """Object frame at the centre of the smallest upright box, z up, x along its longer horizontal side (towards +x, else +y, of the world);
+    painted, with its canonical view."""
+    mesh = built.solid.mesh
     low, high = mesh.bounds
     (cx, cy), (w, h), angle = cv2.minAreaRect(((mesh.vertices[:, :2] - low[:2]) * 1000).astype(np.float32))
-    if abs(w - h) < 0.04 * max(w, h) and built.shape in ("sphere", "cylinder", "round"):
+    if abs(w - h) < 0.04 * max(w, h) and built.solid.shape in ("sphere", "cylinder", "round"):
         angle = 0.0  # round: no direction is longer, keep the world's
         w = h
     elif h > w:
@@ -174,18 +195,18 @@ def _as_object(
     object_from_table = transforms.inverse(table_from_object)
     local = mesh.transformed(object_from_table)
     pose = world_from_table @ table_from_object
-    local = Mesh(local.vertices, local.faces, _paint(local, points, colors, transforms.inverse(pose)))
-    pieces = tuple(piece.transformed(object_from_table) for piece in built.pieces)
-    start = find_view(local, pieces)
+    local = Mesh(local.vertices, local.faces, _paint(local, built.points, built.colors, transforms.inverse(pose)))
+    pieces = tuple(piece.transformed(object_from_table) for piece in built.solid.pieces)
     return SceneObject(
-        name, local, pieces, pose, start, points, colors, world_from_box=pose, box_extents=local.extents, confidence=built.confidence
-    )
+        "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera,
+        world_from_box=pose, box_extents=local.extents, confidence=built.confidence,
+    )  # fmt: skip
 
 
 def _paint(mesh: Mesh, points: NDArray[np.float64], colors: NDArray[np.uint8], object_from_world: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Colours (V, 3) of a mesh's vertices from the nearest seen point."""
     from scipy.spatial import cKDTree
 
-    step = max(1, len(points) // 6000)
-    tree = cKDTree(transforms.apply(object_from_world, points[::step]))
-    return colors[::step][tree.query(mesh.vertices, workers=2)[1]]
+    step = max(1, len(points) // 4000)
+    tree = cKDTree(transforms.apply(object_from_world, points[::step]), balanced_tree=False, compact_nodes=False)
+    return colors[::step][tree.query(mesh.vertices)[1]]

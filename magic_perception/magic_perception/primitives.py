@@ -95,7 +95,7 @@ def recognise(points: NDArray[np.float64], height: float, noise: float) -> Recon
         return None
     sample = points[:: max(1, len(points) // 1500)]
     sample = sample[sample[:, 2] > min(0.004, 0.1 * height)]
-    if len(sample) < 60:
+    if len(sample) < 40:
         return None
     limit = max(0.0025, 2.5 * noise)
     ball = fit_sphere(sample)

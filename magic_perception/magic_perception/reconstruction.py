@@ -26,7 +26,7 @@ from magic_perception import clusters, polygons, primitives
 from magic_perception.layers import build_layers
 from magic_perception.lying import build_lying
 from magic_perception.parameters import Parameters
-from magic_perception.sight import Sight, agreement, surface
+from magic_perception.sight import Sight, agreement, surfaces
 from magic_perception.solids import Reconstruction, extruded
 from magic_perception.turned import build_round
 
@@ -35,14 +35,9 @@ __all__ = ["Reconstruction", "Sight", "as_in_paper", "reconstruct"]
 
 def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     """The solid of one thing from all cameras that saw it.  Raises ``RECONSTRUCTION_FAILED`` where there is too little."""
-    clouds = [surface(sight) for sight in sights]
-    points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
-    eyes = np.repeat([sight.eye for sight in sights], [len(c) for c in clouds], axis=0)
-    keep = points[:, 2] > -0.01
-    points, eyes = points[keep], eyes[keep]
-    if len(points) < 50:
-        raise MagicError(Code.RECONSTRUCTION_FAILED, "points of one object", len(points), "at least 50")
-    points[:, 2] = np.maximum(points[:, 2], 0)
+    points, eyes = surfaces(sights)
+    if len(points) < 20:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "points of one object", len(points), "at least 20")
     noise = float(np.median([s.sigma for s in sights]))
     if parameters.method == "paper":
         return as_in_paper(points)
@@ -60,7 +55,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         if turned is not None and fit > 0.8:
             return turned
         if height < 0.65 * length:  # a ladle's stem rises, but it lies
-            return build_lying(sights, points, height, noise, parameters)
+            return build_lying(sights, noise, parameters)
         if turned is None:
             return build_layers(sights, points, height, parameters)
         # It does not look as what was seen does: a hoop or a bent wire taken for a body.
@@ -68,7 +63,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         other = agreement(stacked.mesh, sights)
         better = turned if fit >= other else stacked
         return replace(better, confidence=better.confidence * max(fit, other))
-    return build_lying(sights, points, height, noise, parameters)
+    return build_lying(sights, noise, parameters)
 
 
 def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 0.005) -> Reconstruction:

@@ -33,17 +33,26 @@ T, R = TypeVar("T"), TypeVar("R")
 class Looked:
     """One frame over the table.
 
-    points (H, W, 3) float32 world metres, NaN without depth; heights (H, W) float32 metres above the table, the
-    camera's own small error of calibration taken out, lightly smoothed; raw heights are unsmoothed.
-    inside (H, W): in the region of interest.  sigma (H, W): standard deviation of ``heights``, measured on the table.
+    heights (H, W) float32 metres above the table, the camera's own small error of calibration taken out, lightly
+    smoothed; raw heights are unsmoothed; NaN without depth.  inside (H, W): in the region of interest.
+    sigma (H, W): standard deviation of ``heights``, measured on the table.
     """
 
     frame: RgbdFrame
-    points: NDArray[np.float32]
     raw: NDArray[np.float32]
     heights: NDArray[np.float32]
     inside: NDArray[np.bool_]
     sigma: NDArray[np.float32]
+
+    def points(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        """World points (..., 3) in metres at pixels, row and column (...) each; NaN without depth."""
+        k, pose = self.frame.intrinsics, self.frame.world_from_camera
+        z = self.frame.depth[rows, columns].astype(np.float32)
+        local = np.empty((*z.shape, 3), np.float32)
+        np.multiply((columns.astype(np.float32) - np.float32(k.cx)) / np.float32(k.fx), z, out=local[..., 0])
+        np.multiply((rows.astype(np.float32) - np.float32(k.cy)) / np.float32(k.fy), z, out=local[..., 1])
+        local[..., 2] = z
+        return local @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
 
 
 class Segmenter(Protocol):
@@ -71,22 +80,32 @@ def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size:
     return total / (safe[..., None] if values.ndim == 3 else safe), share
 
 
+def masked_mean_at(
+    values: NDArray[np.float32], weights: NDArray[np.float32], size: int, where: tuple[NDArray, NDArray]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """:func:`masked_mean` of values (H, W, C) at some pixels only: (N, C) and (N,)."""
+    share = cv2.blur(weights, (size, size), borderType=cv2.BORDER_CONSTANT)[where]
+    total = cv2.blur(values * weights[..., None], (size, size), borderType=cv2.BORDER_CONSTANT)[where]
+    return total / np.maximum(share, np.float32(1e-6))[:, None], share
+
+
 def find_table(frames: list[RgbdFrame], parameters: Parameters) -> tuple[Plane, list[Plane]]:
     """The table in world coordinates, and as each camera sees it (which takes small errors of calibration out).
 
     A camera whose own plane is off by more than 20 mm or 2 degrees, or that sees no plane, uses the common one.
     """
     clouds = []
+    low, high = np.asarray(parameters.region_low) - [0, 0, 0.05], np.asarray(parameters.region_high)
+    bounded = [axis for axis in range(3) if np.isfinite(low[axis]) or np.isfinite(high[axis])]
     for frame in frames:
         k = frame.intrinsics
-        v, u = np.mgrid[0 : k.height : 4, 0 : k.width : 4]
-        z = frame.depth[::4, ::4].astype(float)
-        seen = np.isfinite(z)
-        u, v, z = u[seen], v[seen], z[seen]
-        points = transforms.apply(frame.world_from_camera, np.column_stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z]))
-        low, high = np.asarray(parameters.region_low) - [0, 0, 0.05], np.asarray(parameters.region_high)
-        with np.errstate(invalid="ignore"):
-            keep = np.all((points > low) & (points < high), axis=1)
+        z = frame.depth[::4, ::4]
+        v, u = np.nonzero(np.isfinite(z))
+        z = z[v, u].astype(float)
+        points = transforms.apply(frame.world_from_camera, np.column_stack([(4 * u - k.cx) / k.fx * z, (4 * v - k.cy) / k.fy * z, z]))
+        keep = np.ones(len(points), bool)
+        for axis in bounded:
+            keep &= (points[:, axis] > low[axis]) & (points[:, axis] < high[axis])
         clouds.append(points[keep])
     up = (0.0, 0.0, 1.0)
     both = fit_plane(np.concatenate(clouds), up, parameters.table_tilt, parameters.table_band, seed=parameters.seed)
@@ -114,7 +133,7 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
     frame = RgbdFrame(frame.color, frame.depth, frame.intrinsics, pose, frame.camera, frame.stamp)
     k = frame.intrinsics
     table_from_camera = transforms.inverse(world_from_table) @ pose
-    z = frame.depth.astype(np.float32)
+    z = np.ascontiguousarray(frame.depth, dtype=np.float32)
     across = ((np.arange(k.width) - k.cx) / k.fx).astype(np.float32)[None, :]
     down = ((np.arange(k.height) - k.cy) / k.fy).astype(np.float32)[:, None]
 
@@ -125,20 +144,23 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
 
     row = table_from_camera[2]
     fall = along(row[:3])
-    raw = z * fall + np.float32(row[3])
+    raw = cv2.multiply(z, fall)
+    raw += np.float32(row[3])
     valid = np.isfinite(raw)
-    points = np.empty((*z.shape, 3), np.float32)
     # Without depth a pixel counts as inside where its ray meets the table there.
     reach = np.float32(-row[3]) / np.minimum(fall, np.float32(-1e-3))
     inside = reach < 5.0
-    with np.errstate(invalid="ignore"):
-        for axis in range(3):
-            ray, start = along(pose[axis, :3]), np.float32(pose[axis, 3])
-            points[..., axis] = z * ray + start
-            low, high = np.float32(parameters.region_low[axis]), np.float32(parameters.region_high[axis])
-            if np.isfinite(low) or np.isfinite(high):
-                where = np.where(valid, points[..., axis], reach * ray + start)
-                inside &= (where > low) & (where < high)
+    distance = None
+    for axis in range(3):
+        low, high = np.float32(parameters.region_low[axis]), np.float32(parameters.region_high[axis])
+        if np.isfinite(low) or np.isfinite(high):
+            distance = np.where(valid, z, reach) if distance is None else distance
+            where = along(pose[axis, :3])
+            where *= distance
+            where += np.float32(pose[axis, 3])
+            inside &= where > low
+            inside &= where < high
+    raw[~valid] = np.nan
     zero = np.where(valid, raw, np.float32(0))
     # Bias of depth over the table, which varies slowly over the picture: a quarter of its resolution will do.
     near = (valid & (np.abs(zero) < 0.008)).astype(np.float32)
@@ -147,16 +169,23 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
         cv2.blur(cv2.resize(x, small, interpolation=cv2.INTER_AREA), (21, 21), borderType=cv2.BORDER_CONSTANT) for x in (near, near * zero)
     )
     bias = np.where(count > 0.15, total / np.maximum(count, 1e-6), 0).astype(np.float32)
-    raw = raw - cv2.resize(bias, (k.width, k.height))
+    raw -= cv2.resize(bias, (k.width, k.height))
     zero = np.where(valid, raw, np.float32(0))
     # Smooth over nearby pixels of like height only: an edge of 10 mm must not smear.
-    smooth, _share = masked_mean(zero, valid.astype(np.float32), 3)
-    heights = np.where(valid & (np.abs(smooth - zero) < 0.01), smooth, raw).astype(np.float32)
-    flat = valid & (np.abs(zero) < 0.01) & inside
-    with np.errstate(invalid="ignore"):
-        unit = (np.abs(heights[flat]) / z[flat] ** 2)[::5] if flat.sum() > 500 else np.array([0.002])
-        sigma = (1.4826 * np.median(unit) * z**2).astype(np.float32)
-    return Looked(frame, points, raw, heights, inside, np.maximum(np.nan_to_num(sigma, nan=0.002), 3e-4))
+    share = cv2.blur(valid.astype(np.float32), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    smooth = cv2.blur(zero, (3, 3), borderType=cv2.BORDER_CONSTANT)
+    smooth /= np.maximum(share, np.float32(1e-6))
+    heights = np.where(valid & (cv2.absdiff(smooth, zero) < 0.01), smooth, raw)
+    flat = np.flatnonzero(valid & (np.abs(zero) < 0.01) & inside)
+    sigma = np.where(valid, z, np.float32(0))
+    sigma *= sigma
+    if len(flat) > 500:
+        sample = flat[::5]
+        sigma *= np.float32(1.4826 * np.median(np.abs(np.take(heights, sample)) / np.take(sigma, sample)))
+    else:
+        sigma *= np.float32(1.4826 * 0.002)
+    sigma[~valid] = 0.002
+    return Looked(frame, raw, heights, inside, np.maximum(sigma, np.float32(3e-4)))
 
 
 def _frame_on(plane: Plane, world_from_table: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -199,14 +228,14 @@ def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np
         mean[far], variance[far] = whole.mean(axis=0), whole.var(axis=0)
     size = lab.shape[1::-1]
     # Floor: 3 grey levels of noise in lightness, 2 in colour.
-    weight = cv2.resize(1 / (variance + np.array([9.0, 4.0, 4.0], np.float32)), size)
-    offset = lab.astype(np.float32)
-    offset -= cv2.resize(mean, size)
-    offset *= offset
-    offset *= weight
-    distance = _total(offset)
-    sample = distance[table]
-    threshold = max(25.0, float(np.percentile(sample[::7], 99.7))) if len(sample) > 500 else np.inf
+    weight = 1 / (variance + np.array([9.0, 4.0, 4.0], np.float32))
+    distance = np.zeros(lab.shape[:2], np.float32)
+    for channel in range(3):
+        offset = cv2.subtract(cv2.extractChannel(lab, channel), cv2.resize(mean[..., channel], size), dtype=cv2.CV_32F)
+        offset *= offset
+        cv2.accumulateProduct(offset, cv2.resize(weight[..., channel], size), distance)
+    sample = np.flatnonzero(table)
+    threshold = max(25.0, float(np.percentile(np.take(distance, sample[::7]), 99.7))) if len(sample) > 500 else np.inf
     return distance, threshold
 
 
@@ -214,31 +243,32 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it."""
     h = looked.heights
     valid = np.isfinite(h)
-    zero = np.where(valid, h, 0)
-    limit = np.maximum(parameters.min_height, 4.0 * looked.sigma)
-    raised = valid & (zero > limit) & looked.inside
-    raised = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(bool)
+    zero = np.where(valid, h, np.float32(0))
+    limit = np.maximum(np.float32(parameters.min_height), np.float32(4.0) * looked.sigma)
+    raised = (zero > limit) & looked.inside
+    raised = cv2.morphologyEx(raised.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(bool)
     if not parameters.use_color:
         return raised
-    around = cv2.dilate(raised.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    around = cv2.dilate(raised.view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
     table = valid & (np.abs(zero) < limit) & looked.inside & ~around
-    if table.sum() < 500:
+    if np.count_nonzero(table) < 500:
         return raised
     distance, threshold = color_distance(looked, table)
     if not np.isfinite(threshold):
         return raised
     other = (distance > threshold) & looked.inside
     # Of another colour and a little above the table on the average of a window: a thin thing.  A shadow or a print lies at 0.
-    weights = (other & valid & (zero < 0.03)).astype(np.float32)
-    mean, share = masked_mean(np.where(valid, looked.raw, 0).astype(np.float32), weights, 9)
-    thin = other & (share * 81 > 8) & (mean > np.maximum(0.0015, looked.sigma * 1.2))
+    near = other & valid & (zero < 0.03)
+    total = cv2.blur(np.where(near, looked.raw, np.float32(0)), (9, 9), borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(near.astype(np.float32), (9, 9), borderType=cv2.BORDER_CONSTANT)
+    thin = other & (share * np.float32(81) > 8) & (total > share * np.maximum(np.float32(0.0015), looked.sigma * np.float32(1.2)))
     core = raised | thin
     # Grow into pixels without depth that have another colour and touch what is there.
     unseen = other & ~valid
     joined = core | unseen
-    count, labels = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
+    count, labels = cv2.connectedComponents(joined.view(np.uint8), connectivity=4)
     touched = np.zeros(count, bool)
-    touched[np.unique(labels[core])] = True
+    touched[labels[core]] = True
     touched[0] = False
     result = touched[labels]
     result = _fill_bowls(result, looked, other, parameters)
@@ -294,23 +324,27 @@ def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_
         r0, r1, c0, c1 = max(y - margin, 0), min(y + h + margin, mask.shape[0]), max(x - margin, 0), min(x + w + margin, mask.shape[1])
         cut = (slice(r0, r1), slice(c0, c1))
         lab = cv2.cvtColor(np.ascontiguousarray(looked.frame.color[cut]), cv2.COLOR_RGB2LAB).astype(np.float32)
-        own, share = masked_mean(lab, inner[cut], 13)
-        ground, ground_share = masked_mean(lab, free[cut], 31)
+        where = np.zeros(lab.shape[:2], bool)
+        middle = (slice(y - r0, y - r0 + h), slice(x - c0, x - c0 + w))
+        where[middle] = band[cut][middle]
+        where = np.nonzero(where)
+        own, share = masked_mean_at(lab, inner[cut], 13, where)
+        ground, ground_share = masked_mean_at(lab, free[cut], 31, where)
         difference = own - ground
         length = _total(difference**2)
-        offset = lab - ground
+        offset = lab[where] - ground
         part = _total(offset * difference) / np.maximum(length, 1.0)
         # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
         rest = _total((offset - part[..., None] * difference) ** 2)
-        told = band[cut] & ((rest < 9.0**2) | ~mask[cut]) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
-        told[: y - r0], told[y - r0 + h :], told[:, : x - c0], told[:, x - c0 + w :] = False, False, False, False
+        before = mask[cut][where]
+        told = ((rest < 9.0**2) | ~before) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
         # Grow only into what depth does not contradict, and by what touches the mask.
         with np.errstate(invalid="ignore"):
-            possible = ~(looked.heights[cut] <= -0.006)
-        result[cut] = np.where(told, (part > 0.5) & (mask[cut] | possible), result[cut])
-    count, labels = cv2.connectedComponents(result.astype(np.uint8), connectivity=8)
+            possible = ~(looked.heights[cut][where] <= -0.006)
+        result[cut][where] = np.where(told, (part > 0.5) & (before | possible), result[cut][where])
+    count, labels = cv2.connectedComponents(result.view(np.uint8), connectivity=8)
     touched = np.zeros(count, bool)
-    touched[np.unique(labels[mask & result])] = True
+    touched[labels[mask & result]] = True
     touched[0] = False
     return touched[labels]
 
@@ -327,7 +361,7 @@ def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...],
     for mesh in known:
         scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
     if len(where[0]):
-        points = np.ascontiguousarray(looked.points[where], dtype=np.float32)
+        points = np.ascontiguousarray(looked.points(*where))
         near = scene.compute_distance(o3d.core.Tensor(points), nthreads=2).numpy() < margin
         eye = looked.frame.world_from_camera[:3, 3].astype(np.float32)
         rays = np.concatenate([np.broadcast_to(eye, points.shape), points - eye], axis=1)
@@ -360,16 +394,17 @@ class DepthSegmenter:
         fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
         masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
         solid = [mask & np.isfinite(looked.heights) for mask, looked in zip(masks, looks, strict=True)]
-        cloud = np.concatenate([looked.points[s] for looked, s in zip(looks, solid, strict=True)])
-        counts = [int(s.sum()) for s in solid]
+        spots = [np.nonzero(s) for s in solid]
+        cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
+        counts = [len(where[0]) for where in spots]
         instance = clusters.cluster(cloud, parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
         if parameters.split:
-            instance = self._split(looks, solid, cloud, instance)
+            instance = self._split(looks, spots, cloud, instance)
         labels = []
         start = 0
-        for mask, s, count, known_pixels in zip(masks, solid, counts, fixed, strict=True):
+        for mask, where, count, known_pixels in zip(masks, spots, counts, fixed, strict=True):
             image = np.zeros(mask.shape, np.int32)
-            image[s] = instance[start : start + count] + 1
+            image[where] = instance[start : start + count] + 1
             start += count
             labels.append(_fill(image, mask))
             labels[-1][known_pixels] = -1
@@ -377,10 +412,10 @@ class DepthSegmenter:
 
     @staticmethod
     def _split(
-        looks: list[Looked], solid: list[NDArray[np.bool_]], cloud: NDArray[np.float32], instance: NDArray[np.int64]
+        looks: list[Looked], spots: list[tuple[NDArray, NDArray]], cloud: NDArray[np.float32], instance: NDArray[np.int64]
     ) -> NDArray[np.int64]:
         """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
-        heights = np.concatenate([looked.heights[s] for looked, s in zip(looks, solid, strict=True)])
+        heights = np.concatenate([looked.heights[where] for looked, where in zip(looks, spots, strict=True)])
         following = int(instance.max(initial=-1)) + 1
         members = [np.nonzero(instance == label)[0] for label in range(following)]
         tall = [mine for mine in members if len(mine) >= 1500 and np.percentile(heights[mine], 97) >= 0.05]
@@ -390,16 +425,17 @@ class DepthSegmenter:
         flags[np.concatenate(tall)] = True
         normal = np.full((len(cloud), 3), np.nan, np.float32)
         start = 0
-        for looked, s in zip(looks, solid, strict=True):
-            image = np.zeros(s.shape, np.uint8)
-            image[s] = flags[start : start + int(s.sum())]
-            x, y, w, h = cv2.boundingRect(image)
-            if w and h:
-                cut = (slice(max(y - 8, 0), y + h + 8), slice(max(x - 8, 0), x + w + 8))
-                field = np.full((*s.shape, 3), np.nan, np.float32)
-                field[cut] = convexity.normals(looked.points[cut], looked.frame.world_from_camera[:3, 3])
-                normal[start : start + int(s.sum())] = field[s]
-            start += int(s.sum())
+        for looked, (rows, columns) in zip(looks, spots, strict=True):
+            here = flags[start : start + len(rows)]
+            if here.any():
+                v, u = rows[here], columns[here]
+                r0, r1 = max(int(v.min()) - 8, 0), min(int(v.max()) + 9, looked.heights.shape[0])
+                c0, c1 = max(int(u.min()) - 8, 0), min(int(u.max()) + 9, looked.heights.shape[1])
+                window = looked.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
+                field = convexity.normals(window, looked.frame.world_from_camera[:3, 3])
+                near = np.nonzero((rows >= r0) & (rows < r1) & (columns >= c0) & (columns < c1))[0]
+                normal[start + near] = field[rows[near] - r0, columns[near] - c0]
+            start += len(rows)
         for mine in tall:
             part = convexity.parts(cloud[mine], normal[mine], heights[mine])
             for number in range(1, int(part.max()) + 1):
@@ -410,28 +446,47 @@ class DepthSegmenter:
 
 def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 12.0) -> NDArray[np.int32]:
     """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels."""
-    if not (mask & (labels == 0)).any() or not (labels > 0).any():
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    if w == 0 or h == 0:
         return labels
-    distance, index = cv2.distanceTransformWithLabels((labels <= 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    table = np.zeros(int(index.max()) + 1, np.int32)
-    seen = labels > 0
-    table[index[seen]] = labels[seen]
-    return np.where(mask & (labels == 0) & (distance <= reach), table[index], labels).astype(np.int32)
+    margin = int(np.ceil(reach))
+    cut = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+    part = labels[cut]
+    seen = part > 0
+    missing = np.nonzero(mask[cut] & (part == 0))
+    if len(missing[0]) == 0 or not seen.any():
+        return labels
+    distance, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    table = np.zeros(int(np.count_nonzero(seen)) + 1, np.int32)
+    table[index[seen]] = part[seen]
+    result = labels.copy()
+    result[cut][missing] = np.where(distance[missing] <= reach, table[index[missing]], 0)
+    return result
 
 
 def _sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
     """Drop what is too small, and number the rest from 1, by their pixels, most first."""
-    top = max((int(image.max()) for image in labels), default=0)
-    pixels = np.zeros((len(labels), top + 1), int)
-    for i, image in enumerate(labels):
-        pixels[i] = np.bincount(np.maximum(image, 0).ravel(), minlength=top + 1)
+    spots = [np.nonzero(image > 0) for image in labels]
+    values = [image[where] for image, where in zip(labels, spots, strict=True)]
+    top = max((int(v.max(initial=0)) for v in values), default=0)
+    pixels = np.stack([np.bincount(v, minlength=top + 1) for v in values])
+    order = [np.argsort(v, kind="stable") for v in values]
+    starts = [np.concatenate([[0], np.cumsum(row)]) for row in pixels]
     keep = []
     for label in range(1, top + 1):
         if pixels[:, label].max() < parameters.min_pixels:
             continue
-        points = np.concatenate([looked.points[image == label] for looked, image in zip(looks, labels, strict=True)])
+        clouds = []
+        for looked, where, turn, start in zip(looks, spots, order, starts, strict=True):
+            mine = turn[start[label] : start[label + 1]]
+            mine = mine[:: max(1, len(mine) // 2000)]
+            clouds.append(looked.points(where[0][mine], where[1][mine]))
+        points = np.concatenate(clouds)
         points = points[np.isfinite(points[:, 0])]
-        if len(points) < 20 or np.max(np.percentile(points, 97, axis=0) - np.percentile(points, 3, axis=0)) < parameters.min_extent:
+        if len(points) < 20:
+            continue
+        low, high = np.percentile(points, [3, 97], axis=0)
+        if np.max(high - low) < parameters.min_extent:
             continue
         keep.append((pixels[:, label].sum(), label))
     keep.sort(reverse=True)

@@ -37,7 +37,26 @@ class Sight:
 
     @cached_property
     def _blind(self) -> NDArray[np.uint8]:
-        return self.hidden.astype(np.uint8)
+        return self.hidden.view(np.uint8)
+
+    @cached_property
+    def _filled(self) -> tuple[NDArray[np.bool_], NDArray[np.float32], int, int]:
+        """Around the mask: where the surface is known, its heights, filled and smoothed, and the first row and column."""
+        x, y, w, h = cv2.boundingRect(self.mask.view(np.uint8))
+        pad = 3
+        r0, r1, c0, c1 = max(y - pad, 0), y + h + pad, max(x - pad, 0), x + w + pad
+        mask, heights = self.mask[r0:r1, c0:c1], self.heights[r0:r1, c0:c1]
+        known = mask & np.isfinite(heights)
+        if not w or np.count_nonzero(known) < 5:
+            return np.zeros((0, 0), bool), np.zeros((0, 0), np.float32), 0, 0
+        distance, index = cv2.distanceTransformWithLabels((~known).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        value = np.zeros(int(np.count_nonzero(known)) + 1, np.float32)
+        value[index[known]] = heights[known]
+        return mask & (distance < 12), cv2.medianBlur(value[index], 5), r0, c0
+
+    @cached_property
+    def _camera_from_table(self) -> NDArray[np.float64]:
+        return transforms.inverse(self.table_from_camera)
 
     @property
     def eye(self) -> NDArray[np.float64]:
@@ -49,45 +68,32 @@ class Sight:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
         """At points (..., 3): the mask (0..1, interpolated; 1 where blind), where the picture tells nothing (hidden or
         outside of it), the points' depth and the measured depth."""
-        camera = transforms.apply(transforms.inverse(self.table_from_camera), points)
-        pixels = np.nan_to_num(self.intrinsics.project(camera), nan=-1e4)
-        u, v = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
-        shape = u.shape
+        pose, k = self._camera_from_table, self.intrinsics
+        shape = points.shape[:-1]
+        camera = points.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+        z = np.where(camera[:, 2] > 1e-9, camera[:, 2], np.nan)
+        u, v = (np.nan_to_num(f * camera[:, i] / z + c, nan=-1e4).astype(np.float32) for i, f, c in ((0, k.fx, k.cx), (1, k.fy, k.cy)))
+        count = len(u)
         # OpenCV's remap takes pictures of less than 32768 rows and columns.
-        rows = -(-u.size // 8192)
+        rows = -(-count // 8192)
         u, v = (np.resize(x, (rows, 8192)) if rows > 1 else x.reshape(1, -1) for x in (u, v))
-        count = int(np.prod(shape))
 
         def at(field: NDArray, how: int, beyond: float) -> NDArray:
             return cv2.remap(field, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond).ravel()[:count].reshape(shape)
 
         blind = at(self._blind, cv2.INTER_NEAREST, 1.0) > 0
-        inside = np.where(blind, np.float32(1), at(self._soft, cv2.INTER_LINEAR, 1.0))
-        return inside, blind, camera[..., 2].astype(np.float32), at(self.depth, cv2.INTER_NEAREST, float("nan"))
+        inside = at(self._soft, cv2.INTER_LINEAR, 1.0)
+        inside[blind] = 1
+        return inside, blind, camera[:, 2].astype(np.float32).reshape(shape), at(self.depth, cv2.INTER_NEAREST, float("nan"))
 
 
-def surface(sight: Sight, upsample: int = 2) -> NDArray[np.float64]:
-    """The thing's visible surface as points (N, 3), also where depth is missing in the mask, twice as dense as the pixels.
+def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
+    """The thing's visible surface as points (N, 3), also where depth is missing in the mask, ``upsample`` times as dense as the pixels.
 
     Heights are filled from the nearest pixel and smoothed in the mask; each point is where its pixel's ray reaches its height.
     """
-    rows, columns = np.nonzero(sight.mask)
-    if len(rows) == 0:
-        return np.zeros((0, 3))
-    pad = 3
-    r0, r1 = max(rows.min() - pad, 0), min(rows.max() + pad + 1, sight.mask.shape[0])
-    c0, c1 = max(columns.min() - pad, 0), min(columns.max() + pad + 1, sight.mask.shape[1])
-    mask = sight.mask[r0:r1, c0:c1]
-    heights = sight.heights[r0:r1, c0:c1]
-    known = mask & np.isfinite(heights)
-    if known.sum() < 5:
-        return np.zeros((0, 3))
-    distance, index = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    value = np.zeros(int(index.max()) + 1, np.float32)
-    value[index[known]] = heights[known]
-    filled = cv2.medianBlur(value[index], 5)
-    mask = mask & (distance < 12)
-    if upsample > 1:
+    mask, filled, r0, c0 = sight._filled
+    if upsample > 1 and mask.size:
         size = (mask.shape[1] * upsample, mask.shape[0] * upsample)
         mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
         filled = cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR)
@@ -98,9 +104,21 @@ def surface(sight: Sight, upsample: int = 2) -> NDArray[np.float64]:
     k = sight.intrinsics
     rays = np.column_stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(u))]) @ sight.table_from_camera[:3, :3].T
     down = np.minimum(rays[:, 2], -1e-3)
-    points = sight.eye + rays * ((h - sight.eye[2]) / down)[:, None]
+    rays *= ((h - sight.eye[2]) / down)[:, None]
     # A grazing ray turns a small error of height into a large one in the plane.
-    return points[np.linalg.norm(points - sight.eye, axis=1) < 4.0]
+    near = np.einsum("ij,ij->i", rays, rays) < 4.0**2
+    return (rays if near.all() else rays[near]) + sight.eye
+
+
+def surfaces(sights: list[Sight], upsample: int = 1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The surface points (N, 3) of all cameras, none below the table, and for each the camera (N, 3) that saw it."""
+    clouds = [surface(sight, upsample) for sight in sights]
+    points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
+    eyes = np.repeat([sight.eye for sight in sights], [len(c) for c in clouds], axis=0)
+    keep = points[:, 2] > -0.01
+    points, eyes = points[keep], eyes[keep]
+    np.maximum(points[:, 2], 0, out=points[:, 2])
+    return points, eyes
 
 
 def carve(

@@ -49,12 +49,13 @@ def fit_plane(
     Raises ``NO_TABLE`` for fewer than 100 points or no plane that 10 % of them agree with.
     """
     points = np.asarray(points, dtype=float)
-    points = points[np.all(np.isfinite(points), axis=1)]
+    if not np.isfinite(points.sum()):
+        points = points[np.all(np.isfinite(points), axis=1)]
     if len(points) < 100:
         raise MagicError(Code.NO_TABLE, "points for the table plane", len(points), "at least 100 with depth in the region of interest")
     rng = np.random.default_rng(seed)
     points = points[rng.permutation(len(points))[:sample]]
-    few = points[:1500]  # enough to rank hypotheses; the best is fitted to all
+    few = points[:1000]  # enough to rank hypotheses; the best is fitted to all
     corners = few[rng.integers(0, len(few), (iterations, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
@@ -71,7 +72,8 @@ def fit_plane(
         normals, offsets = normals * sign[:, None], offsets * sign
     if len(normals) == 0:
         raise MagicError(Code.NO_TABLE, "table plane", "no upright plane", f"a plane within {max_tilt} degrees of level")
-    support = np.count_nonzero(np.abs(normals @ few.T + offsets[:, None]) < band, axis=1)
+    distance = normals.astype(np.float32) @ few.T.astype(np.float32) + offsets[:, None].astype(np.float32)
+    support = np.count_nonzero(np.abs(distance, out=distance) < band, axis=1)
     best = int(np.argmax(support))
     coefficients = np.append(normals[best], offsets[best])
     for width in (band, band * 0.6, band * 0.6):

@@ -24,7 +24,7 @@ class Body:
 
     axis: NDArray[np.float64]
     profile: NDArray[np.float64]
-    open: bool
+    open: bool = False
     through: bool = False
 
     def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -37,7 +37,7 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in a parabola q, so that conical and bulged bodies fit at once.
     """
     index = np.nonzero((points[:, 2] > 0.08 * height) & (points[:, 2] < 0.94 * height))[0]
-    if len(index) < 150:
+    if len(index) < 60:
         return None
     rng = np.random.default_rng(seed)
     index = index[rng.permutation(len(index))[:5000]]
@@ -45,7 +45,7 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     band = max(0.003, 2 * noise)
     slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
     members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
-    members = [m for m in members if len(m) > 20]
+    members = [m for m in members if len(m) > 8]
     if not members:
         return None
     # Circles through three points of one level, all hypotheses at once.
@@ -78,7 +78,7 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     axis, model = origin, None
     for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
         p = sample[near]
-        if len(p) < 60:
+        if len(p) < 25:
             return None
         local, z = p[:, :2] - origin, p[:, 2] / height
         matrix = np.column_stack([2 * local, np.ones(len(p)), z, z**2])
@@ -100,18 +100,32 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
         return None
     top = float(np.percentile(sample[near, 2], 99))
     around = points[np.abs(np.linalg.norm(points[:, :2] - axis, axis=1) - float(np.median(radius))) < 0.012]
-    top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 20 else top)
+    top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 8 else top)
     levels = np.linspace(0, top, max(4, int(top / 0.008)) + 1)
     zs = levels / height
     radii = np.sqrt(np.maximum(model[2] + model[3] * zs + model[4] * zs**2 + model[:2] @ model[:2], 1e-6))
     rho = np.linalg.norm(sample[:, :2] - axis, axis=1)
     for i, level in enumerate(levels):
         here = rho[(np.abs(sample[:, 2] - level) < 0.006) & (np.abs(rho - radii[i]) < 2.5 * band)]
-        if len(here) > 15:
+        if len(here) > 6:
             radii[i] = 0.5 * radii[i] + 0.5 * np.median(here)
-    inside = points[np.linalg.norm(points[:, :2] - axis, axis=1) < 0.6 * radii[-1]]
-    hollow = len(inside) > 25 and np.median(inside[:, 2]) < top - max(0.012, 0.15 * top)
-    return Body(axis, np.column_stack([radii, levels]), bool(hollow))
+    return Body(axis, np.column_stack([radii, levels]))
+
+
+def seen_into(sights: list[Sight], body: Body, noise: float) -> bool:
+    """Whether most of the rays that meet the top disc of the body go on below it: then it is open."""
+    radius, top = body.profile[-1]
+    steps = np.linspace(-0.6, 0.6, 13)
+    x, y = (part.ravel() for part in np.meshgrid(steps, steps))
+    disc = np.column_stack([x, y])[np.hypot(x, y) <= 0.6] * radius + body.axis
+    lid = np.column_stack([disc, np.full(len(disc), top)])
+    through = told = 0
+    for sight in sights:
+        inside, blind, z, measured = sight.sample(lid)
+        known = (inside > 0.5) & ~blind & np.isfinite(measured)
+        told += int(known.sum())
+        through += int((measured[known] > z[known] + max(0.010, 3 * noise)).sum())
+    return told > 8 and through > 0.5 * told
 
 
 def fit_to_silhouettes(body: Body, sights: list[Sight], reach: float = 0.008) -> Body:
@@ -207,6 +221,7 @@ def build_round(
     if height > body.profile[-1, 1] + 0.012:
         return None
     body = fit_to_silhouettes(body, sights)
+    body = replace(body, open=seen_into(sights, body, noise))
     # Of a band some part of the table inside shows to some camera.
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     spots = np.array(
@@ -223,7 +238,7 @@ def build_round(
     if len(over) > 0.08 * len(points):
         return None  # more than a body of revolution with a flat end, a bottle's neck say
     handle = None
-    if len(out) > 60:
+    if len(out) > 20:
         out = out[clusters.largest(out, 0.012, 4, 0.003)]
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
         if np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010 and len(out) > 0.02 * len(points):

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.rendering import GREY, VIEW_FILL, VIEW_SIZE, Raycaster, canonical_view
+from magic_core.rendering import GREY, VIEW_FILL, VIEW_SIZE, Raycaster
 from magic_core.scene import VIEW_KINDS, CanonicalView
 
 #: Horizontal directions tried for the side view, over half a turn, and the pixels of their silhouettes.
@@ -42,7 +42,7 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
         return _section(mesh, pieces, size)
     if kind == "side":
         direction, _, confidence = _best_side(mesh)
-        return canonical_view(mesh, direction, (0, 0, 1), "side", size, confidence=confidence)
+        return _drawn(mesh, direction, (0, 0, 1), "side", size, confidence)
     width = float(np.linalg.norm(mesh.extents[:2]))
     if mesh.extents[2] < 0.3 * width:  # it lies on the table
         return _top(mesh, size, float(np.clip(1.0 - mesh.extents[2] / max(width, 1e-9), 0.5, 1.0)))
@@ -51,35 +51,101 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
     direction, told, confidence = _best_side(mesh)
     from_above = _tells(_silhouettes(Raycaster([mesh]), mesh, np.array([[0, 0, -1.0]]), np.array([0, 1.0, 0]))[0][0])
     if told > 1.2 * from_above and told > 0.03:
-        return canonical_view(mesh, direction, (0, 0, 1), "side", size, confidence=confidence)
+        return _drawn(mesh, direction, (0, 0, 1), "side", size, confidence)
     return _top(mesh, size, float(np.clip(0.5 + from_above - told, 0.1, 1.0)))
 
 
 def _top(mesh: Mesh, size: int, confidence: float) -> CanonicalView:
-    return canonical_view(mesh, (0, 0, -1), (0, 1, 0), "top", size, confidence=confidence)
+    return _drawn(mesh, (0, 0, -1), (0, 1, 0), "top", size, confidence)
+
+
+def _drawn(mesh: Mesh, direction: ArrayLike, up: ArrayLike, kind: str, size: int, confidence: float) -> CanonicalView:
+    """What :func:`magic_core.rendering.canonical_view` draws, in half of its time: shaded by triangle, not by pixel."""
+    import open3d as o3d
+
+    z = transforms.unit(direction)
+    up = np.asarray(up, dtype=float)
+    y = transforms.unit(-(up - (up @ z) * z))
+    x = np.cross(y, z)
+    rotation = np.column_stack([x, y, z])
+    local = mesh.vertices @ rotation
+    low, high = local.min(axis=0), local.max(axis=0)
+    centre = rotation @ ((low + high) / 2)
+    scale = max(float((high - low)[:2].max()), 1e-6) / (VIEW_FILL * size)
+    reach = float(high[2] - low[2]) / 2 + 0.01
+    # The object is centred: rays are needed only in the rectangle that it fills, two pixels of margin around it.
+    left, top = np.maximum((size - 2 * np.ceil((high - low)[:2] / scale / 2).astype(int) - 4) // 2, 0)
+    width, height = size - 2 * left, size - 2 * top
+    across = ((np.arange(width) - (width - 1) / 2) * scale).astype(np.float32)
+    down = ((np.arange(height) - (height - 1) / 2) * scale).astype(np.float32)
+    start = centre - reach * z
+    rays = np.empty((height, width, 6), np.float32)
+    for axis in range(3):
+        np.add(np.float32(x[axis]) * across, (np.float32(y[axis]) * down + np.float32(start[axis]))[:, None], out=rays[..., axis])
+        rays[..., 3 + axis] = z[axis]
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    hits = scene.cast_rays(o3d.core.Tensor(rays))
+    distance = hits["t_hit"].numpy()
+    hit = np.isfinite(distance)
+    where = np.flatnonzero(hit)
+    face = np.take(hits["primitive_ids"].numpy().ravel(), where)
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals[normals @ z > 0] *= -1
+    light = transforms.unit(-z + 0.4 * x - 0.3 * y)
+    bright = (0.45 + 0.55 * np.clip(normals @ light, 0, 1)).astype(np.float32)
+    seen = np.zeros((height * width, 3), np.uint8)
+    if mesh.colors is None:
+        seen[where] = np.take((GREY * bright[:, None]).astype(np.uint8), face, axis=0)
+    else:
+        # Colour over a triangle is linear: its value at a corner and the slopes along two sides.
+        paint = mesh.colors[mesh.faces].astype(np.float32) * bright[:, None, None]
+        paint[:, 1:] -= paint[:, :1]
+        bc = np.take(hits["primitive_uvs"].numpy().reshape(-1, 2), where, axis=0)
+        rows = np.take(paint.reshape(-1, 9), face, axis=0)
+        rows[:, 3:6] *= bc[:, :1]
+        rows[:, 6:] *= bc[:, 1:]
+        seen[where] = rows[:, :3] + rows[:, 3:6] + rows[:, 6:]
+    image = np.zeros((size, size, 3), np.uint8)
+    mask = np.zeros((size, size), bool)
+    depth = np.full((size, size), np.nan, np.float32)
+    window = (slice(top, top + height), slice(left, left + width))
+    image[window] = seen.reshape(height, width, 3)
+    mask[window] = hit
+    depth[window] = np.where(hit, distance - np.float32(reach), np.float32(np.nan))
+    return CanonicalView(image, mask, scale, transforms.make(rotation, centre), kind, depth, confidence)
 
 
 def _silhouettes(
     caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """The masks (D, P, P) of a mesh seen along directions (D, 3), and their metres per pixel (D,)."""
+    count = len(directions)
+    y = -(up - (directions @ up)[:, None] * directions)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    axes = np.stack([np.cross(y, directions), y, directions], axis=1)  # rows: right, down, into the picture
+    local = axes @ mesh.vertices.T
+    low, high = local.min(axis=2), local.max(axis=2)
+    extent = (high - low)[:, :2]
+    scales = np.maximum(extent.max(axis=1), 1e-6) / (0.9 * _PROBE)
+    # The thing is in the middle: only the rows and columns that it reaches in some direction need rays.
+    reach = np.minimum(np.ceil((extent / scales[:, None]).max(axis=0) / 2).astype(int) + 1, _PROBE // 2)
+    columns, rows = (slice(_PROBE // 2 - r, _PROBE // 2 + r) for r in reach)
     steps = np.arange(_PROBE) - (_PROBE - 1) / 2
-    rays = np.empty((len(directions), _PROBE, _PROBE, 6), np.float32)
-    scales = []
-    for ray, direction in zip(rays, directions, strict=True):
-        y = transforms.unit(-(up - (up @ direction) * direction))
-        rotation = np.column_stack([np.cross(y, direction), y, direction])
-        local = mesh.vertices @ rotation
-        low, high = local.min(axis=0), local.max(axis=0)
-        scale = max(float((high - low)[:2].max()), 1e-6) / (0.9 * _PROBE)
-        middle = (low + high) / 2
-        middle[2] = low[2] - 0.01
-        across, down = steps * scale + middle[0], steps * scale + middle[1]
-        for axis in range(3):
-            ray[..., axis] = (rotation[axis, 0] * across + rotation[axis, 2] * middle[2])[None, :] + (rotation[axis, 1] * down)[:, None]
-        ray[..., 3:] = direction
-        scales.append(scale)
-    return caster.hits(rays[..., :3], rays[..., 3:]), np.array(scales)
+    middle = (low + high) / 2
+    middle[:, 2] = low[:, 2] - 0.01
+    across = scales[:, None] * steps[columns] + middle[:, :1]
+    down = scales[:, None] * steps[rows] + middle[:, 1:2]
+    rays = np.empty((count, down.shape[1], across.shape[1], 6), np.float32)
+    for axis in range(3):
+        right, below, into = axes[:, 0, axis, None], axes[:, 1, axis, None], axes[:, 2, axis, None]
+        np.add((right * across + into * middle[:, 2:])[:, None, :], (below * down)[:, :, None], out=rays[..., axis], casting="same_kind")
+        rays[..., 3 + axis] = directions[:, axis, None, None]
+    masks = np.zeros((count, _PROBE, _PROBE), bool)
+    masks[:, rows, columns] = caster.hits(rays[..., :3], rays[..., 3:])
+    return masks, scales
 
 
 def holes_of(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -1,0 +1,115 @@
+"""Seconds by stage and memory, for a benchmark of two cameras over four objects: ``ros2 run magic_perception evaluate --speed``."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from pathlib import Path
+
+import numpy as np
+
+from magic_core import sensor, shapes, transforms
+from magic_core.camera import RgbdFrame
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.segmentation import Segmenter
+from magic_perception.tracking import Tracker
+
+#: Family, seed, x and y in metres and yaw in radians of what stands and lies on the table.
+OBJECTS = (("l_hook", 1, 0.50, -0.10, 0.4), ("cylinder", 1, 0.62, 0.12, 0.0), ("mug", 3, 0.48, 0.10, 2.5), ("caliper", 2, 0.68, -0.05, 1.2))
+
+#: Eyes of the two cameras, which look at the table's middle.
+EYES = ((0.25, 0.45, 0.62), (0.25, -0.45, 0.62))
+
+#: What of the stages the issue of speed is about: from the masks on, and from the images on, to meshes with convex pieces.
+SUMS = {"masks to meshes": ("meshes",), "images to meshes": ("table", "masks", "meshes"), "all": ("table", "masks", "meshes", "views")}
+
+
+def frame_pairs(count: int, seed: int = 0) -> list[list[RgbdFrame]]:
+    """``count`` pairs of 640x480 frames of one scene, each with noise of its own."""
+    meshes = []
+    for family, number, x, y, yaw in OBJECTS:
+        mesh = shapes.make(family, number).mesh
+        meshes.append(mesh.transformed(transforms.from_rpy(0, 0, yaw, [x, y, -mesh.bounds[0, 2]])))
+    caster = sensor.scene_raycaster(meshes)
+    return [
+        [
+            sensor.capture(
+                meshes, sensor.D435, sensor.looking_at(eye, (0.55, 0.0, 0.02)), [seed, n, i], camera=f"camera_{i}", raycaster=caster
+            )
+            for i, eye in enumerate(EYES)
+        ]
+        for n in range(count)
+    ]
+
+
+def resident() -> float:
+    """Resident memory of this process in MiB; NaN where the system does not tell it as Linux does."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    except OSError:
+        return float("nan")
+
+
+def measure(frames: int, segmenter: Segmenter, seed: int = 0, workers: int = 1, pairs: int = 8) -> dict:
+    """Seconds by stage and resident memory over ``frames`` scenes, made of ``pairs`` captures over and over, ids tracked as the node does."""
+    captured = frame_pairs(min(pairs, frames), seed)
+    parameters = Parameters(workers=workers, seed=seed)
+    tracker = Tracker()
+    perceive(captured[0], parameters=parameters, segmenter=segmenter)  # loads libraries
+    reports, memory = [], []
+    begin = time.perf_counter()
+    scene = None
+    for number in range(frames):
+        report = Report()
+        scene = tracker.update(perceive(captured[number % len(captured)], parameters=parameters, segmenter=segmenter, report=report))
+        report.labels = []
+        reports.append(report)
+        if (number + 1) % max(1, frames // 20) == 0:
+            memory.append(round(resident(), 1))
+    assert scene is not None
+    stages = {name: (name,) for name in reports[0].seconds} | SUMS
+    table = {}
+    for name, parts in stages.items():
+        wall, cpu = (
+            np.array([sum(times[p] for p in parts) for times in ([r.seconds for r in reports], [r.cpu for r in reports])[i]])
+            for i in (0, 1)
+        )
+        table[name] = {
+            "wall_least": round(float(wall.min()), 4),
+            "wall_median": round(float(np.median(wall)), 4),
+            "cpu_least": round(float(cpu.min()), 4),
+            "cpu_median": round(float(np.median(cpu)), 4),
+        }
+    half = np.array(memory[len(memory) // 2 :])
+    return {
+        "frames": frames,
+        "workers": workers,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "machine": platform.processor() or platform.machine(),
+        "load": round(os.getloadavg()[0], 1),
+        "shapes": list(reports[-1].shapes.values()),
+        "pieces": [len(item.pieces) for item in scene.objects],
+        "seconds": table,
+        "seconds_in_all": round(time.perf_counter() - begin, 1),
+        "memory_mib": memory,
+        "memory_growth_second_half_mib": round(float(half[-1] - half[0]), 1) if len(half) > 1 else None,
+    }
+
+
+def markdown(result: dict) -> str:
+    """The measurement as a table."""
+    lines = [
+        f"{result['frames']} scenes of {len(result['shapes'])} objects ({', '.join(result['shapes'])}; {sum(result['pieces'])} convex pieces), "
+        f"two 640x480 cameras, {result['cores']} cores, {result['workers']} threads, load {result['load']}:",
+        "",
+        "| stage | wall, least s | wall, median s | CPU, least s | CPU, median s |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {name} | {row['wall_least']:.3f} | {row['wall_median']:.3f} | {row['cpu_least']:.3f} | {row['cpu_median']:.3f} |"
+        for name, row in result["seconds"].items()
+    ]
+    lines += ["", f"Resident memory, MiB, at each twentieth: {', '.join(f'{m:.0f}' for m in result['memory_mib'])}"]
+    return "\n".join(lines) + "\n"
