@@ -147,7 +147,6 @@ class Watcher:
     def __init__(self, topics: Sequence[str], say: Any) -> None:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
-        from rclpy.action import ActionClient
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
         from rclpy.signals import SignalHandlerOptions
@@ -155,6 +154,7 @@ class Watcher:
         from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
         from magic_core import qos
+        from magic_core.actions import ActionClient
         from magic_interfaces.action import RunStrategy
         from magic_interfaces.msg import SceneObjectArray
 

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
+from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
 
 #: Between looks at whether a server is still there, s; discovery gives no event for it in rclpy.

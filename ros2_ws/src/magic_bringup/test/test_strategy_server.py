@@ -8,7 +8,6 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.action import ActionClient
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
@@ -20,6 +19,7 @@ from magic_bringup.remote import Token
 from magic_bringup.strategy_server import StrategyServer, complaint_code
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
+from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.srv import MatchContact
