@@ -87,10 +87,12 @@ def frame(mask: NDArray[np.bool_], out: int, fill: float = 0.9) -> tuple[NDArray
 
     The same for every turn, so that a tool and its turned copy are seen at one size.
     """
-    v, u = np.nonzero(mask)
-    if len(u) == 0:
+    rows = np.nonzero(mask.any(axis=1))[0]
+    if len(rows) == 0:
         raise MagicError(Code.EMPTY_MASK, "pixels of the mask that are on the object", 0, "at least 16")
-    corners = np.column_stack([u, v]).astype(float)
+    # Each row's first and last pixel: no other can be the farthest.
+    first, last = np.argmax(mask[rows], axis=1), mask.shape[1] - 1 - np.argmax(mask[rows, ::-1], axis=1)
+    corners = np.column_stack([np.concatenate([first, last]), np.concatenate([rows, rows])]).astype(float)
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius = float(np.hypot(*(corners - centre).T).max()) + 1.0
     return centre, fill * out / (2 * radius)
@@ -99,8 +101,8 @@ def frame(mask: NDArray[np.bool_], out: int, fill: float = 0.9) -> tuple[NDArray
 def draw(view: CanonicalView, views: Views, out: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float64]]:
     """Masked pictures (V, out, out, 3), masks (V, out, out) 0..1 and affine maps (V, 2, 3) of the views."""
     centre, scale = frame(view.mask, out)
-    image = np.where(view.mask[..., None], view.image, 0).astype(np.uint8)
     soft = view.mask.astype(np.float32)
+    image = cv2.bitwise_and(view.image, view.image, mask=view.mask.view(np.uint8))
     pictures, masks, maps = [], [], []
     for rotation, flipped in zip(views.rotation, views.flipped, strict=True):
         matrix = view_matrix(float(rotation), bool(flipped), view.mask.shape, centre, out, scale)
@@ -131,30 +133,45 @@ def box_sums(features: NDArray[np.float32], m: int) -> NDArray[np.float32]:
 
 
 def pairs_similarity(patch: NDArray[np.float32], inside: NDArray[np.bool_], features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The paper's s_dino at every token (n, n): the mean over all pairs of the patch (m, m, d) and the neighbourhood's tokens."""
-    m = patch.shape[0]
-    direction = (patch * inside[..., None]).sum(axis=(0, 1))
-    response = features @ direction
-    total = cv2.boxFilter(response.astype(np.float32), -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    count = cv2.boxFilter(np.ones(response.shape, np.float32), -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return total / (count * max(int(inside.sum()), 1))
+    """The paper's s_dino at every token: the mean over all pairs of a patch's and the neighbourhood's tokens.
+
+    Patches (V, m, m, d) against a map (n, n, d) -> (V, n, n), or one patch (m, m, d) -> (n, n).
+    """
+    if patch.ndim == 3:
+        return pairs_similarity(patch[None], inside[None], features)[0]
+    m = patch.shape[1]
+    directions = np.einsum("vrcd,vrc->vd", patch, inside.astype(np.float32))
+    # One product and one box sum for all views: the sum over the neighbourhood is linear.
+    response = np.ascontiguousarray(features @ directions.T)
+    total = cv2.boxFilter(response, -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    count = cv2.boxFilter(np.ones(response.shape[:2], np.float32), -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    here = np.maximum(inside.sum(axis=(1, 2)), 1).astype(np.float32)
+    return total.reshape(response.shape).transpose(2, 0, 1) / (count * here[:, None, None])
 
 
 def aligned_similarity(patches: NDArray[np.float32], inside: NDArray[np.bool_], features: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mean cosine at aligned positions (V, n, n) for patches (V, m, m, d) against a map (n, n, d)."""
     import torch
 
-    m = patches.shape[1]
+    m, n = patches.shape[1], features.shape[0]
     with torch.inference_mode():
-        kernel = torch.from_numpy(np.ascontiguousarray((patches * inside[..., None]).transpose(0, 3, 1, 2)))
-        total = torch.nn.functional.conv2d(
-            torch.from_numpy(np.ascontiguousarray(features.transpose(2, 0, 1)))[None], kernel, padding=m // 2
-        )[0]
-        there = torch.nn.functional.conv2d(
-            torch.ones(1, 1, *features.shape[:2]), torch.from_numpy(inside.astype(np.float32))[:, None], padding=m // 2
-        )[0]
+        kept = np.ascontiguousarray(inside.reshape(-1), dtype=np.float32)
+        tokens = torch.from_numpy(np.ascontiguousarray(patches.reshape(-1, patches.shape[-1]))) * torch.from_numpy(kept)[:, None]
+        # All cosines at once, then each offset's plane is shifted to where it belongs: quicker than a convolution of so many channels.
+        cosines = (tokens @ torch.from_numpy(np.ascontiguousarray(features.reshape(-1, features.shape[-1]))).T).reshape(-1, m, m, n, n)
+        half = m // 2
+        total = torch.zeros(len(patches), n + 2 * half, n + 2 * half)
+        there = torch.zeros_like(total)
+        exists = torch.from_numpy(inside.astype(np.float32))
+        for r in range(m):
+            for c in range(m):
+                # Token r, c of the patch under token y, x of the map: the patch's middle lies at y - r + half, x - c + half.
+                at = (slice(None), slice(2 * half - r, 2 * half - r + n), slice(2 * half - c, 2 * half - c + n))
+                total[at] += cosines[:, r, c]
+                there[at] += exists[:, r, c, None, None]
+        total, there = (a[:, half : half + n, half : half + n] for a in (total, there))
         # A neighbourhood that the border cuts to a few tokens would win by chance: at least half of the patch counts.
-        floor = torch.from_numpy(inside.sum(axis=(1, 2)).astype(np.float32))[:, None, None] / 2
+        floor = exists.sum(dim=(1, 2))[:, None, None] / 2
         return (total / torch.maximum(there, floor).clamp(min=1)).numpy()
 
 
@@ -169,25 +186,41 @@ def _patches(maps: NDArray[np.float32], tokens: NDArray[np.int64], m: int) -> tu
 
 def _moments(tokens: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     """Mean (d,), scatter matrix about the mean (d, d) and number of tokens (N, d)."""
-    mean = tokens.mean(axis=0, dtype=np.float64)
-    centred = tokens - mean.astype(np.float32)
-    return mean, (centred.T @ centred).astype(np.float64), len(tokens)
+    import torch
+
+    with torch.inference_mode():
+        mean = tokens.mean(axis=0, dtype=np.float64)
+        centred = torch.from_numpy(tokens - mean.astype(np.float32))
+        return mean, (centred.T @ centred).numpy().astype(np.float64), len(tokens)
 
 
 def joint_pca(prepared: PreparedGlobal, tokens: NDArray[np.float32], components: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean (d,) and W (d, d') of the reference's tokens and new ones (N, d) together."""
+    import torch
+
     mean, scatter, count = _moments(tokens)
     total = prepared.count + count
     shift = mean - prepared.mean
     joint = prepared.mean + shift * (count / total)
-    covariance = prepared.scatter + scatter + np.outer(shift, shift) * (prepared.count * count / total)
-    values, vectors = np.linalg.eigh(covariance / total)
-    kept = vectors[:, ::-1][:, : min(components, len(values))]
-    return joint.astype(np.float32), kept.astype(np.float32)
+    covariance = (prepared.scatter + scatter + np.outer(shift, shift) * (prepared.count * count / total)) / total
+    with torch.inference_mode():
+        _values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.astype(np.float32)))
+    kept = vectors.numpy()[:, ::-1][:, : min(components, len(covariance))]
+    return joint.astype(np.float32), np.ascontiguousarray(kept)
+
+
+def _project(tokens: NDArray[np.float32], mean: NDArray[np.float32], w: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(tokens - mean) W for tokens (..., d)."""
+    import torch
+
+    with torch.inference_mode():
+        flat = torch.from_numpy(np.ascontiguousarray(tokens.reshape(-1, tokens.shape[-1])))
+        return torch.addmm(torch.from_numpy(-(mean @ w)), flat, torch.from_numpy(w)).numpy().reshape(*tokens.shape[:-1], -1)
 
 
 def _unit(tokens: NDArray[np.float32]) -> NDArray[np.float32]:
-    return tokens / np.maximum(np.linalg.norm(tokens, axis=-1, keepdims=True), 1e-9)
+    length = np.sqrt(np.einsum("...d,...d->...", tokens, tokens))
+    return tokens / np.maximum(length, 1e-9)[..., None]
 
 
 def prepare(
@@ -213,14 +246,14 @@ def similarity(prepared: PreparedGlobal, features: NDArray[np.float32], aggregat
     patches, inside = prepared.patches, prepared.inside
     if components is not None:
         mean, w = joint_pca(prepared, features.reshape(-1, features.shape[-1]), components)
-        patches, features = (patches - mean) @ w, (features - mean) @ w
+        patches, features = _project(patches, mean, w), _project(features, mean, w)
     patches, features = _unit(patches), _unit(features)
     if aggregation == "aligned":
         return aligned_similarity(patches, inside, features)
     if aggregation == "none":
         half = patches.shape[1] // 2
         return np.einsum("vd,rcd->vrc", patches[:, half, half], features)
-    return np.stack([pairs_similarity(p, i, features) for p, i in zip(patches, inside, strict=True)])
+    return pairs_similarity(patches, inside, features)
 
 
 def propose(
@@ -247,19 +280,21 @@ def propose(
         pictures, masks, matrices = draw(view, upright, out)
         maps = extract(pictures)
         scores = similarity(prepared, maps[0], aggregation, components)
-        on = np.broadcast_to(_coverage(masks[0], maps.shape[1]), scores.shape)
-        to_picture = np.broadcast_to(cv2.invertAffineTransform(matrices[0]), (len(scores), 2, 3))
-        views = prepared.views
+        on, to_picture, views = _coverage(masks[0], maps.shape[1])[None], cv2.invertAffineTransform(matrices[0])[None], prepared.views
     scores = np.where(on, scores, -np.inf)
     n = scores.shape[1]
-    centres = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1) + 0.5) * (out / n) - 0.5
-    points = np.einsum("vij,rcj->vrci", to_picture[:, :, :2], centres) + to_picture[:, None, None, :, 2]
     if not np.isfinite(scores).any():
         raise MagicError(Code.EMPTY_MASK, "tokens of the network's map that lie on the object", 0, "at least one")
-    size = float(np.hypot(*(np.ptp(np.nonzero(view.mask), axis=1))))
-    flat_scores, flat_points = scores.reshape(-1), points.reshape(-1, 2)
+    # Where all relative views are seen in one picture a token is the same place in all of them: only its best view counts.
+    best = np.argmax(scores, axis=0) if len(to_picture) == 1 else None
+    ranked = scores if best is None else np.take_along_axis(scores, best[None], axis=0)
+    centres = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1) + 0.5) * (out / n) - 0.5
+    points = np.einsum("vij,rcj->vrci", to_picture[:, :, :2], centres) + to_picture[:, None, None, :, 2]
+    rows, columns = (np.nonzero(view.mask.any(axis=axis))[0] for axis in (1, 0))
+    size = float(np.hypot(rows[-1] - rows[0], columns[-1] - columns[0]))
+    flat_scores, flat_points = ranked.reshape(-1), points.reshape(-1, 2)
     chosen = suppress(flat_points, flat_scores, 0.1 * size, count)
-    which = [c // (n * n) for c in chosen]
+    which = [c // (n * n) if best is None else int(best.flat[c]) for c in chosen]
     proposals = tuple(
         Proposal(flat_points[c], float(views.rotation[k]), bool(views.flipped[k]), float(flat_scores[c]))
         for c, k in zip(chosen, which, strict=True)
@@ -272,7 +307,7 @@ def propose(
         grid = np.nan_to_num((grid - low) / max(high - low, 1e-9)).astype(np.float32)
         large = cv2.resize(grid, (out, out), interpolation=cv2.INTER_LINEAR)
         height, width = view.mask.shape
-        heat = cv2.warpAffine(large, np.ascontiguousarray(to_picture[v]), (width, height), flags=cv2.INTER_LINEAR)
+        heat = cv2.warpAffine(large, np.ascontiguousarray(to_picture[v if best is None else 0]), (width, height), flags=cv2.INTER_LINEAR)
         heat = np.where(view.mask, np.clip(heat, 0, 1), 0).astype(np.float32)
     return GlobalMatch(proposals, heat)
 
