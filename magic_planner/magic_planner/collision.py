@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,25 +43,25 @@ DIRECTIONS = 600
 LARGEST = 1e4
 
 
-def _outermost(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of points (N, 3) those (M, 3), M <= DIRECTIONS, that reach furthest in directions spread evenly over the sphere.
+def outermost(points: NDArray[np.float64], count: int = DIRECTIONS) -> NDArray[np.float64]:
+    """Of points (N, 3) those (M, 3), M <= count, that reach furthest in ``count`` directions spread evenly over the sphere.
 
     The directions are stretched with the points, so that long and flat shapes are sampled as well as round ones: what is
-    cut off is below 1 % of the extent in each direction (0.3 % for a ball).
+    cut off is, with DIRECTIONS of them, below 1 % of the extent in each direction (0.3 % for a ball).
     """
-    n = np.arange(DIRECTIONS) + 0.5
-    polar, turn = np.arccos(1 - 2 * n / DIRECTIONS), np.pi * (1 + np.sqrt(5)) * n
+    n = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * n / count), np.pi * (1 + np.sqrt(5)) * n
     directions = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)])
     centred = points - points.mean(axis=0)
     axes = np.linalg.svd(centred.T @ centred)[0]
     centred = centred @ axes
     white = np.ascontiguousarray((centred / np.maximum(np.abs(centred).max(axis=0), 1e-9)).T, dtype=np.float32)
     towards = np.ascontiguousarray(directions.T, dtype=np.float32)
-    best, index = np.full(DIRECTIONS, -np.inf, np.float32), np.zeros(DIRECTIONS, dtype=int)
+    best, index = np.full(count, -np.inf, np.float32), np.zeros(count, dtype=int)
     for first in range(0, len(points), 10_000):
         reach = towards @ white[:, first : first + 10_000]
         furthest = reach.argmax(axis=1)
-        value = reach[np.arange(DIRECTIONS), furthest]
+        value = reach[np.arange(count), furthest]
         index = np.where(value > best, first + furthest, index)
         best = np.maximum(best, value)
     return points[np.unique(index)]
@@ -73,7 +74,7 @@ def _hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
     if not np.abs(points).max() < LARGEST:
         raise MagicError(Code.BAD_MESH, "convex piece", f"{np.abs(points).max():.3g} m", f"coordinates below {LARGEST:g} m")
     if len(points) > MOST_VERTICES:
-        points = _outermost(points)
+        points = outermost(points)
     try:
         shell = ConvexHull(points)
     except (QhullError, ValueError):
@@ -147,6 +148,51 @@ def shell(pieces: Iterable[Mesh]) -> list[Any]:
     return [tree]
 
 
+@dataclass(frozen=True)
+class _Solid:
+    """What collision tests need to know of P convex pieces, in their frame.
+
+    tree: their surfaces; normals (P, F, 3), offsets (P, F): their planes, the shorter lists filled up; centres (P, 3), radii (P,):
+    balls about them; first (P, 3): a point of each.
+    """
+
+    tree: Any
+    normals: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+    centres: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    first: NDArray[np.float64]
+
+
+#: Solids of pieces seen lately, as of :data:`_HULLS`.
+_SOLIDS: OrderedDict[tuple[int, ...], tuple[tuple[Mesh, ...], _Solid]] = OrderedDict()
+_KEPT_SOLIDS = 64
+
+
+def _solid(pieces: tuple[Mesh, ...]) -> _Solid:
+    key = tuple(id(piece) for piece in pieces)
+    known = _SOLIDS.get(key)
+    if known is not None:
+        _SOLIDS.move_to_end(key)
+        return known[1]
+    hulls = [hull(piece.vertices) for piece in pieces]
+    planes = [_planes(vertices, faces) for vertices, faces in hulls]
+    centres = np.array([(vertices.min(axis=0) + vertices.max(axis=0)) / 2 for vertices, _ in hulls])
+    solid = _Solid(
+        tree=shell(pieces)[0],
+        normals=padded([n for n, _ in planes]),
+        offsets=padded([o for _, o in planes]),
+        centres=centres,
+        radii=np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, centres, strict=True)]),
+        first=np.array([vertices[0] for vertices, _ in hulls]),
+    )
+    # The pieces are kept with it: an id is theirs for as long as they live.
+    _SOLIDS[key] = (pieces, solid)
+    while len(_SOLIDS) > _KEPT_SOLIDS:
+        _SOLIDS.popitem(last=False)
+    return solid
+
+
 class Body:
     """A named rigid body of convex pieces that can be moved and asked what it touches."""
 
@@ -156,15 +202,10 @@ class Body:
         from mplib.collision_detection import fcl
 
         self.name = name
-        pieces = list(pieces)
-        self.object = fcl.CollisionObject(shell(pieces)[0], mplib.Pose())
-        hulls = [hull(piece.vertices) for piece in pieces]
-        self._planes = [_planes(vertices, faces) for vertices, faces in hulls]
-        bounds = np.array([(vertices.min(axis=0), vertices.max(axis=0)) for vertices, _ in hulls])
-        self.local = bounds.mean(axis=1)
-        #: Radius in metres of the ball about each piece, and a point of each piece.
-        self.radii = np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, self.local, strict=True)])
-        self.first = np.array([vertices[0] for vertices, _ in hulls])
+        solid = _solid(tuple(pieces))
+        self.object = fcl.CollisionObject(solid.tree, mplib.Pose())
+        self._planes = solid.normals, solid.offsets
+        self.local, self.radii, self.first = solid.centres, solid.radii, solid.first
         self.pose = np.eye(4)
         self.centres = self.local
 
@@ -197,12 +238,19 @@ class Body:
     def _holds(self, other: Body, pairs: NDArray[np.int64]) -> bool:
         """Whether the first point of other's piece j lies in this body's piece i, for any of the pairs (N, 2) of i and j."""
         points = transforms.apply(transforms.inverse(self.pose), transforms.apply(other.pose, other.first))
-        close = np.linalg.norm(points[pairs[:, 1]] - self.local[pairs[:, 0]], axis=1) < self.radii[pairs[:, 0]]
-        for i, j in pairs[close]:
-            normals, offsets = self._planes[i]
-            if np.all(normals @ points[j] <= offsets):
-                return True
-        return False
+        near = np.linalg.norm(points[pairs[:, 1]] - self.local[pairs[:, 0]], axis=1) < self.radii[pairs[:, 0]]
+        if not near.any():
+            return False
+        i, j = pairs[near].T
+        normals, offsets = self._planes
+        heights = np.matmul(normals[i], points[j][:, :, None])[:, :, 0] - offsets[i]
+        return bool((heights.max(axis=1) <= 0).any())
+
+
+def padded(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Arrays of different lengths as one (N, longest, ...), the shorter ones filled up with copies of their first row."""
+    longest = max(len(row) for row in rows)
+    return np.stack([np.concatenate([row, np.repeat(row[:1], longest - len(row), axis=0)]) for row in rows])
 
 
 def _planes(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

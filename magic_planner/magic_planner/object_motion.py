@@ -25,6 +25,7 @@ from magic_core.motion import Phase, ToolMotion
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy
 from magic_planner.collision import Body, outer_points, solid_pieces
+from magic_planner.giving_way import give_way
 
 #: Largest step between two samples: metres, radians.
 STEP_LENGTH = 0.005
@@ -82,9 +83,8 @@ def plan_tool_motion(
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
     world_from_tool = (world_from_target @ target_from_contact) @ contacts @ transforms.inverse(tool_from_contact)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool))
-    motion = ToolMotion(times, world_from_tool, phases)
     start = Body(tool.id, solid_pieces(tool))
-    start.move(motion.world_from_tool[0])
+    start.move(world_from_tool[0])
     for item in (target, *obstacles):
         if start.touches(Body.from_object(item)):
             raise MagicError(
@@ -93,7 +93,15 @@ def plan_tool_motion(
                 "in collision",
                 "a first waypoint at which the tool is clear of the target and the obstacles",
             )
-    return motion
+    direction = (world_from_target @ target_from_contact)[:3, 2]
+    marks = waypoint_times(strategy)
+
+    def name(index: int) -> str:
+        ahead = next((n for n, t in marks if t >= times[index] - 1e-6), marks[-1][0])
+        return f"waypoint {ahead!r} (at {times[index]:.2f} s of the tool's motion)"
+
+    world_from_tool = give_way(world_from_tool, tool, obstacles, direction, plane, TABLE_CLEARANCE, name)
+    return ToolMotion(times, world_from_tool, phases)
 
 
 def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:
