@@ -20,12 +20,17 @@ from magic_verifier.simulation import extremes
 
 #: Faces above which the surface is sampled rather than used whole.
 SAMPLES = 400_000
+#: What fills its convex hull to this share counts as convex.
+CONVEX = 0.95
+#: Cubes that the thinnest side is cut into, if no more than FINEST along the longest edge are needed for it.
+THINNEST, FINEST = 6, 112
 MAX_EXTENT = 5.0
 MIN_EXTENT = 0.002
 
 
 def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Mesh, ...]:
-    """Convex pieces in the mesh's frame; ``resolution`` cubes along the longest edge, at most ``most`` pieces.
+    """Convex pieces in the mesh's frame; ``resolution`` cubes along the longest edge (for thin things up
+    to :data:`FINEST`), at most ``most`` pieces.
 
     Raises ``BAD_MESH`` for a mesh without faces, or of a size that cannot be simulated.
     """
@@ -35,7 +40,7 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
     extent = float((high - low).max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
         raise MagicError(Code.BAD_MESH, "largest extent of the mesh", f"{extent:.3g} m", f"{MIN_EXTENT} to {MAX_EXTENT} m")
-    pitch = extent / resolution
+    pitch = max(min(extent / resolution, float((high - low).min()) / THINNEST), extent / max(resolution, FINEST))
     surface = _surface(mesh, pitch)
     origin = low - 1.5 * pitch
     index = np.floor((surface - origin) / pitch).astype(int)
@@ -44,8 +49,7 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
     # What cannot be reached from outside is inside.
     filled = ndimage.binary_fill_holes(grid)
     hull = _hull(extremes(surface, 1000))
-    # The cubes reach beyond the surface: what fills its hull even so is convex.
-    if hull is not None and ConvexHull(hull.vertices).volume <= filled.sum() * pitch**3:
+    if hull is not None and _volume(mesh, grid, filled, pitch) >= CONVEX * ConvexHull(hull.vertices).volume:
         return (hull,)
     boxes = _boxes(filled)
     boxes = sorted(boxes, key=lambda b: -int(np.prod(b[1] - b[0])))[:most]
@@ -57,6 +61,17 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
             _piece(corner, end, filled[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))], grid, lower, surface, tree, pitch)
         )
     return tuple(p for p in pieces if p is not None)
+
+
+def _volume(mesh: Mesh, grid: NDArray[np.bool_], filled: NDArray[np.bool_], pitch: float) -> float:
+    """Volume in m^3: exact for a closed mesh, else of the cubes inside and half of those on the surface.
+
+    All cubes together reach beyond the surface by as much as a thin thing is thick.
+    """
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    if solid.is_watertight and solid.is_winding_consistent:
+        return abs(float(solid.volume))
+    return float((filled & ~grid).sum() + 0.5 * grid.sum()) * pitch**3
 
 
 def _surface(mesh: Mesh, pitch: float) -> NDArray[np.float64]:

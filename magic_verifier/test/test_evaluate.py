@@ -12,7 +12,7 @@ import yaml
 pytest.importorskip("magic_matcher.matching")
 pytest.importorskip("magic_planner.object_motion")
 
-from magic_core import transforms
+from magic_core import shapes, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
@@ -87,6 +87,18 @@ def test_a_convex_mesh_is_one_piece():
     pieces = convex_pieces(Mesh(ball.vertices, ball.faces))
     assert len(pieces) == 1
     assert sphere_of(usable_pieces("ball", pieces)[0])[1] == pytest.approx(0.03, rel=0.02)
+
+
+def test_a_thin_hollow_thing_is_not_taken_for_convex():
+    """Cubes as large as a shallow spoon is thick would fill its bowl."""
+    shape = shapes.make(
+        "spoon", 5, bowl_half_length=0.03, bowl_half_width=0.02, depth=0.006, wall=0.003, handle=0.25, handle_thickness=0.005
+    )
+    pieces = convex_pieces(shape.mesh)
+    assert len(pieces) > 5
+    assert _volume(pieces) < 1.6 * _volume(shape.pieces)
+    plate = trimesh.creation.box(extents=[0.3, 0.05, 0.004])
+    assert len(convex_pieces(Mesh(plate.vertices, plate.faces))) == 1
 
 
 @pytest.mark.parametrize(
