@@ -34,7 +34,8 @@ class Contour:
     the loop a point is on; starts (L,) and lengths (L,) give each loop's slice of the
     arrays, in walking order, closed; spacing (L,) pixels between neighbours.  soft
     (H, W) float32 is the blurred mask whose 0.5 level the contour is.  size is the
-    diagonal of the points' bounding box, the length that scales are relative to.
+    diagonal of the points' bounding box, the length that scales are relative to; blur, px, is
+    that of the mask before its level was taken.
     """
 
     points: NDArray[np.float64]
@@ -46,6 +47,7 @@ class Contour:
     soft: NDArray[np.float32]
     size: float
     centroid: NDArray[np.float64]
+    blur: float = BLUR
 
     @cached_property
     def flat(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -163,4 +165,5 @@ def extract(mask: NDArray[np.bool_], spacing: float = 1.0, blur: float = BLUR) -
         soft=np.ascontiguousarray(whole[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]),
         size=float(np.hypot(*(everything.max(axis=0) - everything.min(axis=0)))),
         centroid=corner + np.array([moments["m10"], moments["m01"]]) / moments["m00"],
+        blur=float(blur),
     )

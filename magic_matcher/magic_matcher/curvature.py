@@ -82,6 +82,8 @@ FAR = 2.0
 EXPLAINED_FLOOR = 10.0
 
 _RAYS, _RAY_STEPS = 96, 56
+#: Scales, from the largest, at which an arc between straight arms is looked for.
+_FILLETS = 5
 #: Neighbourhoods whose rays are sampled at a time.
 _BLOCK = 16
 
@@ -434,9 +436,101 @@ def _models(
     return np.array(bends) / scales, residue
 
 
-def explained(contour: Contour, index: int, normal: NDArray[np.float64], scales: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Signed curvature (1/px, positive: convex) at the largest of ``scales`` at which a circle or a conic explains the edge,
-    and that scale; ``None`` where there is none.  ``normal`` (2,) is the contact's, outward."""
+def _fillet(
+    x: NDArray[np.float64], y: NDArray[np.float64], start: tuple[float, float, float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Two straight arms joined by an arc, fitted to points x, y (K,) of an edge that opens towards +y.
+
+    start: slope angles of the left and the right arm, both rising away from the corner, and their offsets.
+    -> (angle, angle, offset, offset, radius), what is left (K,), on which part each point lies (2, K): left arm, right arm.
+    """
+
+    def misses(p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Distances (P, K) from P models towards the open side, and the parts."""
+        a, b, c, d, r = (p[:, k, None] for k in range(5))
+        sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
+        turn = sa * cb + ca * sb
+        # The arc's centre is r away from both arms.
+        u = (cb * (c + r) - ca * (d + r)) / turn
+        v = (sb * (c + r) + sa * (d + r)) / turn
+        dx, dy = x - u, y - v
+        left, right = dy * sa - dx * ca, dx * cb + dy * sb
+        arms = np.stack([(left > 0) & (left >= right), (right > 0) & (right > left)])
+        on_left, on_right = x * sa + y * ca - c, y * cb - x * sb - d
+        return np.where(arms[0], on_left, np.where(arms[1], on_right, r - np.sqrt(dx * dx + dy * dy))), arms
+
+    a, b, c, d = start
+    # Where the arms would meet, and how far the edge stays from it: k times the radius.
+    turn = np.sin(a + b)
+    apex = np.array([(np.cos(b) * c - np.cos(a) * d) / turn, (np.sin(b) * c + np.sin(a) * d) / turn])
+    k = 1.0 / max(np.cos((a + b) / 2), 1e-3) - 1.0
+    p = np.array([a, b, c, d, max(float(np.hypot(x - apex[0], y - apex[1]).min()) / k, 1.0)])
+    steps = np.diag([1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
+    damping, (left, arms) = 1e-3, misses(p[None])
+    left, arms = left[0], arms[:, 0]
+    for _ in range(8):
+        jacobian = (misses(p + steps)[0] - left) / np.diag(steps)[:, None]
+        gradient, normal = jacobian @ left, jacobian @ jacobian.T
+        change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), -gradient)
+        moved = p + change
+        if not (0 < moved[0] < 1.5 and 0 < moved[1] < 1.5 and moved[4] > 0.5):
+            break
+        new, parts = misses(moved[None])
+        if new[0] @ new[0] > left @ left:
+            damping *= 10
+            continue
+        gained = left @ left - new[0] @ new[0]
+        p, left, arms, damping = moved, new[0], parts[:, 0], damping * 0.3
+        if gained < 1e-4 * (left @ left):
+            break
+    return p, left, arms
+
+
+def fillet(x: NDArray[np.float64], y: NDArray[np.float64], blur: float) -> tuple[float, float] | None:
+    """Radius (px) of the arc in which the contact (0, 0) lies between two straight arms, and the root mean square of what is left.
+
+    x, y (K,) in walking order, x along the tangent, y towards the side to which the edge opens;
+    blur: that of the contour.  ``None`` where there are no two arms or no arc between them.
+    """
+    if x[0] > x[-1]:
+        x, y = x[::-1], y[::-1]
+    third = len(x) // 3
+    if third < 4:
+        return None
+    arms = []
+    for part, sign in ((slice(0, third), -1.0), (slice(len(x) - third, len(x)), 1.0)):
+        u, v = x[part], y[part]
+        mean_u, mean_v = u.mean(), v.mean()
+        du, dv = u - mean_u, v - mean_v
+        angle = 0.5 * np.arctan2(2 * float(du @ dv), float(du @ du - dv @ dv))
+        angle *= sign
+        if not 0.05 < angle < 1.45:
+            return None
+        offset = np.sin(angle) * -sign * mean_u + np.cos(angle) * mean_v
+        # Bent arms are none; what the arc itself takes of them is a little.
+        if np.sqrt(np.mean((np.sin(angle) * -sign * u + np.cos(angle) * v - offset) ** 2)) > 2 * RESIDUE:
+            return None
+        arms.append((angle, offset))
+    (a, c), (b, d) = arms
+    if a + b < 0.5:
+        return None
+    (a, b, _, _, radius), left, parts = _fillet(x, y, (a, b, c, d))
+    turn = a + b
+    arc = ~parts.any(axis=0)
+    if not arc[np.argmin(x * x + y * y)] or arc.sum() < 4 or min(parts.sum(axis=1)) < max(4.0, 0.3 * radius) or turn < 0.5:
+        return None
+    # The blur of the mask fills the corner by blur^2 / (2 r), and the arc's middle is k r from where the arms meet.
+    k = 1.0 / np.cos(turn / 2) - 1.0
+    radius = 0.5 * (radius + np.sqrt(max(radius**2 - 2 * blur**2 / k, 0.0)))
+    return float(radius), float(np.sqrt(np.mean(left**2)))
+
+
+def explained(
+    contour: Contour, index: int, normal: NDArray[np.float64], scales: NDArray[np.float64], concave: bool = False
+) -> tuple[float, float] | None:
+    """Signed curvature (1/px, positive: convex) at the largest of ``scales`` at which a circle, a conic or an arc between
+    straight arms explains the edge, and that scale; ``None`` where there is none.  ``normal`` (2,) is the contact's, outward, concave its sign.
+    """
     scales = np.sort(scales[scales >= EXPLAINED_FLOOR])[::-1]
     if not len(scales):
         return None
@@ -456,15 +550,23 @@ def explained(contour: Contour, index: int, normal: NDArray[np.float64], scales:
     circles, left = _models(x, y, use, scales, True)
     circle = int(np.argmax(left <= RESIDUE)) if (left <= RESIDUE).any() else len(scales)
     if circle == 0:
-        return float(circles[0]), float(scales[0])
+        return float(_unblurred(circles[0], contour.blur)), float(scales[0])
     conics, left = _models(x, y, use[:circle], scales[:circle], False)
     # More bent than this it is a corner's arms that look like a hyperbola.
     fits = (left <= RESIDUE) & (np.abs(conics) * scales[:circle] <= ALPHA)
-    if fits.any():
-        conic = int(np.argmax(fits))
-        if circle == len(scales) or scales[circle] < scales[conic] / FAR or scales[conic] == largest:
-            return float(conics[conic]), float(scales[conic])
-    return (float(circles[circle]), float(scales[circle])) if circle < len(scales) else None
+    conic = int(np.argmax(fits)) if fits.any() else circle
+    for k in range(min(conic + 1, circle, _FILLETS)):  # larger than, or as large as, what a conic explains
+        found = fillet(x[use[k]], -y[use[k]] if concave else y[use[k]], contour.blur)
+        if found is not None and found[1] <= RESIDUE and (k < conic or found[1] < 0.9 * left[conic]):
+            return (-1.0 if concave else 1.0) / found[0], float(scales[k])
+    if conic < circle and (circle == len(scales) or scales[circle] < scales[conic] / FAR or scales[conic] == largest):
+        return float(conics[conic]), float(scales[conic])
+    return (float(_unblurred(circles[circle], contour.blur)), float(scales[circle])) if circle < len(scales) else None
+
+
+def _unblurred(curvature: float, blur: float) -> float:
+    """The curvature of an arc before the blur of the mask took blur^2 / (2 r) of its radius."""
+    return curvature / (1.0 + 0.5 * (blur * curvature) ** 2)
 
 
 def estimate(
@@ -548,7 +650,7 @@ def _accept(
         signed = float(curvature[best - 1] * share + curvature[best] * (1 - share))
         direction = normal[best - 1] * share + normal[best] * (1 - share)
         direction = direction / max(float(np.hypot(*direction)), 1e-9)
-    exact = explained(contour, int(indices[best]), direction, scales[scales <= scale * (1 + 1e-9)]) if two_step else None
+    exact = explained(contour, int(indices[best]), direction, scales[scales <= scale * (1 + 1e-9)], signed < 0) if two_step else None
     if exact is not None and (exact[0] < 0) == (signed < 0):
         signed = exact[0]
     radius = 1.0 / max(abs(signed), 1e-12)
