@@ -1,7 +1,14 @@
-"""Matching from picture files alone: masks from a plain background, views in pixels."""
+"""Matching from picture files alone: masks from a plain background, views in pixels.
+
+Large pictures are matched at the size that the method needs (:class:`Picture`): cut to the
+object, averaged over blocks of whole pixels, and what is found is carried back and put on the
+full mask's edge.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -10,11 +17,16 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
+from magic_matcher import contour as contours
 
 #: Share of the border that must agree with the background's colour for it to count as plain.
 PLAIN_SHARE = 0.8
 #: Smallest side of a picture, px.
 SMALLEST = 8
+#: Longest side, px, at which an object is matched, and of a picture that is not cut to its object.
+WORKING, WHOLE = 768, 1024
+#: Rows of a picture that are compared with the background at a time.
+_STRIPE = 128
 #: Canny's thresholds (the paper authors' code).
 CANNY = (100, 200)
 
@@ -92,14 +104,12 @@ def mask_from_background(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
         if not mask.any():
             raise MagicError(Code.EMPTY_MASK, "picture", "transparent all over", "an object on a transparent background")
         return mask
-    lab = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2LAB)
     width = max(2, min(image.shape[:2]) // 50)
-    inner = np.zeros(image.shape[:2], bool)
-    inner[width:-width, width:-width] = True
-    border = lab[~inner]
+    sides = (lab[:width], lab[-width:], lab[width:-width, :width], lab[width:-width, -width:])
+    border = np.concatenate([side.reshape(-1, 3) for side in sides]).astype(np.float32)
     colour = np.median(border, axis=0)
-    distance = np.linalg.norm(lab - colour, axis=-1)
-    spread = float(np.percentile(distance[~inner], 100 * PLAIN_SHARE))
+    spread = float(np.percentile(np.linalg.norm(border - colour, axis=-1), 100 * PLAIN_SHARE))
     if spread > 18:
         raise MagicError(
             Code.EMPTY_MASK,
@@ -108,8 +118,15 @@ def mask_from_background(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
             "18, or give a mask",
         )
     threshold = max(12.0, 3 * spread)
-    mask = (distance > threshold).astype(np.uint8)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    # The squares of the differences by table, a stripe at a time: large pictures stay in the processor's cache.
+    squares = ((np.arange(256, dtype=np.float32)[None, :, None] - colour.astype(np.float32)) ** 2).astype(np.float32)
+    mask = np.empty(image.shape[:2], np.uint8)
+    for row in range(0, len(mask), _STRIPE):
+        differs = cv2.LUT(lab[row : row + _STRIPE], squares)
+        mask[row : row + _STRIPE] = cv2.transform(differs, np.ones((1, 3), np.float32)) > threshold**2
+    # Lines one pixel wide are noise.  The anchors are opposite corners: OpenCV's own opening would move the object by a pixel.
+    square = np.ones((2, 2), np.uint8)
+    mask = cv2.dilate(cv2.erode(mask, square, anchor=(0, 0)), square, anchor=(1, 1))
     found = _large(mask)
     if found is None:
         found = _large(_enclosed(image))
@@ -136,7 +153,9 @@ def _large(mask: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     largest = int(stats[1:, cv2.CC_STAT_AREA].max()) if count > 1 else 0
     if largest < 64:
         return None
-    return np.isin(labels, [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= 0.02 * largest])
+    kept = stats[:, cv2.CC_STAT_AREA] >= 0.02 * largest
+    kept[0] = False
+    return kept[labels]
 
 
 def _enclosed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -157,6 +176,12 @@ def _enclosed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def view(picture: str | Path, mask: str | Path | None = None, kind: str = "top") -> CanonicalView:
     """A picture file as a view in which one metre is one pixel and the object frame is the view's."""
+    image, on = _image_and_mask(picture, mask)
+    return CanonicalView(image, on, 1.0, np.eye(4), kind)
+
+
+def _image_and_mask(picture: str | Path, mask: str | Path | None) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A picture (H, W, 3) uint8 RGB, black off its object, and the object's mask."""
     data = read(picture)
     if mask is not None:
         on = read_mask(mask, data.shape[:2])
@@ -165,6 +190,88 @@ def view(picture: str | Path, mask: str | Path | None = None, kind: str = "top")
             on = mask_from_background(data)
         except MagicError as error:
             raise MagicError(error.code, f"{picture}: {error.message}") from error
-    image = data[..., :3].copy()
-    image[~on] = 0
-    return CanonicalView(image, on, 1.0, np.eye(4), kind)
+    image = np.ascontiguousarray(data[..., :3])
+    return cv2.bitwise_and(image, image, mask=on.view(np.uint8)), on
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture file and the view in which it is matched.
+
+    mask (H, W): of the file; view: at working size, one metre a pixel of the view; block: file pixels a side of a pixel of
+    the view; corner (2,): the file's pixel (u, v) at which the view's first begins.
+    """
+
+    mask: NDArray[np.bool_]
+    view: CanonicalView
+    block: int
+    corner: NDArray[np.int64]
+
+    def to_view(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """File pixels (..., 2) in the view; (0, 0) is the centre of the first pixel in both."""
+        return (points - self.corner + 0.5) / self.block - 0.5
+
+    def to_file(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The view's pixels (..., 2) in the file."""
+        return (points + 0.5) * self.block - 0.5 + self.corner
+
+    def on_edge(self, point: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The point (2,) of the file moved along its normal onto the full mask's edge; as it is where there is none within two blocks."""
+        if self.block == 1:
+            return point
+        at = np.arange(-2.0 * self.block, 2.0 * self.block + 0.25, 0.25)
+        reach = 2 * self.block + 8
+        low = np.maximum(np.floor(point).astype(int) - reach, 0)
+        cut = self.mask[low[1] : low[1] + 2 * reach + 2, low[0] : low[0] + 2 * reach + 2].astype(np.float32)
+        line = (point - low + at[:, None] * normal).astype(np.float32)
+        soft = cv2.GaussianBlur(cut, (0, 0), contours.BLUR, borderType=cv2.BORDER_CONSTANT)
+        value = cv2.remap(soft, line[None, :, 0], line[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[0]
+        leaves = np.nonzero((value[:-1] >= 0.5) & (value[1:] < 0.5))[0]
+        if not len(leaves):
+            return point
+        k = leaves[np.argmin(np.abs(at[leaves]))]
+        return point + (at[k] + 0.25 * float((value[k] - 0.5) / (value[k] - value[k + 1]))) * normal
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the file, px."""
+        return self.mask.shape[1], self.mask.shape[0]
+
+    def enlarged(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A picture of the view (h, w) at the file's size (H, W), 0 beyond the view and off the mask."""
+        if self.block == 1 and picture.shape == self.mask.shape:
+            return picture
+        height, width = picture.shape
+        large = cv2.resize(picture, (width * self.block, height * self.block), interpolation=cv2.INTER_LINEAR)
+        result = np.zeros(self.mask.shape, np.float32)
+        left, top = (int(c) for c in self.corner)
+        part = result[top : top + large.shape[0], left : left + large.shape[1]]
+        part[:] = large[: part.shape[0], : part.shape[1]]
+        result[~self.mask] = 0.0
+        return result
+
+
+def load(picture: str | Path, mask: str | Path | None = None, kind: str = "top") -> Picture:
+    """A picture file for matching; as :func:`view`, but an object that is large in pixels is cut out and averaged over blocks."""
+    image, on = _image_and_mask(picture, mask)
+    rows, columns = (np.nonzero(on.any(axis=axis))[0] for axis in (1, 0))
+    height, width = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
+    block = -(-max(height, width) // WORKING)
+    if block == 1 and max(on.shape) <= WHOLE:
+        return Picture(on, CanonicalView(image, on, 1.0, np.eye(4), kind), 1, np.zeros(2, dtype=np.int64))
+    margin = 16 * block
+    left, top = max(0, int(columns[0]) - margin), max(0, int(rows[0]) - margin)
+    right, bottom = min(on.shape[1], int(columns[-1]) + 1 + margin), min(on.shape[0], int(rows[-1]) + 1 + margin)
+    fill = ((0, -(bottom - top) % block), (0, -(right - left) % block))
+    small = np.pad(image[top:bottom, left:right], (*fill, (0, 0)))
+    share = np.pad(on[top:bottom, left:right].astype(np.float32), fill)
+    if block > 1:
+        size = (share.shape[1] // block, share.shape[0] // block)
+        small, share = cv2.resize(small, size, interpolation=cv2.INTER_AREA), cv2.resize(share, size, interpolation=cv2.INTER_AREA)
+    kept = share >= 0.5
+    if not kept.any():
+        raise MagicError(
+            Code.EMPTY_MASK, f"{picture}: width of the object", f"less than {block} px", "an object that fills more of its extent"
+        )
+    small[~kept] = 0
+    return Picture(on, CanonicalView(small, kept, 1.0, np.eye(4), kind), block, np.array([left, top]))

@@ -14,7 +14,8 @@ of the target picture, concave, rotation (rad), flipped, s_dino, s_curv, score, 
 target_from_reference, the 3x3 that carries pixels of the reference picture onto the
 target's so that the contacts meet (turned, mirrored where flipped, not scaled).
 ``match.png`` shows both, ``heatmap.png`` (8 bits, size of the target picture) how alike its
-places are to the reference.  Exit status: 0, or 2 with the code and what was wrong.
+places are to the reference.  Objects of more than 768 px a side are matched at a whole fraction of their size
+(``block``); all that is written is in pixels of the files.  Exit status: 0, or 2 with the code and what was wrong.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ import cv2
 import numpy as np
 
 from magic_core.contact import ContactCandidate
-from magic_core.errors import MagicError
+from magic_core.errors import Code, MagicError
+from magic_matcher import contour as contours
 from magic_matcher import curvature, drawing, features, images, matching
 from magic_matcher.cache import Cache
 
@@ -39,58 +41,72 @@ def _number(value: float) -> float | None:
     return None if not math.isfinite(value) else float(value)
 
 
-def _planar(reference: features.Reference, candidate: ContactCandidate) -> list[list[float]]:
-    """target_from_reference (3, 3) on pixels."""
+def record(first: images.Picture, second: images.Picture, reference: features.Reference, candidate: ContactCandidate) -> dict[str, Any]:
+    """One candidate as plain data, lengths in pixels of the files; straight edges have radius ``null``."""
+    tool = candidate.tool
+    pixel = second.on_edge(second.to_file(tool.pixel), tool.normal)
     c, s = math.cos(candidate.rotation), math.sin(candidate.rotation)
     linear = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if candidate.flipped else 1.0, 1.0])
-    shift = candidate.tool.pixel - linear @ reference.pixel
-    return [[*map(float, linear[0]), float(shift[0])], [*map(float, linear[1]), float(shift[1])], [0.0, 0.0, 1.0]]
-
-
-def record(reference: features.Reference, candidate: ContactCandidate) -> dict[str, Any]:
-    """One candidate as plain data; straight edges have radius ``null``."""
+    shift = pixel - linear @ _contact_pixel(first, reference)
     return {
-        "pixel": [float(v) for v in candidate.tool.pixel],
-        "normal": [float(v) for v in candidate.tool.normal],
-        "radius": _number(candidate.tool.radius),
-        "concave": candidate.tool.concave,
-        "scale": float(candidate.tool.scale),
+        "pixel": [float(v) for v in pixel],
+        "normal": [float(v) for v in tool.normal],
+        "radius": _number(tool.radius * second.block),
+        "concave": tool.concave,
+        "scale": float(tool.scale) * second.block,
         "rotation": candidate.rotation,
         "flipped": candidate.flipped,
         "s_dino": candidate.s_dino,
         "s_curv": candidate.s_curv,
         "score": candidate.score,
-        "target_from_reference": _planar(reference, candidate),
+        "target_from_reference": [[*map(float, linear[0]), float(shift[0])], [*map(float, linear[1]), float(shift[1])], [0.0, 0.0, 1.0]],
     }
+
+
+def _contact_pixel(picture: images.Picture, reference: features.Reference) -> np.ndarray:
+    """The reference's contact (2,) in the file."""
+    return picture.on_edge(picture.to_file(reference.pixel), reference.normal)
+
+
+def _reference(picture: images.Picture, point: np.ndarray) -> features.Reference:
+    """The reference at a file's pixel (2,); errors in the file's pixels."""
+    width, height = picture.size
+    if not np.all(np.isfinite(point)) or not (-0.5 <= point[0] <= width - 0.5 and -0.5 <= point[1] <= height - 0.5):
+        raise MagicError(Code.POINT_OUTSIDE, "reference point", point.tolist(), f"u in 0..{width - 1}, v in 0..{height - 1}")
+    # What lies off the part that is matched lies far from the object: the view's nearest pixel does, too.
+    shown = picture.view.mask.shape
+    at = np.clip(picture.to_view(point), 0, np.array([shown[1] - 1, shown[0] - 1]))
+    contour = contours.extract(picture.view.mask)
+    away = float(np.hypot(*(contour.points[contour.nearest(at)] - picture.to_view(point)))) * picture.block
+    allowed = 0.1 * contour.size * picture.block
+    if away > allowed:
+        raise MagicError(
+            Code.POINT_OUTSIDE, "distance of the reference point from the object's edge", f"{away:.1f} px", f"at most {allowed:.1f} px"
+        )
+    return features.make_reference(picture.view, at, contour=contour)
 
 
 def run(given: argparse.Namespace) -> dict[str, Any]:
     """Do what the command line asks for; returns what ``match.json`` holds."""
-    first = images.view(given.reference, given.reference_mask)
-    second = images.view(given.target, given.target_mask)
-    reference = features.make_reference(first, np.array(given.reference_point, dtype=float))
+    first = images.load(given.reference, given.reference_mask)
+    second = images.load(given.target, given.target_mask)
+    reference = _reference(first, np.array(given.reference_point, dtype=float))
     matcher = matching.Matcher(
         features.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None
     )
-    contact = matching.to_contact(first, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
-    result = matcher.match_views(reference, contact, [matching.Tool("target", second)], None, given.top, heatmap=True)
+    contact = matching.to_contact(first.view, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
+    result = matcher.match_views(reference, contact, [matching.Tool("target", second.view)], None, given.top, heatmap=True)
     data = {
         "reference": {
-            "pixel": [float(v) for v in reference.pixel],
+            "pixel": [float(v) for v in _contact_pixel(first, reference)],
             "normal": [float(v) for v in reference.normal],
-            "radius": _number(reference.radius),
+            "radius": _number(reference.radius * first.block),
             "concave": reference.concave,
-            "scale": float(contact.scale),
-            "size": [first.mask.shape[1], first.mask.shape[0]],
-            "mask": "file" if given.reference_mask else "background",
-            "mask_pixels": int(first.mask.sum()),
+            "scale": float(contact.scale) * first.block,
+            **_about(first, given.reference_mask),
         },
-        "candidates": [record(reference, candidate) for candidate in result.candidates],
-        "target": {
-            "size": [second.mask.shape[1], second.mask.shape[0]],
-            "mask": "file" if given.target_mask else "background",
-            "mask_pixels": int(second.mask.sum()),
-        },
+        "candidates": [record(first, second, reference, candidate) for candidate in result.candidates],
+        "target": _about(second, given.target_mask),
         "units": "pixels and radians; normals point out of the material, v down",
         "features": result.features,
         "seconds": result.seconds,
@@ -98,19 +114,29 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     out = Path(given.out)
     out.mkdir(parents=True, exist_ok=True)
     (out / "match.json").write_text(json.dumps(data, indent=1) + "\n")
-    shown = [drawing.draw_match(first, contact), drawing.draw_match(second, [c.tool for c in result.candidates], result.heatmap)]
+    shown = [drawing.draw_match(first.view, contact), drawing.draw_match(second.view, [c.tool for c in result.candidates], result.heatmap)]
     picture = drawing.side_by_side(
-        shown, ("reference", f"target, best score {result.candidates[0].score:.3f}"), height=max(384, second.mask.shape[0])
+        shown, ("reference", f"target, best score {result.candidates[0].score:.3f}"), height=max(384, second.view.mask.shape[0])
     )
     files = {"match.png": cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)}
     if result.heatmap is not None:
-        files["heatmap.png"] = np.rint(255 * np.clip(result.heatmap, 0, 1)).astype(np.uint8)
+        files["heatmap.png"] = np.rint(255 * np.clip(second.enlarged(result.heatmap), 0, 1)).astype(np.uint8)
     for name, content in files.items():
         done, raw = cv2.imencode(".png", content)
         if not done:
             raise OSError(f"{out / name} could not be encoded")
         (out / name).write_bytes(raw.tobytes())
     return data
+
+
+def _about(picture: images.Picture, mask: str | None) -> dict[str, Any]:
+    """What was matched: the file's size, where the mask is from, its pixels, file pixels a side of a pixel that was matched."""
+    return {
+        "size": list(picture.size),
+        "mask": "file" if mask else "background",
+        "mask_pixels": int(np.count_nonzero(picture.mask)),
+        "block": picture.block,
+    }
 
 
 def parser() -> argparse.ArgumentParser:

@@ -30,6 +30,14 @@ def test_mask_from_a_plain_background(background):
     assert (mask & view.mask).sum() / (mask | view.mask).sum() > 0.9
 
 
+def test_mask_from_background_is_not_moved():
+    image = np.full((60, 80, 3), 220, np.uint8)
+    image[20:41, 30:52] = 40
+    image[5, 10:60] = 40  # a line is no object
+    mask = images.mask_from_background(image)
+    assert np.array_equal(np.argwhere(mask).min(axis=0), [20, 30]) and np.array_equal(np.argwhere(mask).max(axis=0), [40, 51])
+
+
 def test_mask_from_transparency():
     image = np.zeros((40, 40, 4), np.uint8)
     image[10:30, 10:30, 3] = 255
@@ -135,3 +143,52 @@ def test_errors_are_one_line_and_status_2(tmp_path, capsys, monkeypatch, change,
     assert caught.value.code == 2
     error = capsys.readouterr().err.strip()
     assert said in error and len(error.splitlines()) == 1
+
+
+def test_large_pictures_are_matched_small_and_answered_at_full_size(tmp_path):
+    hook, mug = shapes.make("l_hook", 3), shapes.make("mug", 4)
+    first, second = hook.view(), mug.view("side")
+    factor, found = 4, {}
+    point = hook.contact("inner", first).pixel
+    for name, f in (("small", 1), ("large", factor)):
+        # Nearest neighbours, so that a pixel becomes a block and both are the same shape; the larger one stands in a wide picture.
+        grown = [np.kron(view.mask, np.ones((f, f), bool)) for view in (first, second)]
+        shown = [np.where(m[..., None], (120, 110, 100), (235, 232, 228)).astype(np.uint8) for m in grown]
+        shift = np.array([700, 40]) if f > 1 else np.zeros(2)
+        if f > 1:
+            shown[1] = np.pad(shown[1], ((40, 0), (700, 0), (0, 0)), mode="edge")
+        u, v = (point + 0.5) * f - 0.5
+        arguments = ["--reference", write(tmp_path / f"r{f}.png", shown[0]), "--reference-point", str(u), str(v)]
+        match_images.main([*arguments, "--target", write(tmp_path / f"t{f}.png", shown[1]), "--out", str(tmp_path / name)])
+        found[name] = json.loads((tmp_path / name / "match.json").read_text()), shift
+        heat = cv2.imread(str(tmp_path / name / "heatmap.png"), cv2.IMREAD_UNCHANGED)
+        assert heat.shape == shown[1].shape[:2]
+    (small, _), (large, shift) = found["small"], found["large"]
+    assert (
+        small["target"]["block"] == 1
+        and large["target"]["block"] == 2
+        and large["reference"]["mask_pixels"] == 16 * small["reference"]["mask_pixels"]
+    )
+    a, b = small["candidates"][0], large["candidates"][0]
+    # Beside the way of sampling, the same place: within a few steps of the described points.
+    assert (np.array(b["pixel"]) - shift + 0.5) / factor - 0.5 == pytest.approx(np.array(a["pixel"]), abs=8)
+    assert b["radius"] / factor == pytest.approx(a["radius"], rel=0.15) and np.dot(a["normal"], b["normal"]) > 0.97
+    # On the edge of the file's own mask.
+    mask = cv2.imread(str(tmp_path / "t4.png"))[..., 0] < 180
+    inside, outside = (np.rint(np.array(b["pixel"]) + s * 2.0 * np.array(b["normal"])).astype(int) for s in (-1, 1))
+    assert mask[inside[1], inside[0]] and not mask[outside[1], outside[0]]
+
+
+def test_view_and_file_pixels_agree(tmp_path):
+    mask = np.zeros((1500, 2100), np.uint8)
+    cv2.circle(mask, (1203, 702), 600, 255, -1)
+    path = write(tmp_path / "m.png", mask)
+    picture_ = images.load(path, path)
+    points = np.random.default_rng(0).uniform(0, 1400, (5, 2))
+    assert picture_.block == 2 and picture_.to_file(picture_.to_view(points)) == pytest.approx(points)
+    centre = np.array([np.nonzero(picture_.view.mask.any(axis=axis))[0].mean() for axis in (0, 1)])
+    assert picture_.to_file(centre) == pytest.approx([1203, 702], abs=1)
+    out = np.array([0.6, 0.8])
+    for off in (-3.0, 0.0, 2.5):
+        edge = picture_.on_edge(np.array([1203, 702]) + (600 + off) * out, out)
+        assert np.hypot(*(edge - [1203, 702])) == pytest.approx(600, abs=1.0)
