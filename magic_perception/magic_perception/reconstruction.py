@@ -9,13 +9,16 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
   sharpness from the colour image, not from depth, and a hole through which the table is seen stays open;
 * things that lie become a height field on the table, or, where they are seen to be hollow from above (a spoon's
   bowl), a shell;
-* things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where the
-  inside was seen, with the handle carved in its own upright plane in the same way as a flat thing;
-* other standing things are stacked from layers, completed by point symmetry where no camera saw through the completion.
+* things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where cameras
+  look into it, with the handle carved in its own upright plane in the same way as a flat thing;
+* other standing things are stacked from layers, completed by point symmetry where no camera saw through the completion;
+* every proposal but the flat ones has to agree with the masks, and free space forbids it: where rays of a depth camera pass
+  through a proposed solid (a hoop taken for a ball, a bent wire for a wall), the thing is carved out of space instead.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -23,10 +26,11 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_perception import clusters, polygons, primitives
+from magic_perception.carved import build_carved
 from magic_perception.layers import build_layers
 from magic_perception.lying import build_lying
 from magic_perception.parameters import Parameters
-from magic_perception.sight import Sight, agreement, surfaces
+from magic_perception.sight import Agreement, Sight, agreement, surfaces
 from magic_perception.solids import Reconstruction, extruded
 from magic_perception.turned import build_round
 
@@ -44,26 +48,56 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     height = float(np.percentile(points[:, 2], 98))
     found = primitives.recognise(points, height, noise)
     if found is not None:
-        return found
+        fit = agreement(found.mesh, sights)
+        if fit.overlap > 0.75 and fit.through < _FREE:
+            return found
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
     # Without the outermost half percent: one stray ray must not lay a mug down.
     length = float(np.max(np.subtract(*np.percentile(spread @ axes.T, [99.5, 0.5], axis=0))))
     if height > 0.04 and height > 0.45 * length:
         turned = build_round(sights, points, eyes, height, noise, parameters)
-        fit = agreement(turned.mesh, sights) if turned is not None else 0.0
-        if turned is not None and fit > 0.8:
-            return turned
-        if height < 0.65 * length:  # a ladle's stem rises, but it lies
-            return build_lying(sights, noise, parameters)
-        if turned is None:
-            return build_layers(sights, points, height, parameters)
-        # It does not look as what was seen does: a hoop or a bent wire taken for a body.
-        stacked = build_layers(sights, points, height, parameters)
-        other = agreement(stacked.mesh, sights)
-        better = turned if fit >= other else stacked
-        return replace(better, confidence=better.confidence * max(fit, other))
-    return build_lying(sights, noise, parameters)
+        if turned is not None:
+            fit = agreement(turned.mesh, sights)
+            if fit.overlap > 0.8 and fit.through < _FREE:
+                return turned
+        if height > 0.65 * length:  # a ladle's stem rises, but it lies
+            return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
+    return _freest([lambda: build_lying(sights, noise, parameters)], sights, noise)
+
+
+#: Largest share of rays that may pass through a solid: noise and a pixel of the edge.
+_FREE = 0.15
+
+
+def _freest(builds: list[Callable[[], Reconstruction | None]], sights: list[Sight], noise: float) -> Reconstruction:
+    """The solid that agrees best with what was seen; carved out of space where the cameras look through all others."""
+    best, value, problem = None, Agreement(0.0, 1.0), None
+    for build in builds:
+        try:
+            found = build()
+        except MagicError as error:
+            problem = error
+            continue
+        if found is None:
+            continue
+        if found.shape == "flat":  # carved already
+            return found
+        fit = agreement(found.mesh, sights)
+        if best is None or fit.score > value.score:
+            best, value = found, fit
+    if best is None or value.through > _FREE:
+        try:
+            found = build_carved(sights, noise)
+            fit = agreement(found.mesh, sights)
+            if best is None or fit.score > value.score:
+                best, value = found, fit
+        except MagicError as error:
+            problem = error
+    if best is None:
+        assert problem is not None
+        raise problem
+    return replace(best, confidence=best.confidence * min(1.0, value.overlap / 0.8))
 
 
 def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 0.005) -> Reconstruction:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh
-from magic_core.rendering import Raycaster
 
 
 @dataclass(frozen=True)
@@ -40,19 +39,20 @@ class Sight:
         return self.hidden.view(np.uint8)
 
     @cached_property
-    def _filled(self) -> tuple[NDArray[np.bool_], NDArray[np.float32], int, int]:
-        """Around the mask: where the surface is known, its heights, filled and smoothed, and the first row and column."""
+    def _filled(self) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32], int, int]:
+        """Around the mask: where the surface is known, its heights, filled and smoothed, the distance in pixels to where they
+        were measured, and the first row and column."""
         x, y, w, h = cv2.boundingRect(self.mask.view(np.uint8))
         pad = 3
         r0, r1, c0, c1 = max(y - pad, 0), y + h + pad, max(x - pad, 0), x + w + pad
         mask, heights = self.mask[r0:r1, c0:c1], self.heights[r0:r1, c0:c1]
         known = mask & np.isfinite(heights)
         if not w or np.count_nonzero(known) < 5:
-            return np.zeros((0, 0), bool), np.zeros((0, 0), np.float32), 0, 0
+            return np.zeros((0, 0), bool), np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32), 0, 0
         distance, index = cv2.distanceTransformWithLabels((~known).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
         value = np.zeros(int(np.count_nonzero(known)) + 1, np.float32)
         value[index[known]] = heights[known]
-        return mask & (distance < 12), cv2.medianBlur(value[index], 5), r0, c0
+        return mask & (distance < 12), cv2.medianBlur(value[index], 5), distance, r0, c0
 
     @cached_property
     def _camera_from_table(self) -> NDArray[np.float64]:
@@ -68,15 +68,8 @@ class Sight:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
         """At points (..., 3): the mask (0..1, interpolated; 1 where blind), where the picture tells nothing (hidden or
         outside of it), the points' depth and the measured depth."""
-        pose, k = self._camera_from_table, self.intrinsics
+        u, v, z, count = self._pixels(points)
         shape = points.shape[:-1]
-        camera = points.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-        z = np.where(camera[:, 2] > 1e-9, camera[:, 2], np.nan)
-        u, v = (np.nan_to_num(f * camera[:, i] / z + c, nan=-1e4).astype(np.float32) for i, f, c in ((0, k.fx, k.cx), (1, k.fy, k.cy)))
-        count = len(u)
-        # OpenCV's remap takes pictures of less than 32768 rows and columns.
-        rows = -(-count // 8192)
-        u, v = (np.resize(x, (rows, 8192)) if rows > 1 else x.reshape(1, -1) for x in (u, v))
 
         def at(field: NDArray, how: int, beyond: float) -> NDArray:
             return cv2.remap(field, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond).ravel()[:count].reshape(shape)
@@ -84,7 +77,24 @@ class Sight:
         blind = at(self._blind, cv2.INTER_NEAREST, 1.0) > 0
         inside = at(self._soft, cv2.INTER_LINEAR, 1.0)
         inside[blind] = 1
-        return inside, blind, camera[:, 2].astype(np.float32).reshape(shape), at(self.depth, cv2.INTER_NEAREST, float("nan"))
+        return inside, blind, z.reshape(shape), at(self.depth, cv2.INTER_NEAREST, float("nan"))
+
+    def look_up(self, points: NDArray[np.float64], picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A picture (H, W) at the nearest pixels of points (..., 3); NaN outside of it."""
+        u, v, _, count = self._pixels(points)
+        found = cv2.remap(picture, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+        return found.ravel()[:count].reshape(points.shape[:-1])
+
+    def _pixels(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], int]:
+        """u and v of points (..., 3) in the shape that OpenCV's remap takes (less than 32768 rows and columns), depths (N,) and N."""
+        pose, k = self._camera_from_table, self.intrinsics
+        camera = points.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+        z = np.where(camera[:, 2] > 1e-9, camera[:, 2], np.nan)
+        u, v = (np.nan_to_num(f * camera[:, i] / z + c, nan=-1e4).astype(np.float32) for i, f, c in ((0, k.fx, k.cx), (1, k.fy, k.cy)))
+        count = len(u)
+        rows = -(-count // 8192)
+        u, v = (np.resize(x, (rows, 8192)) if rows > 1 else x.reshape(1, -1) for x in (u, v))
+        return u, v, camera[:, 2].astype(np.float32), count
 
 
 def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
@@ -92,7 +102,7 @@ def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
 
     Heights are filled from the nearest pixel and smoothed in the mask; each point is where its pixel's ray reaches its height.
     """
-    mask, filled, r0, c0 = sight._filled
+    mask, filled, _, r0, c0 = sight._filled
     if upsample > 1 and mask.size:
         size = (mask.shape[1] * upsample, mask.shape[0] * upsample)
         mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
@@ -172,21 +182,51 @@ def silhouette(sight: Sight, middle: NDArray[np.float64]) -> tuple[NDArray[np.fl
     return away, right, np.concatenate(edges)
 
 
-def agreement(mesh: Mesh, sights: list[Sight], step: int = 3) -> float:
-    """Mean over the cameras of the overlap (intersection over union) of a mesh's silhouette with the mask, every ``step``-th pixel."""
-    caster = Raycaster([mesh])
-    result = []
+@dataclass(frozen=True)
+class Agreement:
+    """How a proposed solid agrees with what the cameras saw.
+
+    overlap: mean over the cameras of the overlap (intersection over union) of silhouette and mask.  through: the largest share, over
+    the cameras, of the rays that meet the solid, away from its outline, but were seen to go on behind where they meet it: past the
+    mask, or to a depth farther by more than the noise.  Free space forbids the solid there.
+    """
+
+    overlap: float
+    through: float
+
+    @property
+    def score(self) -> float:
+        """Both in one number, 0..1."""
+        return self.overlap * (1 - self.through)
+
+
+def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.010) -> Agreement:
+    """Compare a mesh with the masks and depths of all cameras, at every ``step``-th pixel; ``margin`` metres of depth are noise."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    overlaps, passed = [], [0.0]
     for sight in sights:
-        rows, columns = (np.nonzero(sight.mask.any(axis=axis))[0] for axis in (1, 0))
+        x, y, w, h = cv2.boundingRect(sight.mask.view(np.uint8))
         pad = 24
-        v = np.arange(max(rows[0] - pad, 0), min(rows[-1] + pad, sight.mask.shape[0]), step)
-        u = np.arange(max(columns[0] - pad, 0), min(columns[-1] + pad, sight.mask.shape[1]), step)
+        v = np.arange(max(y - pad, 0), min(y + h + pad, sight.mask.shape[0]), step)
+        u = np.arange(max(x - pad, 0), min(x + w + pad, sight.mask.shape[1]), step)
         k = sight.intrinsics
-        rays = (
+        rays = np.empty((len(v), len(u), 6), np.float32)
+        rays[..., :3] = sight.eye
+        # Rays of depth 1, so that their length to the hit is the depth.
+        rays[..., 3:] = (
             np.stack(np.broadcast_arrays(((u - k.cx) / k.fx)[None], ((v - k.cy) / k.fy)[:, None], 1.0), axis=-1)
             @ sight.table_from_camera[:3, :3].T
         )
-        drawn = caster.hits(sight.eye, rays)
-        mask, told = sight.mask[np.ix_(v, u)], ~sight.hidden[np.ix_(v, u)]
-        result.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
-    return float(np.mean(result))
+        depth = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+        drawn = np.isfinite(depth)
+        where = np.ix_(v, u)
+        mask, told = sight.mask[where], ~sight.hidden[where]
+        overlaps.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
+        inner = cv2.erode(drawn.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & told
+        with np.errstate(invalid="ignore"):
+            on = inner & (~mask | (sight.depth[where] > depth + max(margin, 3 * sight.sigma)))
+        passed.append(np.count_nonzero(on) / max(np.count_nonzero(inner), 1))
+    return Agreement(float(np.mean(overlaps)), float(max(passed)))

@@ -1,0 +1,153 @@
+"""Hoops, bent wires and other open forms that stand or rise from the table: carved out of space.
+
+What a mask does not cover, and what lies before a measured depth, is free.  What is left, no farther behind the seen surface than
+the thing is wide there, is the thing: its visual hull (Laurentini 1994), cut by the free space of the depth cameras.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_perception.sight import Sight, surfaces
+from magic_perception.solids import Reconstruction, joined
+
+
+def build_carved(sights: list[Sight], noise: float, cells: int = 60000, block: float = 0.012) -> Reconstruction:
+    """The carved solid.  ``cells``: of the grid, at most, none smaller than 2 mm; ``block``: metres, size of the pieces before they are joined."""
+    points, _ = surfaces(sights)
+    low = np.append(np.percentile(points[:, :2], 0.5, axis=0) - 0.008, 0.0)
+    high = np.percentile(points, 99.5, axis=0) + [0.008, 0.008, 0.003]
+    cell = float(max(0.002, (np.prod(high - low) / cells) ** (1 / 3)))
+    axes = [np.arange(a + cell / 2, b + cell / 2, cell) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    field = np.ones(grid.shape[:3], np.float32)
+    near = np.zeros(grid.shape[:3], bool)
+    for sight in sights:
+        inside, blind, z, measured = sight.sample(grid)
+        with np.errstate(invalid="ignore"):
+            passed = (measured > z + max(0.007, 3 * noise)) & ~blind
+        field = np.minimum(field, np.where(passed, np.float32(0), inside))
+        with np.errstate(invalid="ignore"):
+            near |= z < sight.look_up(grid, _back(sight))
+    field *= near
+    field = _largest(_blurred(field, 0.7))
+    if np.count_nonzero(field > 0.5) < 20:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "carved cells of one object", int(np.count_nonzero(field > 0.5)), "at least 20")
+    mesh = level_surface(field, axes, 0.5)
+    return Reconstruction(mesh, tuple(_pieces(mesh, field, axes, cell, block)), "carved", 0.6)
+
+
+def _back(sight: Sight) -> NDArray[np.float32]:
+    """A picture (H, W) of the depth in metres to which the thing may reach: as far behind the seen surface as it is wide around
+    there; infinite where nothing near was measured; NaN off the mask."""
+    mask, heights, _, r0, c0 = sight._filled
+    back = np.where(sight.mask, np.float32(np.inf), np.float32(np.nan))
+    if not mask.size:
+        return back
+    k = sight.intrinsics
+    rows, columns = mask.shape
+    u, v = np.arange(columns) + c0, np.arange(rows) + r0
+    down = sight.table_from_camera[2]
+    fall = ((u - k.cx) / k.fx * down[0])[None] + ((v - k.cy) / k.fy * down[1])[:, None] + down[2]
+    depth = (heights - down[3]) / np.minimum(fall, -1e-3)
+    distance = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    # The middle line's distance to the edge holds for the whole breadth around it.
+    middle = distance
+    for _ in range(4):
+        middle = np.maximum(middle, np.where(mask, cv2.dilate(middle, np.ones((5, 5), np.uint8)) - 2.5, 0))
+    reach = np.maximum(2 * middle * depth / k.fx, 0.004)
+    back[r0 : r0 + rows, c0 : c0 + columns][mask] = (depth + reach)[mask]
+    return back
+
+
+def _blurred(field: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(np.pad(field, 2), cells)[1:-1, 1:-1, 1:-1]
+
+
+def _largest(field: NDArray[np.float32], share: float = 0.1) -> NDArray[np.float32]:
+    """The field with its parts that hold less than ``share`` of the largest part's cells taken out."""
+    from scipy.ndimage import label
+
+    parts, _ = label(field > 0.5)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    keep = sizes >= share * sizes.max(initial=1)
+    keep[0] = True
+    return np.where(keep[parts], field, np.float32(0))
+
+
+#: The six tetrahedra of a cube, all around its diagonal from corner 0 to corner 7; corner bits are x, y, z.
+_TETRAHEDRA = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+
+
+def level_surface(field: NDArray[np.float32], axes: list[NDArray[np.float64]], level: float) -> Mesh:
+    """The closed surface around where a field is above a level, by marching tetrahedra (Doi and Koide 1991).
+
+    field (X, Y, Z) with a border of cells below the level around the values at ``axes``.
+    """
+    shape = field.shape
+    steps = [float(a[1] - a[0]) for a in axes]
+    start = np.array([a[0] - s for a, s in zip(axes, steps, strict=True)])
+    above = field > level
+    corner = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
+    count = sum(above[c[0] : shape[0] - 1 + c[0], c[1] : shape[1] - 1 + c[1], c[2] : shape[2] - 1 + c[2]].astype(np.int8) for c in corner)
+    cubes = np.argwhere((count > 0) & (count < 8))
+    index = np.ravel_multi_index((cubes[:, None] + corner).reshape(-1, 3).T, shape).reshape(-1, 8)
+    tetra = index[:, _TETRAHEDRA].reshape(-1, 4)
+    inside = above.ravel()[tetra]
+    total = inside.sum(axis=1)
+    pairs = []
+    # One corner apart from three: a triangle; two from two: a quadrilateral.
+    for lone, which in ((1, True), (3, False)):
+        rows = tetra[total == lone]
+        order = np.argsort(inside[total == lone] != which, axis=1, kind="stable")
+        rows = np.take_along_axis(rows, order, axis=1)
+        pairs.append(np.stack([rows[:, [0, 0, 0]], rows[:, 1:]], axis=2))
+    rows = tetra[total == 2]
+    order = np.argsort(~inside[total == 2], axis=1, kind="stable")
+    a, b, c, d = np.take_along_axis(rows, order, axis=1).T
+    pairs.append(np.stack([np.stack([a, a, b], axis=1), np.stack([c, d, c], axis=1)], axis=2))
+    pairs.append(np.stack([np.stack([a, b, b], axis=1), np.stack([d, d, c], axis=1)], axis=2))
+    edges = np.sort(np.concatenate(pairs).reshape(-1, 2), axis=1)
+    unique, faces = np.unique(edges[:, 0] * field.size + edges[:, 1], return_inverse=True)
+    first, second = unique // field.size, unique % field.size
+    values = field.ravel()
+    share = np.clip((level - values[first]) / (values[second] - values[first]), 0.02, 0.98)[:, None]
+    p, q = (np.stack(np.unravel_index(i, shape), axis=1) for i in (first, second))
+    vertices = start + (p + share * (q - p)) * steps
+    faces = faces.reshape(-1, 3)
+    # Outward: away from the corners above the level.
+    lone = np.concatenate(pairs)
+    high = np.where(above.ravel()[lone[:, 0, 0]], lone[:, 0, 0], lone[:, 0, 1])
+    toward = start + np.stack(np.unravel_index(high, shape), axis=1) * steps
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flip = np.sum(normal * (toward - corners[:, 0]), axis=1) > 0
+    faces[flip] = faces[flip][:, ::-1]
+    vertices[:, 2] = np.maximum(vertices[:, 2], 0.0)
+    return Mesh(vertices, faces)
+
+
+def _pieces(mesh: Mesh, field: NDArray[np.float32], axes: list[NDArray[np.float64]], cell: float, block: float) -> list[Mesh]:
+    """Convex pieces: hulls of the cells in blocks, joined where that fills little."""
+    steps = [float(a[1] - a[0]) for a in axes]
+    start = np.array([a[0] - s for a, s in zip(axes, steps, strict=True)])
+    spots = np.argwhere(field > 0.5)
+    size = max(2, round(block / cell))
+    keys = spots // size
+    _, group = np.unique(keys @ np.array([1, 10_000, 100_000_000]), return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    corner = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)]) - 0.5
+    clouds = []
+    for members in np.split(order, np.cumsum(np.bincount(group))[:-1]):
+        centres = start + spots[members] * steps
+        cloud = np.unique((centres[:, None] + corner * steps).reshape(-1, 3).round(6), axis=0)
+        cloud[:, 2] = np.maximum(cloud[:, 2], 0.0)
+        clouds.append(cloud)
+    return joined(clouds)
