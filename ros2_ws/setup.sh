@@ -154,7 +154,7 @@ for pair in libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:libegl1 l
   case $libraries in *"${pair%%:*}"*) ;; *) missing+=("${pair#*:}") ;; esac
 done
 if [ $MODE = jazzy ]; then
-  for package in rclpy rmw_fastrtps_cpp rosidl_default_generators ament_cmake ament_cmake_python common_interfaces tf2_msgs launch_xml \
+  for package in rclpy rmw_fastrtps_cpp rosidl_default_generators ament_cmake ament_cmake_python common_interfaces tf2_msgs control_msgs launch_xml \
     launch_ros ros2run ros2launch ros2node ros2topic ros2service ros2action ros2param ros2interface ros2bag rosbag2_storage_mcap rosbag2_compression_zstd; do
     [ -f $JAZZY/share/$package/package.xml ] || missing+=("ros-jazzy-${package//_/-}")
   done
@@ -221,7 +221,7 @@ if [ $MODE = jazzy ]; then
   set +u
   . $JAZZY/setup.bash
   set -u
-  [ -f $JAZZY/share/tf2_msgs/package.xml ] && skip+=(tf2_msgs)
+  for package in tf2_msgs control_msgs; do [ -f $JAZZY/share/$package/package.xml ] && skip+=($package); done
   [ -x $JAZZY/bin/ros2 ] && skip+=(magic_ros2cli)
 else
   export AMENT_PREFIX_PATH=$VENV CMAKE_PREFIX_PATH=$VENV

@@ -1,9 +1,11 @@
-"""Whether a verified trajectory may be handed to an arm: only where the arm is known to stand at its start.  No ROS here."""
+"""What it takes to carry a verified plan out on an arm: whether it stands at the start, and what arm and gripper do in turn.  No ROS here."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 from magic_core.errors import Code, MagicError
 
@@ -48,4 +50,82 @@ def check_start(
             "distance of the arm from the trajectory's start in rad",
             f"{wrong[name]:.4f} at {name}",
             f"at most {tolerance:g} at every joint",
+        )
+
+
+@dataclass(frozen=True)
+class Move:
+    """The arm follows its trajectory from point ``first`` to point ``last``, both included."""
+
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Fingers:
+    """The gripper opens (``close`` false) or closes on the tool; ``opening`` between the fingers, m, is where it is to stop."""
+
+    close: bool
+    opening: float
+
+
+Step = Move | Fingers
+
+
+def steps(
+    times: Sequence[float],
+    velocities: Sequence[Sequence[float]],
+    grasp_time: float,
+    release_time: float,
+    grasp_width: float,
+    opening: float,
+    standstill: float = 0.01,
+) -> tuple[Step, ...]:
+    """What arm and gripper do in turn: open, go to the tool, close, do the task, and where it ends with a release, open and leave.
+
+    times (N,) seconds from 0, rising; velocities (N, J) rad/s; grasp_time and release_time seconds (release_time NaN: never);
+    grasp_width and opening (of the open gripper) m.  The arm must stand, within ``standstill`` rad/s, where the fingers move,
+    and at the end.  Raises BAD_MOTION.
+    """
+    if len(times) < 2 or any(not b > a for a, b in pairwise(times)):
+        raise MagicError(Code.BAD_MOTION, "times of the trajectory", f"{len(times)} points", "at least two points, at rising times")
+    if not 0.0 <= grasp_width <= opening:
+        raise MagicError(Code.BAD_MOTION, "grasp_width in m", grasp_width, f"0 to the gripper's opening of {opening:g}")
+    releases = not math.isnan(release_time)
+    moments = [("grasp_time", grasp_time), *([("release_time", release_time)] if releases else [])]
+    cuts = []
+    for name, moment in moments:
+        if not times[0] - 1e-6 <= moment <= times[-1] + 1e-6:
+            raise MagicError(Code.BAD_MOTION, name, moment, f"{times[0]:g} to {times[-1]:g}, within the trajectory")
+        cuts.append(min(range(len(times)), key=lambda i: abs(times[i] - moment)))
+    if releases and cuts[1] <= cuts[0]:
+        raise MagicError(Code.BAD_MOTION, "release_time", release_time, f"after the grasp at {grasp_time:g}")
+    last = len(times) - 1
+    for index in (0, *cuts, last):
+        speed = max((abs(v) for v in velocities[index]), default=0.0)
+        if not speed <= standstill:
+            raise MagicError(
+                Code.BAD_MOTION, f"speed of the arm in rad/s at {times[index]:.3f} s", round(speed, 4), f"at most {standstill:g} there"
+            )
+    actions: list[Step] = [Fingers(False, opening)]
+    begin = 0
+    for cut, close in zip(cuts, (True, False)):
+        if cut > begin:
+            actions.append(Move(begin, cut))
+        actions.append(Fingers(close, grasp_width if close else opening))
+        begin = cut
+    if last > begin:
+        actions.append(Move(begin, last))
+    return tuple(actions)
+
+
+def check_grasp(wanted: float, found: float, tolerance: float) -> None:
+    """Whether fingers that closed have the tool between them: their opening ``found`` is ``wanted`` within ``tolerance``, all m.
+
+    Raises GRASP_FAILED.
+    """
+    if not abs(found - wanted) <= tolerance:
+        what = "the fingers closed on nothing, or lost the tool" if found < wanted else "the fingers did not close on the tool as planned"
+        raise MagicError(
+            Code.GRASP_FAILED, f"{what}: opening in mm", round(1000 * found, 1), f"{1000 * wanted:.1f} within {1000 * tolerance:.1f}"
         )

@@ -11,9 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from control_msgs.action import FollowJointTrajectory, GripperCommand
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
 
 from magic_core import conversions, qos, transforms
 from magic_core.contact import Contact, ContactCandidate, contact_frame
@@ -88,15 +90,25 @@ def strategy(name: str = "fake", simulatable: bool = True) -> Strategy:
     )
 
 
-def plan(variant: str = "fg") -> MotionPlan:
-    """A motion of 0.1 m in one second."""
+#: Joints of the stand-in arm.
+JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+
+
+def plan(variant: str = "fg", release: bool = False) -> MotionPlan:
+    """The tool moves 0.1 m in one second; the arm goes to it in one second, grasps 30 mm, and turns by 0.2 rad at every joint.
+
+    It stands at 0, 1, 1.5, 2.5 and 3 s; with ``release`` the fingers open at 2.5 s.
+    """
     times = np.array([0.0, 1.0])
     motion = ToolMotion(times, np.stack([np.eye(4), transforms.make(translation=[0.1, 0.0, 0.0])]), (Phase("goal", 0.0, 1.0),))
     if variant == "fg":
         return MotionPlan(variant, motion)
-    names = tuple(f"panda_joint{i}" for i in range(1, 8))
-    rows = np.zeros((2, 7))
-    return MotionPlan(variant, motion, ArmMotion(times, names, rows, rows, rows, np.eye(4), 0.03, 0.1))
+    times = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+    rows = np.outer([0.0, 0.05, 0.1, 0.1, 0.15, 0.2, 0.2], np.ones(7))
+    speeds = np.outer([0.0, 0.1, 0.0, 0.0, 0.1, 0.0, 0.0], np.ones(7))
+    arm = ArmMotion(times, JOINTS, rows, speeds, np.zeros((7, 7)), np.eye(4), 0.03, 1.0, 2.5 if release else None)
+    return MotionPlan(variant, motion, arm)
 
 
 class FakeServers(Node):
@@ -185,3 +197,70 @@ class FakeServers(Node):
             return result
 
         return ActionServer(self, kind, name, execute, cancel_callback=lambda handle: CancelResponse.ACCEPT, callback_group=group)
+
+
+class FakeArm(Node):
+    """A trajectory controller, a gripper and joint states: an arm that is where its last point told it to be, at once.
+
+    ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort).  ``thickness`` is what is
+    between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code, error_string).
+    ``positions`` of the joints, rad, are told at 50 Hz while ``tells`` is set, ``late`` seconds late.  With ``squeezes`` the
+    fingers close as far as they can, whatever they are told.
+    """
+
+    def __init__(self, name: str = "fake_arm", thickness: float = 0.03, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.log: list[Any] = []
+        self.thickness = thickness
+        self.opening = 0.08
+        self.positions = [0.0] * len(JOINTS)
+        self.tells, self.squeezes = True, False
+        self.late = 0.0
+        self.moving = threading.Event()
+        self.on_move: Callable[[Any, Callable[[], bool]], tuple[int, str]] = lambda trajectory, canceled: (0, "")
+        group = ReentrantCallbackGroup()
+        self._states = self.create_publisher(JointState, "joint_states", qos.RELIABLE)
+        self._servers = [
+            ActionServer(
+                self,
+                FollowJointTrajectory,
+                "arm/follow_joint_trajectory",
+                self._move,
+                cancel_callback=lambda handle: CancelResponse.ACCEPT,
+                callback_group=group,
+            ),
+            ActionServer(self, GripperCommand, "gripper/gripper_action", self._grip, callback_group=group),
+        ]
+        self.create_timer(0.02, self._tell, callback_group=group)
+
+    def _tell(self) -> None:
+        if self.tells:
+            message = JointState(name=[*FINGERS, *JOINTS], position=[self.opening / 2] * 2 + list(self.positions))
+            stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            self._states.publish(message)
+
+    def _move(self, handle: Any) -> Any:
+        trajectory = handle.request.trajectory
+        self.log.append(trajectory)
+        self.moving.set()
+        code, reason = self.on_move(trajectory, lambda: handle.is_cancel_requested)
+        result = FollowJointTrajectory.Result(error_code=code, error_string=reason)
+        if handle.is_cancel_requested:
+            handle.canceled()
+        elif code:
+            handle.abort()
+        else:
+            self.positions = list(trajectory.points[-1].positions)
+            self._tell()
+            handle.succeed()
+        return result
+
+    def _grip(self, handle: Any) -> Any:
+        command = handle.request.command
+        wanted = 2 * command.position
+        closing = wanted < self.opening
+        self.log.append(("close" if closing else "open", command.position, command.max_effort))
+        self.opening = max(0.0 if self.squeezes else wanted, self.thickness) if closing else wanted
+        handle.succeed()
+        return GripperCommand.Result(position=self.opening / 2, stalled=self.opening > wanted, reached_goal=self.opening == wanted)

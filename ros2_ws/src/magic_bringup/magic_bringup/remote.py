@@ -144,14 +144,24 @@ class RemoteAction(_Remote):
         grace: float = 0.0,
         feedback: Callable[[Any], None] | None = None,
     ) -> Any:
-        """The result of a goal.
+        """The result of a goal, of one of this project's actions.
 
         ``timeout`` is what the server itself is given; ``grace`` what is waited
-        beyond it for the answer.  A cancel, and a timeout, are forwarded to the
-        goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, BUSY or CANCELED.
+        beyond it for the answer.  Raises what :meth:`respond` does.
         """
-        deadline = time.monotonic() + timeout + grace
-        self.require(min(presence, timeout + grace), token)
+        response = self.respond(goal, timeout + grace, token, presence, feedback)
+        if response.status != GoalStatus.STATUS_SUCCEEDED and response.result.code == 0:
+            # rclpy answers an empty result where a server's handler raised.
+            raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {response.status} and no result")
+        return response.result
+
+    def respond(self, goal: Any, timeout: float, token: Token, presence: float = 5.0, feedback: Callable[[Any], None] | None = None) -> Any:
+        """The response to a goal, of any action: its ``status`` and ``result``.
+
+        A cancel, and a timeout, are forwarded to the goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, BUSY or CANCELED.
+        """
+        deadline = time.monotonic() + timeout
+        self.require(min(presence, timeout), token)
         callback = None if feedback is None else (lambda message: feedback(message.feedback))
         accepting = self._client.send_goal_async(goal, feedback_callback=callback)
         accepting.add_done_callback(token.poke)
@@ -162,7 +172,7 @@ class RemoteAction(_Remote):
             raise
         if not accepted:
             self._cancel_when_accepted(accepting)
-            raise self._late("did not accept the goal", timeout + grace)
+            raise self._late("did not accept the goal", timeout)
         handle = accepting.result()
         if not handle.accepted:
             raise MagicError(Code.BUSY, f"the {self.server} ({self.name}) refused the goal")
@@ -170,15 +180,11 @@ class RemoteAction(_Remote):
         future.add_done_callback(token.poke)
         try:
             if not token.wait(future.done, deadline, alive=self._still_there):
-                raise self._late("did not finish", timeout + grace)
+                raise self._late("did not finish", timeout)
         except MagicError:
             self._cancel(handle, future, token)
             raise
-        response = future.result()
-        if response.status != GoalStatus.STATUS_SUCCEEDED and response.result.code == 0:
-            # rclpy answers an empty result where a server's handler raised.
-            raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {response.status} and no result")
-        return response.result
+        return future.result()
 
     def _cancel(self, handle: Any, future: Any, token: Token) -> None:
         if token.closing:

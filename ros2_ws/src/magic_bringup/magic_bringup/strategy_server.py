@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -14,15 +14,14 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
-from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from magic_bringup import execution, markers, pipeline
+from magic_bringup import markers, pipeline
+from magic_bringup.arm import Arm, ArmSettings
 from magic_bringup.remote import RemoteAction, RemoteService, Token
 from magic_core import qos
 from magic_core import strategy as strategies
-from magic_core.conversions import time_from_msg
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
@@ -48,8 +47,9 @@ class StrategyServer(Node):
         verified_trajectory (JointTrajectory, latched, variant arm), verified_tool_trajectory (MultiDOFJointTrajectory,
         latched, variant fg), strategy/markers (MarkerArray, latched), /diagnostics at 1 Hz.
         A trajectory is published only after the verifier has answered OK for it.
-        With ``execute``: ``execute_topic`` (JointTrajectory, not latched), what a joint_trajectory_controller of ros2_control
-        takes.  It gets a verified trajectory of the arm, and only while the arm stands at its start; fingers are not commanded.
+    With ``execute``, calls also
+        ``trajectory_action`` (control_msgs/FollowJointTrajectory) and ``gripper_action`` (control_msgs/GripperCommand): arm and
+        gripper carry out a plan of the variant arm that the verifier has passed, where the arm stands at its start.
 
     One goal runs at a time; a second one is answered BUSY.  Cancel is heeded between
     the stages and inside them: it is forwarded to the running plan or verify goal.
@@ -73,25 +73,31 @@ class StrategyServer(Node):
         self._grace = parameter(
             self, "grace", 5.0, "s that an answer may come late before its server counts as dead", **seconds, read_only=True
         )
-        execute = parameter(self, "execute", False, "hand verified trajectories to the arm's controller", read_only=True)
-        topic = parameter(
+        execute = parameter(self, "execute", False, "carry verified plans out with arm and gripper", read_only=True)
+        mover = parameter(
             self,
-            "execute_topic",
-            "joint_trajectory_controller/joint_trajectory",
-            "topic of the controller (JointTrajectory)",
+            "trajectory_action",
+            "panda_arm_controller/follow_joint_trajectory",
+            "action of the arm's controller (control_msgs/FollowJointTrajectory)",
             read_only=True,
         )
-        self._start_tolerance = parameter(
-            self,
-            "start_tolerance",
-            0.02,
-            "rad that a joint may be off the trajectory's start to execute it",
-            low=0.0,
-            high=0.5,
-            read_only=True,
+        gripper = parameter(
+            self, "gripper_action", "panda_gripper/gripper_action", "action of the gripper (control_msgs/GripperCommand)", read_only=True
         )
-        self._state_age = parameter(
-            self, "state_age", 0.5, "s that joint_states may be old to execute a trajectory", low=0.01, high=10.0, read_only=True
+
+        def number(name: str, text: str, low: float, high: float) -> float:
+            return parameter(self, name, getattr(ArmSettings, name), text, low=low, high=high, read_only=True)
+
+        settings = ArmSettings(
+            speed=number("speed", "of the execution, as a share of the planned speed", 0.01, 1.0),
+            start_tolerance=number("start_tolerance", "rad that a joint may be off where a move begins", 0.0, 0.5),
+            state_age=number("state_age", "s that joint_states may be old where a move begins", 0.01, 10.0),
+            opening=number("opening", "m between the open fingers", 0.0, 0.5),
+            finger_scale=number("finger_scale", "position of the gripper's joint for a metre between the fingers", 0.01, 100.0),
+            squeeze=number("squeeze", "m that the fingers are told to close beyond the tool's thickness", 0.0, 0.1),
+            effort=number("effort", "of the gripper, N; 0: the driver's own", 0.0, 1000.0),
+            grasp_tolerance=number("grasp_tolerance", "m that the opening of the closed fingers may be off the planned one", 0.0, 0.1),
+            presence=self._presence,
         )
 
         group = ReentrantCallbackGroup()
@@ -100,7 +106,6 @@ class StrategyServer(Node):
         self._goals: dict[bytes, Token] = {}
         self._scene: SceneObjectArray | None = None
         self._joints: JointState | None = None
-        self._joints_came = -math.inf
         self._complaints: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._waiting: list[str] | None = None
 
@@ -114,8 +119,7 @@ class StrategyServer(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.RELIABLE)
         self._arm_pub = self.create_publisher(JointTrajectory, "verified_trajectory", qos.LATCHED)
         self._tool_pub = self.create_publisher(MultiDOFJointTrajectory, "verified_tool_trajectory", qos.LATCHED)
-        # Not latched: a controller that starts later must not find an order.
-        self._controller = self.create_publisher(JointTrajectory, topic, qos.RELIABLE) if execute else None
+        self._arm = Arm(self, mover, gripper, settings, group) if execute else None
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self.create_timer(1.0, self._tick, callback_group=group)
         self._server = ActionServer(
@@ -136,7 +140,9 @@ class StrategyServer(Node):
         self._poke()
 
     def _on_joints(self, message: JointState) -> None:
-        self._joints, self._joints_came = message, time.monotonic()
+        self._joints = message
+        if self._arm is not None:
+            self._arm.on_state(message)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -151,6 +157,7 @@ class StrategyServer(Node):
     def _tick(self) -> None:
         """Once a second: say what is missing, in the log when it changes and on /diagnostics."""
         waiting = [f"{r.server} ({r.name})" for r in (self._matcher, self._planner, self._verifier) if not r.ready()]
+        waiting += self._arm.ready() if self._arm is not None else []
         if self._scene is None:
             waiting.append(f"perception ({self._objects_topic})")
         if waiting != self._waiting:
@@ -267,8 +274,13 @@ class StrategyServer(Node):
         # First what somebody waits for, then the pictures.
         if outcome.verified and outcome.code == Code.OK and not token.canceled:
             self._publish(outcome.plan)
-            sentence, metrics = pipeline.split_metrics(result.message)
-            result.message = pipeline.with_metrics(sentence + self._execute_on_arm(outcome.plan), list(metrics.items()))
+            if self._arm is not None and outcome.plan.variant == MotionPlan.ARM:
+                reports = tuple(outcome.reports)
+                index = reports[-1].trial.index
+                count = len(stages.matches.candidates)
+                self._carry_out(
+                    self._arm, outcome.plan, token, result, lambda text: notify(pipeline.Progress("execute", index, count, text, reports))
+                )
         if stages.scene is not None and stages.matches is not None:
             plan = outcome.plan or next((r.plan for r in reversed(outcome.reports) if r.plan is not None), None)
             self._marker_pub.publish(
@@ -276,8 +288,8 @@ class StrategyServer(Node):
             )
         if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()
-        ending = f"{goal.strategy} ({goal.variant}) ended with {outcome.code.name}: {outcome.message}"
-        if outcome.code == Code.OK:  # rclpy wants one severity for one line of code
+        ending = f"{goal.strategy} ({goal.variant}) ended with {Code(result.code).name}: {result.message}"
+        if result.code == Code.OK:  # rclpy wants one severity for one line of code
             self.get_logger().info(ending)
         else:
             self.get_logger().warning(ending)
@@ -288,30 +300,19 @@ class StrategyServer(Node):
         else:
             self._tool_pub.publish(plan.tool_trajectory)
 
-    def _execute_on_arm(self, plan: MotionPlan) -> str:
-        """Hand a verified plan to the arm's controller, where that is wanted; returns what is to be added to the message."""
-        if self._controller is None or plan.variant != MotionPlan.ARM:
-            return ""
+    def _carry_out(self, arm: Arm, plan: MotionPlan, token: Token, result: RunStrategy.Result, tell: Callable[[str], None]) -> None:
+        """Have arm and gripper do what physics has passed, and write into the result how that went."""
+        sentence, metrics = pipeline.split_metrics(result.message)
         try:
-            trajectory, state, topic = plan.arm_trajectory, self._joints, self._controller.topic_name
-            age = math.inf
-            if state is not None:
-                by_stamp = self.get_clock().now().nanoseconds * 1e-9 - time_from_msg(state.header.stamp)
-                age = max(time.monotonic() - self._joints_came, by_stamp, key=abs)
-            first = trajectory.points[0].positions if trajectory.points else []
-            names, positions = (state.name, state.position) if state is not None else ((), ())
-            execution.check_start(trajectory.joint_names, first, names, positions, age, self._start_tolerance, self._state_age)
-            if self._controller.get_subscription_count() == 0:
-                raise MagicError(Code.SERVER_UNAVAILABLE, f"subscribers of {topic}", 0, "a controller that takes the trajectory")
-            order = copy.copy(trajectory)
-            order.header = Header(frame_id=trajectory.header.frame_id)  # a stamp of 0: begin at once
-            self._controller.publish(order)
+            self.get_logger().warning("the arm is about to move: carrying out the verified plan")
+            arm.execute(plan, token, tell)
+            result.executed = True
+            sentence += "; carried out by the arm"
         except Exception as error:
-            _, message = describe(self, error)
-            self.get_logger().error(f"not executed: {message}")
-            return f"; not executed: {message}"
-        self.get_logger().warning(f"executing: trajectory of {len(trajectory.points)} points sent to {topic}")
-        return f"; sent to {topic}"
+            result.code, message = describe(self, error)
+            sentence = f"verified ({sentence}), but not carried out to the end: {message}"
+            self.get_logger().error(sentence)
+        result.message = pipeline.with_metrics(sentence, list(metrics.items()))
 
     def destroy_node(self) -> None:
         """Let a run in progress end, so that its thread does not hold up the process."""

@@ -1,22 +1,20 @@
-"""A verified trajectory reaches the arm's controller only where that is wanted and the arm stands at its start."""
+"""Arm and gripper move only where that is wanted, for a verified plan, and while the arm is where the plan believes it."""
 
 import math
+import time
 
 import pytest
-from sensor_msgs.msg import JointState
+from action_msgs.msg import GoalStatus
 from test_strategy_server import Bench
-from trajectory_msgs.msg import JointTrajectory
 
 from magic_bringup import fakes
-from magic_bringup.execution import check_start
-from magic_core import qos
+from magic_bringup.execution import Fingers, Move, check_grasp, check_start, steps
+from magic_core import conversions
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
-from magic_interfaces.action import VerifyMotion
+from magic_interfaces.action import PlanMotion, VerifyMotion
 
-NAMES = tuple(f"panda_joint{i}" for i in range(1, 8))
-FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
-TOPIC = "controller/joint_trajectory"
+NAMES, FINGERS = fakes.JOINTS, fakes.FINGERS
 HERE = {
     "names": NAMES,
     "first": [0.1] * 7,
@@ -54,6 +52,59 @@ def test_any_other_arm_is_refused(change, code, says):
     assert says in caught.value.message
 
 
+TIMES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+SPEEDS = ((0.0,), (0.1,), (0.0,), (0.0,), (0.1,), (0.0,), (0.0,))
+PLAN = {"times": TIMES, "velocities": SPEEDS, "grasp_time": 1.0, "release_time": math.nan, "grasp_width": 0.03, "opening": 0.08}
+
+
+def test_fingers_open_first_and_close_at_the_tool():
+    assert steps(**PLAN) == (Fingers(False, 0.08), Move(0, 2), Fingers(True, 0.03), Move(2, 6))
+    assert steps(**{**PLAN, "release_time": 2.5}) == (
+        Fingers(False, 0.08),
+        Move(0, 2),
+        Fingers(True, 0.03),
+        Move(2, 5),
+        Fingers(False, 0.08),
+        Move(5, 6),
+    )
+    assert steps(**{**PLAN, "release_time": 3.0})[-1] == Fingers(False, 0.08)  # nothing is left to move
+    assert steps(**{**PLAN, "grasp_time": 0.0})[:2] == (Fingers(False, 0.08), Fingers(True, 0.03))
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"grasp_time": 0.5}, "speed of the arm in rad/s at 0.500 s"),
+        ({"release_time": 2.0}, "speed of the arm in rad/s at 2.000 s"),
+        ({"velocities": (*SPEEDS[:-1], (0.1,))}, "at 3.000 s"),
+        ({"velocities": ((math.nan,), *SPEEDS[1:])}, "at 0.000 s"),
+        ({"grasp_time": 3.5}, "grasp_time: 3.5"),
+        ({"grasp_time": math.nan}, "grasp_time: nan"),
+        ({"release_time": 1.0}, "release_time: 1.0"),
+        ({"grasp_width": 0.09}, "grasp_width in m: 0.09"),
+        ({"grasp_width": -0.01}, "grasp_width in m: -0.01"),
+        ({"times": (0.0, 0.5, 0.5, 1.5, 2.0, 2.5, 3.0)}, "rising times"),
+        ({"times": (0.0,)}, "1 points"),
+    ],
+)
+def test_plans_that_cannot_be_carried_out(change, says):
+    with pytest.raises(MagicError) as caught:
+        steps(**{**PLAN, **change})
+    assert caught.value.code == Code.BAD_MOTION
+    assert says in caught.value.message
+
+
+@pytest.mark.parametrize(
+    "found, says", [(0.0, "closed on nothing"), (0.019, "closed on nothing"), (0.05, "did not close"), (math.nan, "nan")]
+)
+def test_what_is_between_the_fingers(found, says):
+    check_grasp(0.03, 0.025, 0.01)
+    with pytest.raises(MagicError) as caught:
+        check_grasp(0.03, found, 0.01)
+    assert caught.value.code == Code.GRASP_FAILED
+    assert says in caught.value.message
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("strategies")
@@ -62,93 +113,188 @@ def folder(tmp_path_factory):
     return root
 
 
+ACTIONS = {"trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}
+
+
 @pytest.fixture(scope="module")
-def arm(folder):
-    """A server that may execute, with an arm that hears orders and tells where it is; no state has been told yet."""
-    bench = Bench(folder, execute=True, execute_topic=TOPIC, state_age=10.0)
-    bench.orders = bench.messages["orders"] = []
-    bench.states = bench.node.create_publisher(JointState, "joint_states", 10)
+def shared(folder):
+    """A server that may move an arm, and the arm."""
+    bench = Bench(folder, execute=True, state_age=0.3, speed=0.5, **ACTIONS)
     bench.fakes.publish(fakes.scene())
+    bench.arm = fakes.FakeArm(context=bench.context)
+    bench.executor.add_node(bench.arm)
+    bench.until(lambda: not bench.server._arm.ready())
     yield bench
     bench.close()
+    bench.arm.destroy_node()
 
 
-def tell(bench, positions, late=0.0):
-    """Publish a joint state until it has arrived."""
-    message = JointState(name=list(FINGERS + NAMES), position=[0.04, 0.04, *positions])
-    now = bench.node.get_clock().now().nanoseconds - int(late * 1e9)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
-    bench.server._joints = None
-    bench.wait_for_match(bench.states)
-    bench.states.publish(message)
-    bench.until(lambda: bench.server._joints is not None)
+@pytest.fixture
+def bench(shared):
+    """The arm at its start, telling so."""
+    arm = shared.arm
+    shared.fakes.clear()
+    shared.feedback.clear()
+    arm.log.clear()
+    arm.moving.clear()
+    arm.positions, arm.thickness, arm.opening, arm.tells, arm.squeezes, arm.late = [0.0] * 7, 0.03, 0.08, True, False, 0.0
+    arm.on_move = lambda trajectory, canceled: (0, "")
+    believes(shared, [0.0] * 7)
+    return shared
 
 
-def refused(bench):
+def believes(bench, positions):
+    """Wait until the server has heard where the arm is, just now."""
+    begin = time.monotonic()
+    bench.until(
+        lambda: bench.server._arm._came > begin and list(bench.server._arm._state.position[2:]) == pytest.approx(positions, nan_ok=True)
+    )
+
+
+def told(bench):
+    """What the arm was told, in short."""
+    return [entry if isinstance(entry, tuple) else "move" for entry in bench.arm.log]
+
+
+def test_arm_and_gripper_carry_a_verified_plan_out(bench):
+    result, status = bench.run(variant="arm")
+    assert (result.code, result.verified, result.executed) == (0, True, True), result.message
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    assert "carried out by the arm" in result.message
+    assert told(bench) == [("open", 0.04, 20.0), "move", ("close", 0.015, 20.0), "move"]
+    there, task = (entry for entry in bench.arm.log if not isinstance(entry, tuple))
+    assert tuple(there.joint_names) == fakes.JOINTS
+    assert (there.header.stamp.sec, there.header.stamp.nanosec) == (0, 0)  # begin at once
+    # At half the planned speed: twice the time, half the velocity; each move begins at 0 s.
+    assert [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in there.points] == pytest.approx([0.0, 1.0, 2.0])
+    assert [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in task.points] == pytest.approx([0.0, 1.0, 2.0, 3.0, 4.0])
+    assert list(there.points[1].velocities) == pytest.approx([0.05] * 7)
+    assert list(task.points[0].positions) == list(there.points[-1].positions)
+    assert {f.stage for f in bench.feedback} >= {"plan", "verify", "execute"}
+    assert any("step 3 of 4: the fingers close" in f.message for f in bench.feedback)
+
+
+def test_a_release_opens_the_fingers(bench):
+    bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(
+        plan=conversions.plan_to_msg(fakes.plan("arm", release=True), goal.tool.id)
+    )
     result, _ = bench.run(variant="arm")
-    assert (result.code, result.verified) == (0, True), result.message
-    assert "; not executed: " in result.message, result.message
-    assert not bench.orders
+    assert result.executed, result.message
+    assert told(bench) == [("open", 0.04, 20.0), "move", ("close", 0.015, 20.0), "move", ("open", 0.04, 20.0), "move"]
+
+
+def refused(bench, code):
+    result, status = bench.run(variant="arm")
+    assert (result.code, result.verified, result.executed) == (code, True, False), result.message
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "but not carried out" in result.message
     return result.message
 
 
-def test_without_a_joint_state_nothing_is_executed(arm):
-    assert "none received" in refused(arm)
+@pytest.mark.parametrize(
+    "change, code, says",
+    [
+        ({"late": 5.0}, Code.STALE_DATA, "age of joint_states"),
+        ({"positions": [0.0] * 6 + [0.5]}, Code.BAD_MOTION, "0.5000 at panda_joint7"),
+    ],
+    ids=["old", "elsewhere"],
+)
+def test_an_arm_that_is_not_known_to_stand_at_the_start_is_not_moved(bench, change, code, says):
+    for name, value in change.items():
+        setattr(bench.arm, name, value)
+    believes(bench, bench.arm.positions)
+    assert says in refused(bench, code)
+    assert not bench.arm.log
 
 
-def test_without_a_controller_nothing_is_executed(arm):
-    tell(arm, [0.0] * 7)
-    assert f"subscribers of /{TOPIC}" in refused(arm)
+def test_an_arm_that_has_fallen_silent_is_not_moved(bench):
+    bench.arm.tells = False
+    silent = time.monotonic()
+    bench.until(lambda: time.monotonic() - silent > 0.4)
+    assert "age of joint_states" in refused(bench, Code.STALE_DATA)
+    assert not bench.arm.log
 
 
-@pytest.fixture(scope="module")
-def controlled(arm):
-    subscription = arm.node.create_subscription(JointTrajectory, TOPIC, lambda m: arm._hear("orders", m), qos.RELIABLE)
-    arm.wait_for_match(arm.server._controller)
-    yield arm
-    arm.node.destroy_subscription(subscription)
+def test_fingers_that_close_on_nothing_end_it(bench):
+    bench.arm.thickness, bench.arm.squeezes = 0.0, True
+    assert "closed on nothing" in refused(bench, Code.GRASP_FAILED)
+    assert told(bench)[-1][0] == "close"
+    assert told(bench).count("move") == 1
 
 
-def test_an_old_joint_state_is_refused(controlled):
-    tell(controlled, [0.0] * 7, late=15.0)
-    assert "age of joint_states" in refused(controlled)
+def test_fingers_that_meet_something_thicker_end_it(bench):
+    bench.arm.thickness = 0.05
+    assert "did not close on the tool as planned: opening in mm: 50.0" in refused(bench, Code.GRASP_FAILED)
+    assert told(bench).count("move") == 1
 
 
-def test_an_arm_elsewhere_is_refused(controlled):
-    tell(controlled, [0.0] * 6 + [0.5])
-    assert "0.5000 at panda_joint7" in refused(controlled)
+def test_a_controller_that_gives_up_ends_it(bench):
+    bench.arm.on_move = lambda trajectory, canceled: (-4, "joint 3 lags")
+    message = refused(bench, Code.EXECUTION_FAILED)
+    assert "error -4" in message
+    assert "joint 3 lags" in message
+    assert told(bench) == [("open", 0.04, 20.0), "move"]
 
 
-def test_what_is_not_verified_or_not_for_the_arm_is_never_executed(controlled):
-    bench = controlled
-    tell(bench, [0.0] * 7)
+def test_an_arm_that_did_not_arrive_goes_no_further(bench):
+    bench.arm.on_move = lambda trajectory, canceled: (setattr(trajectory.points[-1], "positions", [0.05] * 7), (0, ""))[1]
+    assert "distance of the arm" in refused(bench, Code.BAD_MOTION)
+    assert told(bench).count("move") == 1
+
+
+def test_a_cancel_stops_the_arm(bench):
+    stopped = []
+
+    def move(trajectory, canceled):
+        deadline = time.monotonic() + 10.0
+        while not canceled() and time.monotonic() < deadline:
+            time.sleep(0.002)
+        stopped.append(canceled())
+        return 0, ""
+
+    bench.arm.on_move = move
+    handle = bench.send(variant="arm")
+    assert bench.arm.moving.wait(10.0)
+    bench.result(handle.cancel_goal_async())
+    response = bench.result(handle.get_result_async())
+    assert (response.result.code, response.status) == (Code.CANCELED, GoalStatus.STATUS_CANCELED)
+    assert (response.result.verified, response.result.executed) == (True, False)
+    assert stopped == [True]
+    assert told(bench) == [("open", 0.04, 20.0), "move"]
+
+
+def test_what_is_not_verified_or_not_for_the_arm_moves_nothing(bench):
     bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
     result, _ = bench.run(variant="arm")
-    assert not result.verified
+    assert (result.verified, result.executed) == (False, False)
     bench.fakes.clear()
     result, _ = bench.run(strategy="dynamic", variant="arm", allow_unverified=True)
-    assert (result.code, result.verified) == (0, False)
+    assert (result.code, result.verified, result.executed) == (0, False, False)
     result, _ = bench.run(variant="fg")
-    assert (result.code, result.verified) == (0, True)
-    assert "execut" not in result.message
-    assert not bench.orders
+    assert (result.code, result.verified, result.executed) == (0, True, False)
+    assert not bench.arm.log
 
 
-def test_a_verified_trajectory_goes_to_the_arm_at_its_start(controlled):
-    bench = controlled
-    tell(bench, [0.01] * 7)
-    result, _ = bench.run(variant="arm")
-    assert f"sent to /{TOPIC}" in result.message
-    bench.wait(lambda: bench.orders)
-    (order,) = bench.orders
-    assert tuple(order.joint_names) == NAMES
-    assert (order.header.stamp.sec, order.header.stamp.nanosec) == (0, 0)
-    assert len(order.points) == 2
+def test_without_a_gripper_nothing_moves(folder):
+    bench = Bench(folder, execute=True, trajectory_action="arm/follow_joint_trajectory", gripper_action="nowhere", server_timeout=0.5)
+    arm = fakes.FakeArm(context=bench.context)
+    try:
+        bench.executor.add_node(arm)
+        bench.fakes.publish(fakes.scene())
+        result, _ = bench.run(variant="arm")
+        assert result.code == Code.SERVER_UNAVAILABLE
+        assert "/nowhere" in result.message
+        assert (result.verified, result.executed) == (True, False)
+        assert not arm.log
+    finally:
+        bench.close()
+        arm.destroy_node()
 
 
 def test_by_default_nobody_can_be_moved(folder):
     bench = Bench(folder)
     try:
-        assert bench.server._controller is None
+        assert bench.server._arm is None
+        assert not [name for name, _ in bench.server.get_service_names_and_types() if "follow_joint" in name or "gripper" in name]
     finally:
         bench.close()

@@ -80,6 +80,8 @@ class Code(IntEnum):
     BUSY = 504
     NOT_VERIFIABLE = 505
     BAD_REQUEST = 506
+    EXECUTION_FAILED = 507
+    GRASP_FAILED = 508
     INTERNAL = 599
 
 

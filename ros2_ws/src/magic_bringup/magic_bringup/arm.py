@@ -1,0 +1,151 @@
+"""The arm and its gripper as the strategy server sees them: a trajectory controller and a gripper driver, both actions."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from action_msgs.msg import GoalStatus
+from control_msgs.action import FollowJointTrajectory, GripperCommand
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory
+
+from magic_bringup import execution
+from magic_bringup.remote import RemoteAction, Token
+from magic_core.conversions import duration_to_msg, time_from_msg
+from magic_core.errors import Code, MagicError
+from magic_interfaces.msg import MotionPlan
+
+#: A move is given this many times its own length, and this much besides, s: controllers add their settling.
+PATIENCE, MARGIN = 1.5, 5.0
+#: What the fingers are given to open or close, s.
+FINGER_TIME = 10.0
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """How a plan is carried out.
+
+    speed: 1 as planned, less: slower by that factor.  start_tolerance: rad that a joint may be off where a move begins.
+    state_age: s that a joint state may be old.  opening: m between the open fingers.  finger_scale: position of the gripper's
+    joint for a metre of opening (0.5 where the joint is one of two fingers).  squeeze: m that the fingers are told to close
+    beyond the tool's thickness (for drivers that only control position).  effort: of the gripper, N; 0: the driver's own.
+    grasp_tolerance: m that the opening of the closed fingers may differ from the planned one.  presence: s to wait for a
+    server.
+    """
+
+    speed: float = 1.0
+    start_tolerance: float = 0.02
+    state_age: float = 0.5
+    opening: float = 0.08
+    finger_scale: float = 0.5
+    squeeze: float = 0.0
+    effort: float = 20.0
+    grasp_tolerance: float = 0.01
+    presence: float = 5.0
+
+
+class Arm:
+    """Carries out verified plans, step by step: the next step begins only where the one before has succeeded.
+
+    On a failure or a cancel the goal at work is canceled, the arm stays where its controller stops it, and the fingers stay as
+    they are: what to do with a tool in the hand is for a person to decide.
+    """
+
+    def __init__(self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, group: CallbackGroup) -> None:
+        self._node = node
+        self.settings = settings
+        self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group)
+        self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group)
+        self._state: JointState | None = None
+        self._came = -math.inf
+
+    def on_state(self, message: JointState) -> None:
+        """The newest joint state."""
+        self._state, self._came = message, time.monotonic()
+
+    def ready(self) -> list[str]:
+        """The servers that are missing."""
+        return [f"{r.server} ({r.name})" for r in (self._mover, self._gripper) if not r.ready()]
+
+    def execute(self, plan: MotionPlan, token: Token, tell: Callable[[str], None]) -> None:
+        """Carry out a plan.
+
+        Everything that can be checked is checked before anything moves.  Raises BAD_MOTION, NO_FRAMES, STALE_DATA,
+        SERVER_UNAVAILABLE (before the first move), EXECUTION_FAILED, GRASP_FAILED, SERVER_TIMEOUT, CANCELED.
+        """
+        settings, trajectory = self.settings, plan.arm_trajectory
+        times = [time_from_msg(p.time_from_start) for p in trajectory.points]
+        actions = execution.steps(
+            times, [p.velocities for p in trajectory.points], plan.grasp_time, plan.release_time, plan.grasp_width, settings.opening
+        )
+        for remote in (self._mover, self._gripper):
+            remote.require(settings.presence, token)
+        self._check_start(trajectory, 0)
+        for number, action in enumerate(actions, 1):
+            where = f"step {number} of {len(actions)}"
+            if isinstance(action, execution.Move):
+                tell(f"{where}: the arm moves for {(times[action.last] - times[action.first]) / settings.speed:.1f} s")
+                self._check_start(trajectory, action.first)
+                self._move(trajectory, times, action, token)
+            else:
+                tell(f"{where}: the fingers {'close on the tool' if action.close else 'open'}")
+                self._fingers(action, token)
+
+    def _check_start(self, trajectory: JointTrajectory, index: int) -> None:
+        state = self._state
+        age = math.inf
+        if state is not None:
+            by_stamp = self._node.get_clock().now().nanoseconds * 1e-9 - time_from_msg(state.header.stamp)
+            age = max(time.monotonic() - self._came, by_stamp, key=abs)
+        names, positions = (state.name, state.position) if state is not None else ((), ())
+        point = trajectory.points[index].positions
+        execution.check_start(trajectory.joint_names, point, names, positions, age, self.settings.start_tolerance, self.settings.state_age)
+
+    def _move(self, trajectory: JointTrajectory, times: list[float], move: execution.Move, token: Token) -> None:
+        speed = self.settings.speed
+        goal = FollowJointTrajectory.Goal()
+        # A stamp of 0: begin at once.
+        goal.trajectory = JointTrajectory(header=Header(frame_id=trajectory.header.frame_id), joint_names=trajectory.joint_names)
+        for index in range(move.first, move.last + 1):
+            point = copy.copy(trajectory.points[index])
+            point.time_from_start = duration_to_msg((times[index] - times[move.first]) / speed)
+            point.velocities = [v * speed for v in point.velocities]
+            point.accelerations = [a * speed**2 for a in point.accelerations]
+            goal.trajectory.points.append(point)
+        seconds = (times[move.last] - times[move.first]) / speed
+        response = self._mover.respond(goal, PATIENCE * seconds + MARGIN, token, self.settings.presence)
+        result = response.result
+        if response.status != GoalStatus.STATUS_SUCCEEDED or result.error_code != FollowJointTrajectory.Result.SUCCESSFUL:
+            raise MagicError(
+                Code.EXECUTION_FAILED,
+                f"the arm's controller ended the trajectory with error {result.error_code}, status {response.status}: "
+                f"{result.error_string or 'no reason given'}",
+            )
+
+    def _fingers(self, fingers: execution.Fingers, token: Token) -> None:
+        settings = self.settings
+        goal = GripperCommand.Goal()
+        opening = max(0.0, fingers.opening - settings.squeeze) if fingers.close else fingers.opening
+        goal.command.position = opening * settings.finger_scale
+        goal.command.max_effort = settings.effort
+        response = self._gripper.respond(goal, FINGER_TIME, token, settings.presence)
+        result = response.result
+        found = result.position / settings.finger_scale
+        if fingers.close:
+            # A gripper that squeezes a tool may say that it stalled, or abort because it did not get where it was told to.
+            if response.status != GoalStatus.STATUS_SUCCEEDED and not result.stalled:
+                raise MagicError(Code.GRASP_FAILED, f"the gripper ended its goal with status {response.status}")
+            execution.check_grasp(fingers.opening, found, settings.grasp_tolerance)
+        elif response.status != GoalStatus.STATUS_SUCCEEDED or not (
+            result.reached_goal or found >= fingers.opening - settings.grasp_tolerance
+        ):
+            raise MagicError(
+                Code.EXECUTION_FAILED, f"the gripper did not open: mm between the fingers {1000 * found:.1f}, status {response.status}"
+            )
