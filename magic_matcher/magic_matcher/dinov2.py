@@ -17,6 +17,7 @@ from magic_matcher.contour import Contour
 from magic_matcher.features import GlobalMatch, Reference
 
 MODELS = ("dinov2", "dinov2_with_registers", "dinov3_vit")
+PRECISIONS = ("auto", "float32", "bfloat16", "float16")
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
 
@@ -26,8 +27,9 @@ class Dinov2Features:
 
     weights: a hub name or a folder; tokens: side n of the feature map, the picture is then n
     patches wide (37: 518 px at DINOv2's patch of 14); aggregation ``aligned`` or
-    ``pairs``; components d' of the joint PCA (``None``: no PCA).  On the CPU fp32, on a GPU half
-    precision.  The tokens are those of the last block before the final norm.
+    ``pairs``; components d' of the joint PCA (``None``: no PCA); precision ``float32``, ``bfloat16``,
+    ``float16`` or ``auto``: float32 on the CPU, float16 elsewhere.  All that follows the network is float32.
+    The tokens are those of the last block before the final norm.
     """
 
     name = "dinov2"
@@ -41,7 +43,10 @@ class Dinov2Features:
         components: int | None = global_matching.COMPONENTS,
         rotations: int = global_matching.ROTATIONS,
         reflections: bool = True,
+        precision: str = "auto",
     ) -> None:
+        if precision not in PRECISIONS:
+            raise MagicError(Code.BAD_REQUEST, "precision", precision, PRECISIONS)
         try:
             import torch
             from transformers import AutoConfig, AutoModel
@@ -53,17 +58,20 @@ class Dinov2Features:
                 raise MagicError(Code.FEATURE_WEIGHTS, f"model type of {weights}", config.model_type, MODELS)
             self._torch = torch
             self._device = torch.device(device)
-            self._dtype = torch.float32 if self._device.type == "cpu" else torch.float16
+            half = "float32" if self._device.type == "cpu" else "float16"
+            self._dtype = getattr(torch, half if precision == "auto" else precision)
             self._model = AutoModel.from_pretrained(weights, dtype=self._dtype).to(self._device).eval()
         except MagicError:
             raise
-        except (OSError, ValueError, RuntimeError, KeyError) as error:
+        except (
+            Exception
+        ) as error:  # whatever the libraries make of files that are not what they should be, or of a device that is not there
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise MagicError(
                 Code.FEATURE_WEIGHTS,
-                f"weights {weights}: {reason}",
+                f"weights {weights} on {device}: {reason}",
                 None,
-                "a hub name that can be reached, or a folder with config.json and model.safetensors",
+                "a hub name that can be reached, or a folder with config.json and model.safetensors; a torch device of this machine",
             ) from error
         self._weights = str(weights)
         self._patch = int(config.patch_size)

@@ -7,6 +7,7 @@ contact on the target that each would meet.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -174,19 +175,25 @@ class Matcher:
     two_step: bool = True
     cache: Any = None
     _prepared: dict[str, Any] = field(default_factory=dict, repr=False)
+    _lock: Any = field(default_factory=threading.Lock, repr=False, compare=False)
 
     def prepare(self, reference: Reference) -> Any:
         """The backend's view of a reference, computed once."""
         key = f"{self.backend.key()}-{reference.key()}"
-        if key not in self._prepared:
-            if len(self._prepared) >= 16:  # memory stays flat over any number of different references
-                self._prepared.pop(next(iter(self._prepared)))
+        found = self._prepared.get(key)
+        if found is not None:
+            return found
+        # Of requests that come together one prepares a new reference, the others wait for it.
+        with self._lock:
+            if key not in self._prepared:
+                if len(self._prepared) >= 16:  # memory stays flat over any number of different references
+                    self._prepared.pop(next(iter(self._prepared)))
 
-            def make() -> Any:
-                return self.backend.prepare(reference)
+                def make() -> Any:
+                    return self.backend.prepare(reference)
 
-            self._prepared[key] = make() if self.cache is None else self.cache.get(key, make)
-        return self._prepared[key]
+                self._prepared[key] = make() if self.cache is None else self.cache.get(key, make)
+            return self._prepared[key]
 
     def match(
         self,
