@@ -135,7 +135,7 @@ def info(path: Path | str) -> BagInfo:
 
 # ---------------------------------------------------------------------------------------------- message definitions
 
-_FIELD = re.compile(r"^\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[a-z]\w*")
+_FIELD = re.compile(r"^\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[a-z]\w*\s*(?:$|[^=\s])")
 _PRIMITIVES = frozenset(
     [
         "bool",
@@ -157,6 +157,20 @@ _PRIMITIVES = frozenset(
         "time",
     ]
 )
+
+
+def nested_type(line: str, package: str) -> str | None:
+    """The message type of the field that a line of a definition declares, as ``package/msg/Type``; None: a constant or of a plain type.
+
+    ``line`` without its comment; ``package``: of the definition, in which types without a package are.
+    """
+    field = _FIELD.match(line)
+    if not field or field["type"] in _PRIMITIVES:
+        return None
+    kind = field["type"].split("/")
+    if kind == ["Header"]:
+        kind = ["std_msgs", "Header"]
+    return f"{kind[0] if len(kind) > 1 else package}/msg/{kind[-1]}"
 
 
 def share_of(package: str) -> Path:
@@ -190,14 +204,8 @@ def message_definition(type_name: str) -> tuple[str, str]:
     while waiting:
         name = waiting.pop(0)
         for line in texts[name].splitlines():
-            field = _FIELD.match(line.split("#", 1)[0])
-            if not field or field["type"] in _PRIMITIVES:
-                continue
-            kind = field["type"].split("/")
-            if kind == ["Header"]:
-                kind = ["std_msgs", "Header"]
-            nested = f"{kind[0] if len(kind) > 1 else name.split('/')[0]}/msg/{kind[-1]}"
-            if nested not in texts:
+            nested = nested_type(line.split("#", 1)[0], name.split("/")[0])
+            if nested is not None and nested not in texts:
                 texts[nested] = text_of(nested)
                 waiting.append(nested)
     definition = texts.pop(type_name)

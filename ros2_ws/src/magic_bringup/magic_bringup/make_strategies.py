@@ -21,6 +21,7 @@ import argparse
 import itertools
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,36 @@ def _trajectory(target: Contact, contacts: Poses, tool: Contact) -> Poses:
     return target.object_from_contact @ contacts @ transforms.inverse(tool.object_from_contact)
 
 
+def _demonstrated(
+    tool: Shape,
+    tool_view: CanonicalView,
+    tool_contact: Contact,
+    target: Shape,
+    seen: CanonicalView,
+    touched: Contact,
+    normal: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    times: NDArray[np.float64],
+    contacts: Poses,
+) -> dict[str, Any]:
+    """What every strategy has of its demonstration, by the names of :class:`Strategy`.
+
+    ``seen`` and ``touched``: the target's view and contact; ``contacts``: target_contact_from_tool_contact (T, 4, 4) over ``times``.
+    """
+    return {
+        "tool_view": tool_view,
+        "tool_contact": tool_contact,
+        "target_view": seen,
+        "target_contact": touched,
+        "target_normal": normal,
+        "target_view_direction": direction,
+        "times": times,
+        "target_from_tool": _trajectory(touched, contacts, tool_contact),
+        "tool_mesh": tool.mesh,
+        "target_mesh": target.mesh,
+    }
+
+
 def hooking() -> Strategy:
     """An L hook pulls a ball by 0.28 m."""
     tool = make("l_hook", 0, length=0.25, tip=0.07, width=0.02, thickness=0.018, inner_radius=0.03, bend=np.pi / 2)
@@ -109,16 +140,7 @@ def hooking() -> Strategy:
         description="An L hook lying flat is lowered behind a ball and pulls it towards the robot.",
         view="top",
         mode="plan",
-        tool_view=tool_view,
-        tool_contact=tool_contact,
-        target_view=seen,
-        target_contact=touched,
-        target_normal=normal,
-        target_view_direction=direction,
-        times=times,
-        target_from_tool=_trajectory(touched, contacts, tool_contact),
-        tool_mesh=tool.mesh,
-        target_mesh=target.mesh,
+        **_demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         # The demonstration had no kicks; a ball, other than a standing cylinder, does not bear them (it passes with 1 of 5 seeds).
         goal=Goal("hook", {"distance": 0.2, "max_speed": 0.5, "noise": 0.0}),
@@ -177,16 +199,7 @@ def hanging() -> Strategy:
         description="A coat hanger is slid on to a rod from its free end, lowered and let go.",
         view="side",
         mode="plan",
-        tool_view=tool_view,
-        tool_contact=tool_contact,
-        target_view=seen,
-        target_contact=touched,
-        target_normal=normal,
-        target_view_direction=direction,
-        times=times,
-        target_from_tool=_trajectory(touched, contacts, tool_contact),
-        tool_mesh=tool.mesh,
-        target_mesh=target.mesh,
+        **_demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         goal=Goal("hang", {"height": 0.2, "max_speed": 0.5}),
         physics=Physics(friction=3.0, tool_density=600.0, target_density=2700.0, target_is_fixed=True),
@@ -274,16 +287,7 @@ def scooping() -> Strategy:
         description="A spoon, handle upright, pushes a ball on to a quarter pipe, turns it up and lifts it in the bowl.",
         view="section",
         mode="retarget",
-        tool_view=tool_view,
-        tool_contact=tool_contact,
-        target_view=seen,
-        target_contact=touched,
-        target_normal=normal,
-        target_view_direction=direction,
-        times=times,
-        target_from_tool=_trajectory(touched, contacts, tool_contact),
-        tool_mesh=tool.mesh,
-        target_mesh=target.mesh,
+        **_demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         goal=Goal("scoop", {"height": 0.2, "max_speed": 0.1}),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=300.0),

@@ -127,6 +127,24 @@ def shade(
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
+def frame_of_view(
+    mesh: Mesh, direction: ArrayLike, up: ArrayLike, size: int, fill: float
+) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+    """Where a square picture of a mesh looks from: object_from_view (4, 4), metres per pixel, and the mesh's extents (3,) in the view, m.
+
+    The view's z is ``direction``, its y as much down (against ``up``) as that allows; its origin is the middle of the mesh's box there.
+    The silhouette's larger side fills ``fill`` of the ``size`` pixels.
+    """
+    z = transforms.unit(direction)
+    up = np.asarray(up, dtype=float)
+    y = transforms.unit(-(up - (up @ z) * z))
+    rotation = np.column_stack([np.cross(y, z), y, z])
+    local = mesh.vertices @ rotation
+    low, high = local.min(axis=0), local.max(axis=0)
+    extents = high - low
+    return transforms.make(rotation, rotation @ ((low + high) / 2)), max(float(extents[:2].max()), 1e-6) / (fill * size), extents
+
+
 def canonical_view(
     mesh: Mesh,
     direction: ArrayLike,
@@ -140,19 +158,13 @@ def canonical_view(
 
     The picture is square; the silhouette's larger side fills ``fill`` of it.
     """
-    z = transforms.unit(direction)
-    up = np.asarray(up, dtype=float)
-    y = transforms.unit(-(up - (up @ z) * z))
-    rotation = np.column_stack([np.cross(y, z), y, z])
-    local = mesh.vertices @ rotation
-    low, high = local.min(axis=0), local.max(axis=0)
-    object_from_view = transforms.make(rotation, rotation @ ((low + high) / 2))
-    metres_per_pixel = max(float((high - low)[:2].max()), 1e-6) / (fill * size)
-    reach = float(high[2] - low[2]) / 2 + 0.01
+    object_from_view, metres_per_pixel, extents = frame_of_view(mesh, direction, up, size, fill)
+    x, y, z = object_from_view[:3, :3].T
+    reach = float(extents[2]) / 2 + 0.01
     # The object is centred: rays are needed only in the rectangle that it fills, two pixels of margin around it.
-    pad = np.maximum((size - 2 * np.ceil((high - low)[:2] / metres_per_pixel / 2).astype(int) - 4) // 2, 0)
+    pad = np.maximum((size - 2 * np.ceil(extents[:2] / metres_per_pixel / 2).astype(int) - 4) // 2, 0)
     cast, depth = Raycaster([mesh]).orthographic(object_from_view, (size - 2 * pad[1], size - 2 * pad[0]), metres_per_pixel, reach)
-    image = shade(cast, light=-z + 0.4 * np.cross(y, z) - 0.3 * y)
+    image = shade(cast, light=-z + 0.4 * x - 0.3 * y)
     border = ((pad[1], pad[1]), (pad[0], pad[0]))
     return CanonicalView(
         np.pad(image, (*border, (0, 0))), np.pad(cast.ids >= 0, border), metres_per_pixel, object_from_view, kind, np.pad(depth, border, constant_values=np.nan), confidence

@@ -3,31 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import re
 
+from magic_bringup.bag_file import nested_type
 from magic_ros2cli import packages
 from magic_ros2cli.errors import CommandError
-
-FIELD = re.compile(r"^\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[a-z]\w*\s*(?:$|[^=\s])")
-PRIMITIVES = frozenset(
-    [
-        "bool",
-        "byte",
-        "char",
-        "float32",
-        "float64",
-        "int8",
-        "uint8",
-        "int16",
-        "uint16",
-        "int32",
-        "uint32",
-        "int64",
-        "uint64",
-        "string",
-        "wstring",
-    ]
-)
 
 
 def definition(name: str) -> str:
@@ -57,12 +36,8 @@ def lines(name: str, comments: bool = True, nested_comments: bool = False, level
                 continue
             line = code.rstrip() if hash_sign else line
         result.append("\t" * level + line.rstrip())
-        field = FIELD.match(code)
-        if field and field["type"] not in PRIMITIVES:
-            kind = field["type"].split("/")
-            if kind == ["Header"]:
-                kind = ["std_msgs", "Header"]
-            nested = f"{kind[0] if len(kind) > 1 else name.split('/')[0]}/msg/{kind[-1]}"
+        nested = nested_type(code, name.split("/")[0])
+        if nested is not None:
             result += lines(nested, nested_comments, nested_comments, level + 1)
     return result
 

@@ -13,7 +13,7 @@ from magic_core import transforms
 from magic_core.contact import Contact, contact_frame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.rendering import VIEW_FILL, VIEW_SIZE, canonical_view
+from magic_core.rendering import VIEW_FILL, VIEW_SIZE, canonical_view, frame_of_view
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.shapes.solids import Part, join
 
@@ -141,15 +141,8 @@ def section_view(mesh: Mesh, direction: ArrayLike, up: ArrayLike, size: int = VI
     import cv2
     import shapely
 
-    z = transforms.unit(direction)
-    up = np.asarray(up, dtype=float)
-    y = transforms.unit(-(up - (up @ z) * z))
-    rotation = np.column_stack([np.cross(y, z), y, z])
-    local = mesh.vertices @ rotation
-    low, high = local.min(axis=0), local.max(axis=0)
-    object_from_view = transforms.make(rotation, rotation @ ((low + high) / 2))
-    metres_per_pixel = max(float((high - low)[:2].max()), 1e-6) / (fill * size)
-    cut = mesh.to_trimesh().section(plane_origin=object_from_view[:3, 3], plane_normal=z)
+    object_from_view, metres_per_pixel, _ = frame_of_view(mesh, direction, up, size, fill)
+    cut = mesh.to_trimesh().section(plane_origin=object_from_view[:3, 3], plane_normal=object_from_view[:3, 2])
     if cut is None:
         raise MagicError(Code.BAD_MESH, "mesh", "no cut with the plane through its middle", "a closed mesh")
     view_from_object = transforms.inverse(object_from_view)
