@@ -147,7 +147,7 @@ def test_parameters_reach_the_node_typed(file: Path, capfd: pytest.CaptureFixtur
 
 
 def test_exit_of_one_ends_all_and_respawn_stops_then(file: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    again = Process("again", (sys.executable, "-c", "pass"), respawn=True, respawn_delay=0.05)
+    again = Process("again", ("true",), respawn=True, respawn_delay=0.05)
     last = Process("last", ("sleep", "1.0"), ends_launch=True)
     waits = Process("waits", ("sleep", "60"))
     start = time.monotonic()
