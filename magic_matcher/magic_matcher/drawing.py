@@ -75,3 +75,10 @@ def side_by_side(pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str] = 
             column = np.concatenate([column, strip])
         columns.append(column)
     return np.concatenate(columns, axis=1)
+
+
+def sheet(pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str], columns: int, height: int) -> NDArray[np.uint8]:
+    """Pictures in rows of ``columns``, each scaled to one height, with its title below."""
+    rows = [side_by_side(pictures[k : k + columns], titles[k : k + columns], height) for k in range(0, len(pictures), columns)]
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=24) for row in rows])

@@ -8,6 +8,10 @@ A contact shown on one mesh (pixels of its canonical view, which is written as `
 
     ros2 run magic_matcher match_meshes --reference hanger.obj --kind side --reference-point 192 123 --radius 0.006 --tools mug.obj --out out
 
+All meshes of a folder, and shapes of the project's own generator (``FAMILY:SEED``), in rows of six::
+
+    ros2 run magic_matcher match_meshes --strategy hanging --radius 0.006 --tools meshes/ mug:7003 watch:7001 --columns 6 --out out
+
 Meshes that lie (``--kind top`` and ``section``) are laid on their broadest side first, unless ``--as-is``;
 a ``section`` is then turned bowl up only if its file has it so.  Writes ``matches.png`` and ``matches.json``.
 """
@@ -17,6 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import mesh as meshes
+from magic_core import shapes
 from magic_core import strategy as strategies
 from magic_core.contact import Contact
 from magic_core.errors import MagicError
@@ -33,6 +39,9 @@ from magic_core.views import find_view
 from magic_matcher import curvature, drawing, features, jobs, matching
 from magic_matcher.features import Reference, make_reference
 from magic_matcher.match_images import _number
+
+#: Mesh files that are looked for in a folder.
+SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".off", ".dae")
 
 
 def laid(mesh: Mesh) -> Mesh:
@@ -44,8 +53,25 @@ def laid(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices @ rotation.T, mesh.faces)
 
 
+def files(names: Sequence[str]) -> list[str]:
+    """What ``--tools`` means: files and shapes as they are, folders by the mesh files in them, in order of their names."""
+    result = []
+    for name in names:
+        if not Path(name).is_dir():
+            result.append(name)
+            continue
+        found = sorted(str(path) for path in Path(name).iterdir() if path.suffix.lower() in SUFFIXES)
+        if not found:
+            raise MagicError(matching.Code.BAD_REQUEST, "--tools", name, f"a folder with files of {', '.join(SUFFIXES)}")
+        result += found
+    return result
+
+
 def draw(path: str | Path, kind: str, as_is: bool) -> matching.Tool:
-    """A mesh file as a tool: its canonical view of a kind."""
+    """A mesh file, or a generated shape ``FAMILY:SEED``, as a tool: its canonical view of a kind."""
+    family, _, seed = str(path).partition(":")
+    if family in shapes.FAMILIES and seed.isdigit() and not Path(path).exists():
+        return matching.Tool(family, shapes.make(family, int(seed)).view(kind))
     mesh = meshes.load(path)
     mesh = mesh if as_is or kind == "side" else laid(mesh)
     return matching.Tool(Path(path).stem, find_view(mesh, None, kind))
@@ -69,7 +95,7 @@ def run(given: argparse.Namespace) -> tuple[dict[str, Any], NDArray[np.uint8]]:
     matcher = matching.Matcher(features.load(given.features, given.weights))
     target = jobs.disc_target(given.radius, kind)
     pictures, titles, rows = [drawing.draw_match(reference.view, contact)], ["reference"], []
-    for path in given.tools:
+    for path in files(given.tools):
         row: dict[str, Any] = {"tool": str(path)}
         try:
             tool = draw(path, kind, given.as_is)
@@ -95,7 +121,7 @@ def run(given: argparse.Namespace) -> tuple[dict[str, Any], NDArray[np.uint8]]:
         cv2.circle(picture, tuple(int(round(v)) for v in centre), int(round(pixels)), (90, 255, 90), 2, cv2.LINE_AA)
         pictures.append(picture)
         titles.append(tool.id[:24])
-    return {"radius": given.radius, "kind": kind, "matches": rows}, drawing.side_by_side(pictures, titles, 192)
+    return {"radius": given.radius, "kind": kind, "matches": rows}, drawing.sheet(pictures, titles, given.columns or len(pictures), 192)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -110,7 +136,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--reference-radius", type=float, help="radius of the target that the reference meets, m (default: --radius)")
     p.add_argument("--kind", default="side", choices=("top", "side", "section"), help="view, with --reference (default: side)")
     p.add_argument("--radius", type=float, required=True, help="radius of the target that the tools shall meet, m")
-    p.add_argument("--tools", nargs="+", required=True, metavar="MESH")
+    p.add_argument("--tools", nargs="+", required=True, metavar="MESH", help="mesh files, folders of them, or FAMILY:SEED of the generator")
+    p.add_argument("--columns", type=int, default=0, metavar="N", help="pictures in a row (default: all in one)")
     p.add_argument("--as-is", action="store_true", help="do not lay the meshes on their broadest side")
     p.add_argument("--features", default="auto", choices=features.BACKENDS)
     p.add_argument("--weights", default="", help="hub name or folder, for dinov2")
@@ -122,6 +149,8 @@ def main(argv: list[str] | None = None) -> None:
     """The command; errors are one line on stderr and exit status 2."""
     given = parser().parse_args(argv)
     try:
+        if given.columns < 0:
+            raise MagicError(matching.Code.BAD_REQUEST, "--columns", given.columns, "0 or more")
         if not (np.isfinite(given.radius) and given.radius > 0):
             raise MagicError(matching.Code.BAD_REQUEST, "--radius", given.radius, "a length in metres above 0")
         data, sheet = run(given)

@@ -104,3 +104,26 @@ def test_meshes_from_files(tmp_path, capsys):
     assert caught.value.code == 2 and "radius" in capsys.readouterr().err
     with pytest.raises(MagicError):
         match_meshes.draw(tmp_path / "nothing.obj", "top", True)
+
+
+def test_shapes_and_folders_of_meshes(tmp_path, capsys):
+    trimesh = pytest.importorskip("trimesh")
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("no mesh")
+    for name in ("a", "b"):
+        mesh = shapes.make("l_hook", ord(name)).mesh
+        trimesh.Trimesh(mesh.vertices, mesh.faces).export(folder / f"{name}.stl")
+    shape = shapes.make("l_hook", 3)
+    u, v = shape.contact("inner", shape.view("top")).pixel
+    shown = ["--reference", "l_hook:3", "--kind", "top", "--reference-point", str(u), str(v), "--radius", "0.02"]
+    match_meshes.main([*shown, "--tools", str(folder), "caliper:7001", "--columns", "2", "--out", str(tmp_path)])
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0].split("/")[-1] for line in said] == ["a.stl", "b.stl", "caliper"] and all("score" in line for line in said)
+    sheet = cv2.imread(str(tmp_path / "matches.png"))
+    assert sheet.shape[0] == 2 * (192 + 24) and sheet.shape[1] == 2 * 192
+    (tmp_path / "empty").mkdir()
+    for change in (["--tools", str(tmp_path / "empty")], ["--tools", "caliper:1", "--columns", "-1"]):
+        with pytest.raises(SystemExit) as caught:
+            match_meshes.main([*shown, *change, "--out", str(tmp_path)])
+        assert caught.value.code == 2 and "BAD_REQUEST" in capsys.readouterr().err
