@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from magic_bringup import execution
 from magic_bringup.testing import Bench, started, until
 from magic_core import conversions
 from magic_core.errors import Code
@@ -47,6 +48,10 @@ def check_trajectory(result, bench: Bench, variant: str) -> None:
     step = np.diff(arm.times)[:, None] * (arm.velocities[1:] + arm.velocities[:-1]) / 2
     np.testing.assert_allclose(np.diff(arm.positions, axis=0), step, atol=5e-3)
     np.testing.assert_allclose(arm.velocities[[0, -1]], 0, atol=1e-3)
+    # Arm and gripper can carry it out in turn: the arm stands wherever the fingers move.
+    release = np.nan if arm.release_time is None else arm.release_time
+    done = execution.steps(arm.times, arm.velocities, arm.grasp_time, release, arm.grasp_width, 0.08)
+    assert [type(step) for step in done[:4]] == [execution.Fingers, execution.Move] * 2
 
 
 def test_floating_gripper(replay):

@@ -1,0 +1,48 @@
+"""A verified plan is carried out by an arm and a gripper that speak the actions of real ones."""
+
+# In a file of its own: a graph that a module's fixture still holds would share its ROS context.
+
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from rclpy.executors import MultiThreadedExecutor
+
+from magic_bringup import fakes
+from magic_bringup.testing import started
+from magic_core.errors import Code
+
+BAG = Path(__file__).resolve().parents[1] / "bags" / "hanging"
+HOME = [0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4]
+SERVER = {"execute": True, "trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}
+
+
+def test_a_mug_is_hung_by_arm_and_gripper(tmp_path):
+    with started(tmp_path, BAG, {"strategy_server": SERVER}) as bench:
+        bench.ready()
+        bench.play(BAG)  # its joint states say the same as the arm's
+        arm = fakes.FakeArm(thickness=0.0)
+        arm.positions = list(HOME)
+        executor = MultiThreadedExecutor(4)
+        executor.add_node(arm)
+        thread = threading.Thread(target=executor.spin, daemon=True)
+        thread.start()
+        try:
+            result = bench.run(strategy="hanging", variant="arm", timeout=120.0)
+        finally:
+            executor.shutdown(timeout_sec=2.0)
+            arm.destroy_node()
+            thread.join(5.0)
+    assert (result.code, result.verified, result.executed) == (0, True, True), f"{Code(result.code).name}: {result.message}"
+    moves = [entry for entry in arm.log if not isinstance(entry, tuple)]
+    fingers = [entry for entry in arm.log if isinstance(entry, tuple)]
+    # To the mug, to the rod, away: each begins where the one before ended.
+    assert [f[0] for f in fingers] == ["open", "close", "open"]
+    assert fingers[1][1] == result.plan.grasp_width / 2
+    assert len(moves) == 3
+    np.testing.assert_allclose(moves[0].points[0].positions, HOME, atol=0.02)
+    for before, after in pairwise(moves):
+        np.testing.assert_allclose(before.points[-1].positions, after.points[0].positions)
+    assert sum(len(m.points) for m in moves) == len(result.plan.arm_trajectory.points) + 2
+    assert any(line.startswith("execute: step 5 of 6") for line in bench.lines), bench.lines
