@@ -10,7 +10,7 @@ is kept with its stage, and the failure that came furthest is the one reported.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from magic_core.strategy import Strategy
 from magic_planner import timing
 from magic_planner.budget import Budget
 from magic_planner.cloud import CloudSettings, cloud_name, unexplained
-from magic_planner.collision import Body, mass_centre, shell, solid_pieces
+from magic_planner.collision import Body, grown, mass_centre, shell, solid_pieces
 from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
 from magic_planner.object_motion import table_plane, tool_contact_frame, turning, waypoint_times
 from magic_planner.robot import Robot
@@ -41,7 +41,7 @@ STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", 
 class ArmSettings:
     """key_length, key_angle: spacing of the poses at which grasps are compared.  grasps: how many are compared at once, rounds:
     how many such lots.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
-    lift, retreat: metres.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
+    lift, retreat: metres.  room: metres about a tool that is carried.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
     neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path
     (searches take some 20 ms; the limit is wide so that a loaded machine finds the same path)."""
 
@@ -53,6 +53,7 @@ class ArmSettings:
     standoff: float = 0.08
     lift: float = 0.06
     retreat: float = 0.08
+    room: float = 0.015
     dwell: float = 0.5
     jump: float = 0.5
     time_step: float = 0.02
@@ -89,6 +90,15 @@ class Request:
     shapes: list[Any]  # the tool's surface
     marks: tuple[tuple[str, float], ...]  # names of the places the tool's motion passes, and when
     cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
+    _grown: dict[float, list[Any]] = field(default_factory=dict)
+
+    def roomy(self, margin: float) -> list[Any]:
+        """The tool's surface grown by ``margin`` metres."""
+        if margin <= 0:
+            return self.shapes
+        if margin not in self._grown:
+            self._grown[margin] = shell(grown(solid_pieces(self.tool), margin))
+        return self._grown[margin]
 
     def surroundings(self, target: bool = True) -> list[str]:
         """Names of all that is in the collision world besides table and tool; without the target on request."""
@@ -186,7 +196,10 @@ class ArmPlanner:
             feedback("task", f"without the tool's retreat, as {error.message}")
             until = motion.times <= ending.start + 1e-9
             shorter = ToolMotion(
-                motion.times[until], motion.world_from_tool[until], tuple(p for p in motion.phases if p.end <= ending.start + 1e-9)
+                motion.times[until],
+                motion.world_from_tool[until],
+                tuple(p for p in motion.phases if p.end <= ending.start + 1e-9),
+                tuple(m for m in motion.marks if m[1] <= ending.start + 1e-9),
             )
             return self._plan(*given, shorter, *rest)
 
@@ -239,7 +252,7 @@ class ArmPlanner:
             keys=self._keys(poses),
             met=next((p.start for p in motion.phases if p.name in ("contact", "goal")), float(times[-1])),
             shapes=shell(solid_pieces(tool)),
-            marks=waypoint_times(strategy),
+            marks=motion.marks or waypoint_times(strategy),
             cloud=unexplained((target, *obstacles), tool, plane, self.cloud),
         )
         self._build_world(request)
@@ -492,14 +505,14 @@ class ArmPlanner:
         request.feedback("timing", "time parameterisation")
         return self._timed(request, branch, come, pick, carry, task, retreat)
 
-    def _hold(self, request: Request, grasp: Grasp) -> None:
-        """The world with the tool in the closed hand; the tool may touch nothing else yet."""
+    def _hold(self, request: Request, grasp: Grasp, shapes: list[Any] | None = None) -> None:
+        """The world with the tool (or other shapes in its frame) in the closed hand; it may touch nothing else yet."""
         robot, name = self.robot, request.tool.id
         robot.detach()
         if robot.world.has_object(name):
             robot.world.remove_object(name)
         robot.open_to(grasp.width)
-        robot.attach(name, request.shapes, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
+        robot.attach(name, shapes or request.shapes, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
         robot.allow(name, "table", *request.surroundings(), allowed=False)
         self._ignore_target(request, False)
 
@@ -646,9 +659,10 @@ class ArmPlanner:
         return self._free(request, request.start, goal, "approach")
 
     def _carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
+        robot = self.robot
         self._hold(request, branch.grasp)
         for q, what in ((start, "lifted"), (goal, "at the start of the task")):
-            pair = self.robot.collision(q)
+            pair = robot.collision(q)
             if pair is not None:
                 raise StageError(
                     "transfer",
@@ -656,6 +670,21 @@ class ArmPlanner:
                         Code.PATH_IN_COLLISION, f"the tool {what}: {pair}", "in collision", "a tool in the hand clear of everything"
                     ),
                 )
+        # A tool shifts a little in the hand when it is gripped: it is carried with room about it, where its ends leave that.
+        for room in (self.settings.room, self.settings.room / 3):
+            self._hold(request, branch.grasp, request.roomy(room))
+            robot.allow(request.tool.id, "table")
+            if robot.collides(start) or robot.collides(goal):
+                continue
+            try:
+                path = self._free(request, start, goal, "transfer")
+            except StageError:
+                continue
+            # What was left out: the table, above which the task may begin by a hair.
+            self._hold(request, branch.grasp)
+            if robot.first_collision(timing.swept(path, 0.03), budget=request.budget, stage="transfer") is None:
+                return path
+        self._hold(request, branch.grasp)
         return self._free(request, start, goal, "transfer")
 
     def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
@@ -664,7 +693,7 @@ class ArmPlanner:
 
         robot = self.robot
         line = np.stack([start, goal])
-        if robot.first_collision(line, budget=request.budget, stage=stage) is None:
+        if robot.first_collision(line, step=0.03, budget=request.budget, stage=stage) is None:
             return line
         pair = robot.collision(start) or robot.collision(goal)
         if pair is not None:
@@ -678,9 +707,9 @@ class ArmPlanner:
             if not str(status).startswith("Exact"):
                 continue
             path = np.asarray(path, dtype=float)
-            # OMPL checks edges coarsely; a thin obstacle between two states is found here.
+            # OMPL checks edges coarsely, and a spline swings out at corners; what that meets is found here.
             for shorter in (_shorten(robot, path, rng, request.budget, stage), path):
-                if robot.first_collision(shorter, step=0.03, budget=request.budget, stage=stage) is None:
+                if robot.first_collision(timing.swept(shorter, 0.03), budget=request.budget, stage=stage) is None:
                     return shorter
         raise StageError(
             stage,
@@ -735,13 +764,13 @@ class ArmPlanner:
         track = timing.Track(robot.count)
         names: list[tuple[str, float]] = []
         try:
-            track.append(timing.parameterise(come, velocity, acceleration, step))
+            track.append(timing.parameterise(come, velocity, acceleration, step, corners=True))
             track.append(timing.parameterise(pick[0], velocity * 0.6, acceleration, step))
             grasp_time = track.now
             track.hold(settings.dwell, step)
             names.append(("grasp", track.now))
             track.append(timing.parameterise(pick[2], velocity * 0.6, acceleration, step))
-            track.append(timing.parameterise(carry, velocity, acceleration, step))
+            track.append(timing.parameterise(carry, velocity, acceleration, step, corners=True))
             names.append(("transfer", track.now))
             began = track.now
             clock = track.follow(request.times, task, self._rests(request), velocity, acceleration, step)
@@ -793,7 +822,7 @@ class ArmPlanner:
         if request.strategy.mode != "plan":
             return [0, last]
         found = {0, last}
-        for _, when in waypoint_times(request.strategy):
+        for _, when in request.marks:
             found.add(min(last, int(np.abs(request.times - when).argmin())))
         return sorted(found)
 

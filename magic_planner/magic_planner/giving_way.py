@@ -29,15 +29,17 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
-from magic_planner.collision import Body, hull, outermost, padded, solid_pieces
+from magic_planner.collision import Body, grown, hull, outermost, padded, solid_pieces
 
 Array = NDArray[np.float64]
-#: Gap kept between the tool and what it gives way to, metres.
+#: Gap kept between the tool and what it gives way to, metres: of a tool that is where it is led, and of one in a gripper, in
+#: which it shifts and turns a little when it is gripped and pushed.
 GAP = 0.001
+GAP_IN_HAND = 0.004
 #: Largest displacement, metres: a tool that would have to give way further does something else than was shown.
 MOST = 0.10
 #: Pieces whose boxes are nearer than this, metres, bound the displacement, which changes by less from one pose to the next.
-NEAR = 0.010
+NEAR = 0.012
 #: How far ahead, metres, the tool looks when it may step aside.
 LOOK_AHEAD = 0.04
 #: Least way, metres, over which a displacement is smoothed.
@@ -124,12 +126,13 @@ def give_way(
     plane: Array,
     clearance: float,
     name: Callable[[int], str] = lambda index: f"sample {index}",
+    gap: float = GAP,
 ) -> Array:
     """The path world_from_tool (T, 4, 4), displaced where it would lead the tool through the obstacles.
 
     The first pose is taken to be clear.  direction (3,): normal of the plane of the displacement, world axes.  plane (4,): the
     table, which the tool keeps ``clearance`` metres above.  A path that is clear comes back as it is.  ``name`` names a sample
-    in errors.
+    in errors.  ``gap``: metres that are kept to the obstacles where it gives way.
 
     Raises PATH_IN_COLLISION, naming sample, tool and obstacle, where the tool would have to give way by more than :data:`MOST`
     or is between two things.
@@ -139,13 +142,13 @@ def give_way(
     met: list[SceneObject] = []
     for item in obstacles:
         box = np.concatenate([transforms.apply(item.world_from_object, piece.vertices) for piece in solid_pieces(item)])
-        if np.all(box.min(axis=0) <= high) and np.all(box.max(axis=0) >= low):
+        if np.all(box.min(axis=0) <= high + gap) and np.all(box.max(axis=0) >= low - gap):
             met.append(item)
-    hits = _hits(world_from_tool, Body(tool.id, pieces), [Body.from_object(item) for item in met])
+    hits = _hits(world_from_tool, Body(tool.id, grown(pieces, gap) if gap > GAP else pieces), [Body.from_object(item) for item in met])
     if not hits.any():
         return world_from_tool
     walls = Pieces.of([piece.transformed(item.world_from_object) for item in met for piece in solid_pieces(item)])
-    walk = _Walk(world_from_tool, Pieces.of(pieces), walls, _basis(direction), plane, clearance)
+    walk = _Walk(world_from_tool, Pieces.of(pieces), walls, _basis(direction), plane, clearance, gap)
     first, last = int(hits.argmax()), len(hits) - int(hits[::-1].argmax())
     found = _both_walks(walk, first, last)
     if not _allowed(found).all():
@@ -221,13 +224,14 @@ def _smoothed(shifts: Array, poses: Array) -> Array:
 class _Walk:
     """One path, and the displacements that keep it clear."""
 
-    def __init__(self, poses: Array, tool: Pieces, walls: Pieces, basis: Array, plane: Array, clearance: float) -> None:
+    def __init__(self, poses: Array, tool: Pieces, walls: Pieces, basis: Array, plane: Array, clearance: float, gap: float = GAP) -> None:
         self.poses, self.tool, self.walls, self.basis = poses, tool, walls, basis
         #: Whether a pair may also be parted on a side from which the tool did not come, if that is a short step and the shortest
         #: way out LOOK_AHEAD further on.
         self.aside = False
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
         self.ahead = np.minimum(np.searchsorted(way, way + LOOK_AHEAD), len(poses) - 1)
+        self.gap = gap
         self.low, self.high = walls.corners.min(axis=1), walls.corners.max(axis=1)
         flat = plane[:3] @ basis
         length = float(np.linalg.norm(flat))
@@ -260,7 +264,7 @@ class _Walk:
             step = found - now
             size = float(np.linalg.norm(step))
             # What is further away than this was not looked at.  A part of the way keeps to the half spaces that now keeps to.
-            now = found if size <= NEAR - GAP or np.any(directions @ now < least) else now + step * ((NEAR - GAP) / size)
+            now = found if size <= NEAR - self.gap or np.any(directions @ now < least) else now + step * ((NEAR - self.gap) / size)
             before = self._pose(index, now)
             result[index] = now
         return result
@@ -282,22 +286,22 @@ class _Walk:
             return np.zeros((0, 2)), np.zeros(0)
         mine, theirs = np.nonzero(close)
         parted, _ = separations(self.tool, before, self.walls, mine, theirs)
-        gap, away = separations(self.tool, pose, self.walls, mine, theirs)
+        room, away = separations(self.tool, pose, self.walls, mine, theirs)
         # A face parts the pair at the pose before; where none does (two edges cross), the one that comes nearest to it.
         valid = parted >= np.minimum(parted.max(axis=1, keepdims=True), 0.0) - 1e-6
         flat = away @ self.basis
         length = np.sqrt(flat[..., 0] ** 2 + flat[..., 1] ** 2)
         steep = length <= IN_PLANE
         # Room across the plane is room too, as the displacement does not use it up.
-        across = (valid & steep & (gap > GAP)).any(axis=1)
-        out = (GAP - gap) / np.maximum(length, IN_PLANE)
+        across = (valid & steep & (room > self.gap)).any(axis=1)
+        out = (self.gap - room) / np.maximum(length, IN_PLANE)
         way = np.where(valid & ~steep, out, np.inf)
         best = way.argmin(axis=1)
         if ahead is not None:
             later, _ = separations(self.tool, ahead, self.walls, mine, theirs)
-            short = (valid | (out < NEAR - GAP)) & ~steep
+            short = (valid | (out < NEAR - self.gap)) & ~steep
             way = np.where(short, out, np.inf)
-            best = np.where(short, (GAP - later) / np.maximum(length, IN_PLANE), np.inf).argmin(axis=1)
+            best = np.where(short, (self.gap - later) / np.maximum(length, IN_PLANE), np.inf).argmin(axis=1)
         row = np.arange(len(mine)), best
         needed = way[row]
         taken = ~across & np.isfinite(needed) & (needed > -NEAR)

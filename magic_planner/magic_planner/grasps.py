@@ -32,7 +32,8 @@ class GraspSettings:
     angles: approach directions about the closing axis.  poses: hand poses tested in one lot.  looked: hand poses whose pads are
     looked at.  standoff: metres of straight way to the grasp.  clearance: metres kept between hand and table.
     margin: metres left on each side of the object in the open hand.  away: metres
-    around the contact in which no finger is placed.  force, density: of the slip estimate (N, kg/m^3)."""
+    around the contact in which no finger is placed.  force (N, what the contact pushes with) and density (kg/m^3) of the slip
+    estimate; grip_force: newtons of each finger; friction: coefficient between pad and tool."""
 
     agreement: float = 0.9
     samples: int = 500
@@ -46,6 +47,8 @@ class GraspSettings:
     away: float = 0.035
     force: float = 5.0
     density: float = 600.0
+    grip_force: float = 60.0
+    friction: float = 0.6
 
 
 @dataclass(frozen=True)
@@ -258,7 +261,16 @@ def propose(
     order = np.argsort(costs, kind="stable")
     looked = order[: settings.looked]
     costs[order[settings.looked :]] += 5.0
-    costs[looked] += _misfit(robot, frames[looked], widths[pair[looked]], pieces)
+    budget.check("grasp")
+    centred, shift = _centred(robot, frames[looked], pieces)
+    moved = np.flatnonzero(shift > 0.001)
+    if len(moved):
+        fits = (_heights(centred[moved], corners, poses, table) > settings.clearance * 0.5).all(axis=0)
+        for points, sweep in ((own, settings.standoff), (around[0], 0.0), (around[1], settings.standoff)):
+            fits[fits] = ~in_the_way(robot, centred[moved[fits]], nothing, points, sweep)
+        frames[looked[moved[fits]]] = centred[moved[fits]]
+    budget.check("grasp")
+    costs[looked] += _misfit(robot, frames[looked], widths[pair[looked]], pieces, terms)
     order = order[np.argsort(costs[order], kind="stable")]
     # The arm's reach decides in the end, so what comes first should differ: each further grasp of a neighbourhood stands back.
     seen: dict[tuple[int, ...], int] = {}
@@ -311,22 +323,76 @@ def pad_profiles(
     return heights.reshape(len(frames), across, deep, 2), grid
 
 
-def _misfit(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh]) -> NDArray[np.float64]:
+@dataclass(frozen=True)
+class Patches:
+    """Where the two pads (K = 2) of G grasps touch, by the cells of a grid on each pad.
+
+    first (G, K): height in metres at which each pad stops, -inf where it meets nothing; contact (G, across, deep, K): cells that
+    touch then; grid (across, deep, 2): the cells' places on the pad, metres.
+    """
+
+    first: NDArray[np.float64]
+    contact: NDArray[np.bool_]
+    heights: NDArray[np.float64]
+    grid: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh]) -> Patches:
+        """The patches of grasps (G, 4, 4)."""
+        heights, grid = pad_profiles(robot, frames, pieces)
+        first = heights.max(axis=(1, 2))
+        return cls(first, heights >= np.where(np.isfinite(first), first, np.inf)[:, None, None] - 0.001, heights, grid)
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """(G,) whether both pads meet something."""
+        return np.asarray(np.isfinite(self.first).all(axis=1))
+
+    def middles(self) -> NDArray[np.float64]:
+        """(G, K, 2): the middle of each pad's patch on the pad, metres."""
+        count = self.contact.sum(axis=(1, 2))
+        return np.asarray(np.einsum("gadk,adj->gkj", self.contact, self.grid) / np.maximum(count, 1)[..., None])
+
+    def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Of the smaller patch: mean distance (G,) of its cells from its middle, and half its extent (G, 2) across and along the
+        fingers; half a cell is added to each, for a cell is not a point.  Metres."""
+        cell = np.array([np.abs(np.diff(self.grid[..., 0], axis=0)).mean(), np.abs(np.diff(self.grid[..., 1], axis=1)).mean()])
+        offsets = self.grid[None, :, :, None, :] - self.middles()[:, None, None]
+        count = np.maximum(self.contact.sum(axis=(1, 2)), 1)
+        arm = (np.linalg.norm(offsets, axis=-1) * self.contact).sum(axis=(1, 2)) / count + np.hypot(*cell) / 8
+        half = (np.abs(offsets) * self.contact[..., None]).max(axis=(1, 2)) + cell / 4
+        return arm.min(axis=1), half.min(axis=1)
+
+
+def _centred(robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Grasps (G, 4, 4) moved, within the plane of the pads, so that the middles of what the pads touch come to their middles; and
+    by how much (G,), metres."""
+    if not len(frames):
+        return frames, np.zeros(0)
+    patches = Patches.of(robot, frames, pieces)
+    shift = np.where(patches.there[:, None], patches.middles().mean(axis=1), 0.0)
+    index = "xy".index(robot.config.closing_axis)
+    result = frames.copy()
+    result[:, :3, 3] += shift[:, :1] * frames[:, :3, 1 - index] + shift[:, 1:] * frames[:, :3, 2]
+    return result, np.linalg.norm(shift, axis=1)
+
+
+def _misfit(
+    robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], terms: _Terms | None = None
+) -> NDArray[np.float64]:
     """(G,) cost of finger pads that do not lie flat on opposite faces: what is gripped so is shoved, turns or slips when they close.
 
     From the heights under the pads: how far a pad is stopped by something else before it is where the grasp wants it (1 a
     centimetre), how far the middles of the two contact areas are from opposite (1 a centimetre), how far the faces are tilted
-    (2 a radian), how little of the pad is on them (1.0 where nothing is), and how far off the middle the tool is (1 for 2 cm).
+    (2 a radian), how little of the pad is on them (1.0 where nothing is), how far off the middle the tool is (1 for 2 cm), how far
+    out on the pads (1.6 at their edges: what is held by the edge alone is squeezed out), and how much of what the patches can hold the motion asks of them (1 for half, 4 for all, up to 9).
     """
     if not len(frames):
         return np.zeros(0)
-    heights, grid = pad_profiles(robot, frames, pieces)
-    first = heights.max(axis=(1, 2))  # (G, 2): where each pad stops
-    there = np.isfinite(first).all(axis=1)
-    contact = heights >= np.where(np.isfinite(first), first, np.inf)[:, None, None] - 0.001
-    count = contact.sum(axis=(1, 2))
-    middles = np.einsum("gadk,adj->gkj", contact, grid) / np.maximum(count, 1)[..., None]
-    share = count.min(axis=1) / (grid.shape[0] * grid.shape[1])
+    patches = Patches.of(robot, frames, pieces)
+    heights, grid, first, there = patches.heights, patches.grid, patches.first, patches.there
+    middles = patches.middles()
+    share = patches.contact.sum(axis=(1, 2)).min(axis=1) / (grid.shape[0] * grid.shape[1])
     safe = np.where(np.isfinite(first), first, 0.0)
     early = np.maximum(0.0, safe - widths[:, None] / 2).sum(axis=1)
     tilts = np.zeros(len(frames))
@@ -338,14 +404,17 @@ def _misfit(robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float6
         with np.errstate(invalid="ignore"):
             slopes = np.where(both, np.minimum(np.abs(ends[0] - ends[1]) / (step * (inner.shape[axis] - 1)), 0.6), 0.0)
         tilts += (slopes.sum(axis=1) / np.maximum(both.sum(axis=1), 1)).sum(axis=1) / 2
+    used = terms.used(robot, frames, *patches.spans()) if terms is not None else 0.0
     cost = (
         np.minimum(early / 0.01, 3.0)
         + np.linalg.norm(middles[:, 0] - middles[:, 1], axis=1) / 0.01
         + 2.0 * tilts
         + np.maximum(0.0, 1 - share / 0.5)
         + np.abs(safe[:, 0] - safe[:, 1]) / 2 / 0.02
+        + 2.0 * np.maximum(0.0, np.linalg.norm(middles.mean(axis=1) / np.abs(grid).max(axis=(0, 1)), axis=1) - 0.2)
+        + np.minimum((used / 0.5) ** 2, 9.0)
     )
-    return np.where(there, cost, 5.0)
+    return np.where(there, cost, 12.0)
 
 
 def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
@@ -408,6 +477,7 @@ class _Terms:
         self.weights = -np.einsum("kji,j->ki", poses[:, :3, :3], table[:3]) * volume * settings.density * 9.81
         self.up = poses[0, :3, :3].T @ table[:3]
         self.opening = robot.config.opening
+        self.grip, self.friction = settings.grip_force, settings.friction
 
     def of_pairs(self, centres: NDArray[np.float64], closing: NDArray[np.float64], widths: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M,): torque that the fingers must hold by friction, nearness to the contact, distance from the guidance point, width."""
@@ -423,6 +493,28 @@ class _Terms:
             + 0.8 * near
             + (widths / self.opening) ** 2
         )
+
+    def used(self, robot: Robot, frames: NDArray[np.float64], arm: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(G,) the share of what the pads can hold that the motion asks for, at its worst: 1 is the verge of slipping.
+
+        Two patches pressed with N each hold by friction a force 2 mu N along the pads and a torque 2 mu N r about the closing
+        axis, r = ``arm`` (G,) the mean distance of a patch from its middle; and by the shift of the pressure within the patches
+        a torque 2 N h about the other axes, h = ``half`` (G, 2) their half extents.  The loads: the tool's weight at each of the
+        motion's poses, without and with the contact's push.  The three shares are added up, which errs on the safe side.
+        """
+        index = "xy".index(robot.config.closing_axis)
+        origin, closing, across, along = frames[:, :3, 3], frames[:, :3, index], frames[:, :3, 1 - index], frames[:, :3, 2]
+        forces = np.concatenate([self.weights, self.weights + self.force])
+        hang = np.cross((self.centre - origin)[:, None], self.weights[None])
+        push = np.cross(self.contact - origin, self.force)[:, None]
+        torques = np.concatenate([hang, hang + push], axis=1)  # (G, 2K, 3)
+        grip, rub = self.grip, self.friction * self.grip
+        tangential = np.linalg.norm(forces[None] - (forces @ closing.T).T[..., None] * closing[:, None], axis=2)
+        about = [np.abs(np.einsum("gkj,gj->gk", torques, axis)) for axis in (closing, across, along)]
+        share = tangential / (2 * rub) + about[0] / (2 * rub * arm)[:, None]
+        # A torque about the line across the fingers moves the pressure along them, and the other way round.
+        share += about[1] / (2 * grip * half[:, 1])[:, None] + about[2] / (2 * grip * half[:, 0])[:, None]
+        return np.asarray(share.max(axis=1))
 
     def of_approach(self, frames: NDArray[np.float64], back: NDArray[np.float64]) -> NDArray[np.float64]:
         """(G,): an approach that is not from above, fingers drawn back by ``back`` metres."""

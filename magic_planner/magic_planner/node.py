@@ -20,6 +20,7 @@ from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import describe, parameter, run
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
+from magic_planner.giving_way import GAP, GAP_IN_HAND
 from magic_planner.object_motion import plan_tool_motion
 
 
@@ -157,7 +158,8 @@ class PlannerNode(Node):
         candidate = convert.candidate_from_msg(goal.candidate)
         table = convert.plane_from_msg(goal.table)
         reflection = goal.reflection or "keep"
-        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles)
+        gap = GAP_IN_HAND if goal.variant == "arm" else GAP
+        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap)
         budget.check("motion")
         if goal.variant == "fg":
             if goal.attempt:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.motion import Phase, ToolMotion
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy
-from magic_planner.collision import Body, outer_points, solid_pieces
-from magic_planner.giving_way import give_way
+from magic_planner.collision import Body, grown, outer_points, solid_pieces
+from magic_planner.giving_way import GAP, give_way
 
 #: Largest step between two samples: metres, radians.
 STEP_LENGTH = 0.005
@@ -38,6 +39,11 @@ ACCELERATION = 1.0
 DWELL = 0.5
 
 
+#: By how much an approach is drawn in, in order of trial, and the room in metres that it then keeps.
+SHARES = (1.0, 0.75, 0.55, 0.4, 0.28, 0.2, 0.12)
+MARGIN = 0.0015
+
+
 def plan_tool_motion(
     strategy: Strategy,
     tool: SceneObject,
@@ -46,12 +52,14 @@ def plan_tool_motion(
     reflection: str = "keep",
     table: NDArray[np.float64] | Sequence[float] = (0.0, 0.0, 1.0, 0.0),
     obstacles: Sequence[SceneObject] = (),
+    gap: float = GAP,
 ) -> ToolMotion:
     """The motion of a new tool that brings its contact onto the target's as the demonstration did.
 
     reflection: for a mirrored candidate, ``turn`` turns the tool over (exact), ``keep`` keeps its
     face (the mirrored part of the likeness is lost); without effect on other candidates.
-    table (4,): plane a x + b y + c z + d = 0 in world coordinates, unit normal up.
+    table (4,): plane a x + b y + c z + d = 0 in world coordinates, unit normal up.  gap: metres that the tool keeps to an
+    obstacle that it has to give way to (:mod:`magic_planner.giving_way`).
 
     A strategy that releases ends with its phase ``release``: the tool has left the hand, and
     waypoints after that are the hand's own.
@@ -76,6 +84,8 @@ def plan_tool_motion(
     tool_from_contact = tool_contact_frame(candidate, reflection)
 
     if strategy.mode == "plan":
+        waypoint_motion(strategy)  # what is wrong with the waypoints is said before they are changed
+        strategy = drawn_in(strategy, tool, target, (world_from_target @ target_from_contact), transforms.inverse(tool_from_contact))
         times, contacts, phases = waypoint_motion(strategy)
     elif strategy.mode == "retarget":
         times, contacts, phases = demonstrated_motion(strategy)
@@ -100,14 +110,68 @@ def plan_tool_motion(
         ahead = next((n for n, t in marks if t >= times[index] - 1e-6), marks[-1][0])
         return f"waypoint {ahead!r} (at {times[index]:.2f} s of the tool's motion)"
 
-    world_from_tool = give_way(world_from_tool, tool, obstacles, direction, plane, TABLE_CLEARANCE, name)
-    return ToolMotion(times, world_from_tool, phases)
+    world_from_tool = give_way(world_from_tool, tool, obstacles, direction, plane, TABLE_CLEARANCE, name, gap)
+    return ToolMotion(times, world_from_tool, phases, marks)
 
 
 def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:
     """tool_from_contact (4, 4) that is led along: turned over for a mirrored match that is to be turned."""
     tool_from_contact = _rigid(candidate.tool.object_from_contact, f"contact frame of {candidate.tool_id or 'the tool'}")
     return turned_over(tool_from_contact) if candidate.flipped and reflection == "turn" else tool_from_contact
+
+
+def drawn_in(
+    strategy: Strategy,
+    tool: SceneObject,
+    target: SceneObject,
+    world_from_contact: NDArray[np.float64],
+    contact_from_tool: NDArray[np.float64],
+) -> Strategy:
+    """The strategy with its approach and its retreat drawn in to the contact where the tool would meet the target on the way.
+
+    A ring that is lowered over a target has less room than a hook that comes from the open side.  Offsets across the view
+    direction are scaled, of the approach's waypoints from that of the contact, of the retreat's from that of the goal; the
+    largest of :data:`SHARES` counts at which the approach keeps :data:`MARGIN` clear of the target.  Where none does, or the
+    strategy has no approach that ends in a contact, it comes back as it is.
+    """
+    waypoints = list(strategy.waypoints)
+    meets = next((i for i, w in enumerate(waypoints) if w.phase != "approach"), 0)
+    if meets == 0 or waypoints[meets].phase != "contact":
+        return strategy
+    held = Body(tool.id, solid_pieces(tool))
+    fixed = Body.from_object(target)
+    roomy: Body | None = None
+    for share in SHARES:
+        changed = _scaled(strategy, meets, share)
+        times, contacts, phases = waypoint_motion(changed)
+        poses = world_from_contact @ contacts[times <= phases[0].end + 1e-9] @ contact_from_tool
+        if share < 1 and roomy is None:
+            roomy = Body(target.id, grown(solid_pieces(target), MARGIN))
+            roomy.move(target.world_from_object)
+        if not _touches_on(held, poses, fixed if roomy is None else roomy):
+            return changed
+    return strategy
+
+
+def _touches_on(body: Body, poses: NDArray[np.float64], other: Body) -> bool:
+    for pose in poses[::-1]:
+        body.move(pose)
+        if body.touches(other):
+            return True
+    return False
+
+
+def _scaled(strategy: Strategy, meets: int, share: float) -> Strategy:
+    if share == 1:
+        return strategy
+    waypoints, across = list(strategy.waypoints), np.array([share, share, 1.0])
+    contact = np.asarray(waypoints[meets].offset, dtype=float)
+    goal = np.asarray(next((w.offset for w in reversed(waypoints) if w.phase == "goal"), contact), dtype=float)
+    for i, waypoint in enumerate(waypoints):
+        origin = contact if i < meets else goal if waypoint.phase == "retreat" else None
+        if origin is not None:
+            waypoints[i] = replace(waypoint, offset=origin + across * (np.asarray(waypoint.offset, dtype=float) - origin))
+    return replace(strategy, waypoints=tuple(waypoints))
 
 
 def waypoint_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Phase, ...]]:

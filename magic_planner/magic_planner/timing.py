@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 Array = NDArray[np.float64]
 #: TOPP-RA holds its limits at grid points; this share is kept for what lies between.
@@ -48,22 +49,39 @@ def _toppra(knots: Array, rows: Array, velocity: Array, acceleration: Array, ste
     return times, q, qd, qdd
 
 
-def parameterise(path: Array, velocity: Array, acceleration: Array, step: float) -> tuple[Array, Array, Array, Array]:
-    """Time a joint path (n, J) of straight pieces, at rest at both ends: times (m,), positions, velocities, accelerations (m, J).
+def knots(path: Array, corners: bool = False) -> tuple[Array, Array]:
+    """Knots (m,) and points (m, J) of the spline that is laid through a joint path (n, J); no more than one where nothing moves.
 
-    Straight pieces are cut finer before the spline is laid through them, so that it stays near the checked path.
+    Straight pieces are cut finer before, so that the spline stays near them; ``corners``: as fine as a path with sharp
+    corners wants it, about which a spline swings out.
     """
     keep = np.concatenate([[True], np.abs(np.diff(path, axis=0)).max(axis=1) > 1e-7])
     path = path[keep]
-    if len(path) < 2:
-        return np.zeros(1), path[:1], np.zeros_like(path[:1]), np.zeros_like(path[:1])
     rows = [path[:1]]
     for a, b in itertools.pairwise(path):
-        parts = max(1 if len(path) > 6 else 4, int(np.ceil(np.abs(b - a).max() / 0.15)))
+        parts = max(4 if corners or len(path) <= 6 else 1, int(np.ceil(np.abs(b - a).max() / (0.08 if corners else 0.15))))
         rows.append(a + (b - a) * np.linspace(0, 1, parts + 1)[1:, None])
     points = np.concatenate(rows)
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return _toppra(lengths, points, velocity, acceleration, step)
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]), points
+
+
+def swept(path: Array, step: float) -> Array:
+    """Joint positions (m, J), at most ``step`` rad apart, that a free motion along a path (n, J) with corners will pass."""
+    at, points = knots(path, corners=True)
+    if len(points) < 2:
+        return points
+    spline = CubicSpline(at, points)
+    return np.asarray(spline(np.linspace(at[0], at[-1], int(np.ceil(at[-1] / step)) + 1)))
+
+
+def parameterise(
+    path: Array, velocity: Array, acceleration: Array, step: float, corners: bool = False
+) -> tuple[Array, Array, Array, Array]:
+    """Time a joint path (n, J) of straight pieces, at rest at both ends: times (m,), positions, velocities, accelerations (m, J)."""
+    at, points = knots(path, corners)
+    if len(points) < 2:
+        return np.zeros(1), points, np.zeros_like(points), np.zeros_like(points)
+    return _toppra(at, points, velocity, acceleration, step)
 
 
 class Track:

@@ -12,7 +12,9 @@ import pytest
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.strategy import Waypoint
+from magic_planner import timing
 from magic_planner.budget import Budget
+from magic_planner.collision import Body, grown
 from magic_planner.object_motion import plan_tool_motion
 
 
@@ -214,3 +216,28 @@ def test_a_retreat_out_of_reach_is_left_out(arm):
     assert given[-1].phases[-1].name == "retreat"
     plan = arm.plan(*given)
     assert [p.name for p in plan.arm_motion.phases][-1] == "goal"
+
+
+def test_a_free_motion_is_clear_as_it_is_timed_and_not_only_as_it_was_found(arm):
+    """The spline through the corners of a path swings out; what it meets is looked for on the spline."""
+    corner = np.zeros((3, 7))
+    corner[1, 0], corner[2, :2] = 1.0, 1.0
+    passed = timing.swept(corner, 0.02)
+    assert np.abs(passed[:, 0] - np.clip(passed[:, 0], 0, 1)).max() < 0.01
+    assert np.abs(np.diff(passed, axis=0)).max() < 0.025
+    strategy, tool, target, candidate, reflection, motion = problem()
+    post = scenes.item("post", [scenes.box([0.06, 0.06, 0.5])], transforms.make(translation=[0.45, 0.08, 0.25]))
+    plan = arm.plan(strategy, tool, target, candidate, reflection, motion, obstacles=(post,))
+    held, fixed = Body("tool", tool.pieces), Body.from_object(post)
+    carried = (plan.arm_motion.times > span(plan, "grasp").end) & (plan.arm_motion.times < span(plan, "transfer").end)
+    gaps = []
+    for pose in plan.tool_motion.world_from_tool[carried]:
+        held.move(pose)
+        gaps.append(held.touches(fixed))
+    assert not any(gaps)
+
+
+def test_a_carried_tool_keeps_room_about_it():
+    box = scenes.box([0.1, 0.1, 0.1])
+    (large,) = grown([box], 0.01)
+    np.testing.assert_allclose(np.ptp(large.vertices, axis=0), 0.12)

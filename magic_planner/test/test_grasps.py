@@ -11,7 +11,18 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, hull, mass_centre
-from magic_planner.grasps import GraspSettings, _misfit, antipodal, collision_free, in_the_way, pad_profiles, propose
+from magic_planner.grasps import (
+    GraspSettings,
+    Patches,
+    _centred,
+    _misfit,
+    _Terms,
+    antipodal,
+    collision_free,
+    in_the_way,
+    pad_profiles,
+    propose,
+)
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 
@@ -126,7 +137,49 @@ def test_pads_that_meet_flat_opposite_faces_are_preferred(arm):
     askew = _misfit(arm.robot, transforms.from_rpy(0, 0, np.deg2rad(15))[None], widths, [bar])[0]
     end = _misfit(arm.robot, transforms.make(translation=[0.103, 0, 0])[None], widths, [bar])[0]  # the pads hang over the bar's end
     assert ledge > 2 and askew > 0.4 and end > 0.15
-    assert _misfit(arm.robot, transforms.make(translation=[0.3, 0, 0])[None], widths, [bar])[0] == 5.0
+    assert _misfit(arm.robot, transforms.make(translation=[0.3, 0, 0])[None], widths, [bar])[0] == 12.0
+
+
+def test_patches_are_as_large_as_what_the_pads_touch(arm):
+    frame = np.eye(4)[None]
+    whole = Patches.of(arm.robot, frame, [scenes.box([0.2, 0.02, 0.1])])
+    line = Patches.of(arm.robot, frame, [scenes.box([0.2, 0.02, 0.002])])
+    point = Patches.of(arm.robot, frame, [scenes.box([0.002, 0.02, 0.002])])
+    assert whole.there.all() and whole.contact.all()
+    arms = [float(p.spans()[0][0]) for p in (whole, line, point)]
+    assert arms[0] == pytest.approx(0.0085, abs=0.002)  # the mean distance from the middle of a rectangle of 17.6 by 17 mm
+    assert arms[1] == pytest.approx(0.0055, abs=0.0015)  # of a line of 17.6 mm: a quarter of it, and a bit for its breadth
+    assert arms[2] < 0.001
+    assert point.spans()[1].max() < 0.002 < line.spans()[1][0, 0]
+    assert not Patches.of(arm.robot, transforms.make(translation=[0, 0, 0.3])[None], [scenes.box([0.2, 0.02, 0.02])]).there.any()
+
+
+def test_a_grip_by_the_edge_of_the_pads_is_moved_to_their_middle(arm):
+    bar = [scenes.box([0.2, 0.02, 0.004])]
+    frames = np.stack([np.eye(4), transforms.make(translation=[0, 0, -0.006])])
+    moved, shift = _centred(arm.robot, frames, bar)
+    np.testing.assert_allclose(moved[:, 2, 3], 0, atol=0.0025)
+    assert shift[0] < 0.0025 < 0.003 < shift[1]
+    np.testing.assert_allclose(moved[:, :2, 3], 0, atol=1e-6)
+    assert _misfit(arm.robot, moved[1:], np.array([0.02]), bar)[0] < _misfit(arm.robot, frames[1:], np.array([0.02]), bar)[0]
+
+
+def test_what_the_pads_are_asked_to_hold_is_weight_and_lever(arm):
+    """A bar of known mass held level at a known distance from its middle: force and torque by hand."""
+    bar = [scenes.box([0.4, 0.02, 0.02])]
+    settings = GraspSettings(density=1000.0, force=0.0, grip_force=50.0, friction=0.5)
+    contact = transforms.make(translation=[0.2, 0, 0])
+    terms = _Terms(bar, contact, np.eye(4)[None], TABLE, arm.robot, settings)
+    weight = 0.4 * 0.02 * 0.02 * 1000 * 9.81
+    spans = np.array([0.008]), np.array([[0.009, 0.009]])
+    held = np.stack([transforms.from_rpy(np.pi, 0, 0, [x, 0, 0]) for x in (0.0, 0.1)])
+    used = terms.used(arm.robot, held, np.repeat(spans[0], 2), np.repeat(spans[1], 2, axis=0))
+    assert used[0] == pytest.approx(weight / (2 * 0.5 * 50))
+    # The lever lies across the closing axis (y), so the torque is about it: friction in the patches holds it.
+    assert used[1] == pytest.approx(weight / (2 * 0.5 * 50) + 0.1 * weight / (2 * 0.5 * 50 * 0.008))
+    upright = np.stack([transforms.from_rpy(0, -np.pi / 2, 0)])
+    terms = _Terms(bar, contact, upright, TABLE, arm.robot, settings)
+    assert terms.used(arm.robot, held[1:], *spans)[0] == pytest.approx(weight / (2 * 0.5 * 50)), "hung from above, no lever is left"
 
 
 def test_points_in_the_hand_are_found_and_points_between_the_fingers_are_not(arm):

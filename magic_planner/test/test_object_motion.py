@@ -15,6 +15,7 @@ from magic_core import transforms
 from magic_core.contact import OPPOSED, turned_over
 from magic_core.errors import Code, MagicError
 from magic_core.strategy import Waypoint
+from magic_planner.collision import Body
 from magic_planner.object_motion import STEP_LENGTH, TABLE_CLEARANCE, plan_tool_motion, straight_line
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -264,3 +265,46 @@ def test_a_candidate_takes_under_a_tenth_of_a_second():
     start = time.perf_counter()
     plan_tool_motion(strategy, tool, target, candidate)
     assert time.perf_counter() - start < 0.1
+
+
+def ring(radius=0.04, thickness=0.006, parts=24):
+    """A ring lying flat, its contact inside at +x, which faces the middle."""
+    turns = np.arange(parts) * 2 * np.pi / parts
+    length = 2 * (radius + thickness) * np.tan(np.pi / parts)
+    pieces = [
+        scenes.box([thickness, length, 0.02]).transformed(
+            transforms.from_rpy(0, 0, t, [np.cos(t) * (radius + thickness / 2), np.sin(t) * (radius + thickness / 2), 0])
+        )
+        for t in turns
+    ]
+    tool = scenes.item("tool", pieces, transforms.from_rpy(0, 0, 0, [0.45, 0.25, 0.01]), scenes.DOWN)
+    return tool, scenes.contact(scenes.DOWN, [radius, 0, 0], [-1, 0, 0])
+
+
+def test_a_ring_is_lowered_over_its_target_where_the_hook_comes_from_behind():
+    """The demonstrated approach comes down 30 mm behind the target, where the ring's other side would land on it."""
+    tool, tool_contact = ring()
+    target, target_contact = scenes.standing_cylinder(0.025)
+    motion = plan_tool_motion(scenes.pulling(), tool, target, scenes.candidate(tool, tool_contact, target_contact))
+    body, other = Body("tool", tool.pieces), Body.from_object(target)
+    approach = motion.world_from_tool[motion.times <= motion.phases[0].end + 1e-9]
+    for pose in approach:
+        body.move(pose)
+        assert not body.touches(other)
+    offset = approach[-1, 0, 3] + 0.04 - (0.6 + 0.025)
+    assert 0.0015 < offset < 0.03
+    assert dict(motion.marks)["behind"] == pytest.approx(motion.phases[0].end)
+    met = at(motion, contact_end(motion)) @ tool_contact.object_from_contact
+    np.testing.assert_allclose(met[:3, 3], (target.world_from_object @ target_contact.object_from_contact)[:3, 3], atol=1e-9)
+
+
+def test_an_approach_with_room_is_left_as_it_is_and_so_is_one_without_hope():
+    strategy, tool, target, candidate = setup()
+    motion = plan_tool_motion(strategy, tool, target, candidate)
+    start = motion.world_from_tool[0] @ candidate.tool.object_from_contact
+    expected = target.world_from_object @ candidate.target.object_from_contact @ transforms.make(translation=[0.03, 0, -0.10])
+    np.testing.assert_allclose(start[:3, 3], expected[:3, 3], atol=1e-9)
+    tool, tool_contact = ring(radius=0.02)  # narrower than the target
+    candidate = scenes.candidate(tool, tool_contact, candidate.target)
+    start = plan_tool_motion(strategy, tool, target, candidate).world_from_tool[0] @ tool_contact.object_from_contact
+    np.testing.assert_allclose(start[:3, 3], expected[:3, 3], atol=1e-9)

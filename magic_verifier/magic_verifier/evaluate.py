@@ -378,6 +378,7 @@ def _try(
     answer: dict[str, Any],
 ) -> tuple[dict[str, Any], Any, bool]:
     from magic_core.motion import MotionPlan
+    from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
     from magic_verifier.verification import verify
 
@@ -386,7 +387,8 @@ def _try(
     for attempt in range(ARM_ATTEMPTS if options.variant == "arm" and options.method != "no_verification" else 1):
         started = time.perf_counter()
         try:
-            motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles)
+            gap = GAP_IN_HAND if options.variant == "arm" else GAP
+            motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles, gap)
             if options.variant == "arm":
                 from magic_planner.budget import Budget
 

@@ -25,11 +25,16 @@ class Phase:
 
 @dataclass(frozen=True)
 class ToolMotion:
-    """times (T,) seconds from 0, strictly increasing; world_from_tool (T, 4, 4)."""
+    """times (T,) seconds from 0, strictly increasing; world_from_tool (T, 4, 4).
+
+    marks: names of the places that the motion passes and when, in seconds, in order of time (for messages and for
+    the arm's timing; they are not sent with the motion).
+    """
 
     times: NDArray[np.float64]
     world_from_tool: NDArray[np.float64]
     phases: tuple[Phase, ...] = ()
+    marks: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         times = np.asarray(self.times, dtype=float)
