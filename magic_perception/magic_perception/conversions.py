@@ -40,9 +40,13 @@ def markers(scene: Scene) -> MarkerArray:
     for i, item in enumerate(scene.objects):
         color = PALETTE[i % len(PALETTE)] if item.source == "camera" else (0.6, 0.6, 0.6)
         mesh = add("meshes", i, Marker.TRIANGLE_LIST, item.world_from_object, color, 0.9)
-        mesh.points = [Point(x=x, y=y, z=z) for x, y, z in item.mesh.vertices[item.mesh.faces.ravel()].tolist()]
+        # One Python object for each vertex, not for each corner of a triangle: making them is what takes the time.
+        corners_of_faces = item.mesh.faces.ravel().tolist()
+        points = [Point(x=x, y=y, z=z) for x, y, z in item.mesh.vertices.tolist()]
+        mesh.points = [points[k] for k in corners_of_faces]
         if item.mesh.colors is not None:
-            mesh.colors = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in (item.mesh.colors[item.mesh.faces.ravel()] / 255.0).tolist()]
+            colors = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in (item.mesh.colors / 255.0).tolist()]
+            mesh.colors = [colors[k] for k in corners_of_faces]
         if np.all(item.box_extents > 0):
             box = add("boxes", i, Marker.LINE_LIST, item.world_from_box, color, 1.0)
             box.scale = Vector3(x=0.0015, y=0.0, z=0.0)
