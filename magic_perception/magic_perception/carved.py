@@ -16,8 +16,8 @@ from magic_perception.sight import Sight, surfaces
 from magic_perception.solids import Reconstruction, joined
 
 
-def build_carved(sights: list[Sight], noise: float, cells: int = 60000, block: float = 0.012) -> Reconstruction:
-    """The carved solid.  ``cells``: of the grid, at most, none smaller than 2 mm; ``block``: metres, size of the pieces before they are joined."""
+def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: int = 6000) -> Reconstruction:
+    """The carved solid.  ``cells``: of the grid, at most, none smaller than 2 mm; ``faces``: of the mesh, at most."""
     points, _ = surfaces(sights)
     low = np.append(np.percentile(points[:, :2], 0.5, axis=0) - 0.008, 0.0)
     high = np.percentile(points, 99.5, axis=0) + [0.008, 0.008, 0.003]
@@ -37,8 +37,8 @@ def build_carved(sights: list[Sight], noise: float, cells: int = 60000, block: f
     field = _largest(_blurred(field, 0.7))
     if np.count_nonzero(field > 0.5) < 20:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "carved cells of one object", int(np.count_nonzero(field > 0.5)), "at least 20")
-    mesh = level_surface(field, axes, 0.5)
-    return Reconstruction(mesh, tuple(_pieces(mesh, field, axes, cell, block)), "carved", 0.6)
+    mesh = _thinned(level_surface(field, axes, 0.5), faces)
+    return Reconstruction(mesh, tuple(_pieces(field, axes)), "carved", 0.6)
 
 
 def _back(sight: Sight) -> NDArray[np.float32]:
@@ -70,7 +70,7 @@ def _blurred(field: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
     return gaussian_filter(np.pad(field, 2), cells)[1:-1, 1:-1, 1:-1]
 
 
-def _largest(field: NDArray[np.float32], share: float = 0.1) -> NDArray[np.float32]:
+def _largest(field: NDArray[np.float32], share: float = 0.03) -> NDArray[np.float32]:
     """The field with its parts that hold less than ``share`` of the largest part's cells taken out."""
     from scipy.ndimage import label
 
@@ -134,20 +134,43 @@ def level_surface(field: NDArray[np.float32], axes: list[NDArray[np.float64]], l
     return Mesh(vertices, faces)
 
 
-def _pieces(mesh: Mesh, field: NDArray[np.float32], axes: list[NDArray[np.float64]], cell: float, block: float) -> list[Mesh]:
-    """Convex pieces: hulls of the cells in blocks, joined where that fills little."""
-    steps = [float(a[1] - a[0]) for a in axes]
-    start = np.array([a[0] - s for a, s in zip(axes, steps, strict=True)])
+def _thinned(mesh: Mesh, faces: int) -> Mesh:
+    """The mesh with at most that many faces, if it stays closed (quadric decimation, Garland and Heckbert 1997)."""
+    if len(mesh.faces) <= faces:
+        return mesh
+    import open3d as o3d
+
+    solid = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces))
+    solid = solid.simplify_quadric_decimation(faces)
+    kept = np.asarray(solid.triangles)
+    edges = np.sort(np.concatenate([kept[:, [0, 1]], kept[:, [1, 2]], kept[:, [2, 0]]]), axis=1)
+    _, count = np.unique(edges[:, 0].astype(np.int64) * (len(solid.vertices) + 1) + edges[:, 1], return_counts=True)
+    return Mesh(np.asarray(solid.vertices), kept) if np.all(count == 2) else mesh
+
+
+def _pieces(field: NDArray[np.float32], axes: list[NDArray[np.float64]], block: float = 0.012, most: int = 100) -> list[Mesh]:
+    """Convex pieces: hulls of the cells in blocks of ``block`` metres, larger where there were more than ``most``, joined where that fills little."""
+    steps = np.array([float(a[1] - a[0]) for a in axes])
+    start = np.array([a[0] for a in axes]) - steps
     spots = np.argwhere(field > 0.5)
-    size = max(2, round(block / cell))
-    keys = spots // size
-    _, group = np.unique(keys @ np.array([1, 10_000, 100_000_000]), return_inverse=True)
+    size = max(2, round(block / steps[0]))
+    while True:
+        _, group = np.unique((spots // size) @ np.array([1, 10_000, 100_000_000]), return_inverse=True)
+        if group.max() < most:
+            break
+        size += 1
     order = np.argsort(group, kind="stable")
     corner = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)]) - 0.5
     clouds = []
     for members in np.split(order, np.cumsum(np.bincount(group))[:-1]):
-        centres = start + spots[members] * steps
-        cloud = np.unique((centres[:, None] + corner * steps).reshape(-1, 3).round(6), axis=0)
+        cells = spots[members]
+        # Only the outermost cells of each row count for a hull.
+        row = cells[:, 1] * 10_000 + cells[:, 2]
+        by = np.lexsort((cells[:, 0], row))
+        ends = np.flatnonzero(np.diff(row[by], prepend=-1, append=-1))
+        cells = cells[by][np.unique(np.concatenate([ends[:-1], ends[1:] - 1]))]
+        cloud = (start + cells * steps)[:, None] + corner * steps
+        cloud = cloud.reshape(-1, 3)
         cloud[:, 2] = np.maximum(cloud[:, 2], 0.0)
         clouds.append(cloud)
     return joined(clouds)

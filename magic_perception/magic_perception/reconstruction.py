@@ -90,7 +90,8 @@ def _freest(builds: list[Callable[[], Reconstruction | None]], sights: list[Sigh
         try:
             found = build_carved(sights, noise)
             fit = agreement(found.mesh, sights)
-            if best is None or fit.score > value.score:
+            # A body that is a little amiss is worth more than what is carved of it: that has no unseen side.
+            if best is None or 0.75 * fit.score > value.score:
                 best, value = found, fit
         except MagicError as error:
             problem = error

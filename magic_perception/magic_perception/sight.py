@@ -187,8 +187,8 @@ class Agreement:
     """How a proposed solid agrees with what the cameras saw.
 
     overlap: mean over the cameras of the overlap (intersection over union) of silhouette and mask.  through: the largest share, over
-    the cameras, of the rays that meet the solid, away from its outline, but were seen to go on behind where they meet it: past the
-    mask, or to a depth farther by more than the noise.  Free space forbids the solid there.
+    the cameras, of the rays that meet the solid, away from its outline, but were seen to go on: past the mask, or into the solid
+    by more than the noise and more than a quarter of its thickness there.  Free space forbids the solid there.
     """
 
     overlap: float
@@ -222,11 +222,15 @@ def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.
         )
         depth = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
         drawn = np.isfinite(depth)
+        far = np.float32(5.0)
+        rays[..., :3] += far * rays[..., 3:]
+        rays[..., 3:] *= -1
+        thickness = far - scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() - depth
         where = np.ix_(v, u)
         mask, told = sight.mask[where], ~sight.hidden[where]
         overlaps.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
         inner = cv2.erode(drawn.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & told
         with np.errstate(invalid="ignore"):
-            on = inner & (~mask | (sight.depth[where] > depth + max(margin, 3 * sight.sigma)))
+            on = inner & (~mask | (sight.depth[where] > depth + np.maximum(max(margin, 3 * sight.sigma), 0.25 * thickness)))
         passed.append(np.count_nonzero(on) / max(np.count_nonzero(inner), 1))
     return Agreement(float(np.mean(overlaps)), float(max(passed)))

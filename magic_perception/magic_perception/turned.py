@@ -31,7 +31,7 @@ class Body:
         return np.interp(z, self.profile[:, 1], self.profile[:, 0])
 
 
-def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, seed: int) -> Body | None:
+def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, wall: float, seed: int) -> Body | None:
     """The body of revolution on which most of the side points lie, or ``None``.
 
     x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in a parabola q, so that conical and bulged bodies fit at once.
@@ -72,14 +72,17 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     out, ray = sample[:, :2] - origin, eye[:, :2] - sample[:, :2]
     cosine = np.sum(ray * out, axis=1) / np.maximum(np.linalg.norm(ray, axis=1) * np.linalg.norm(out, axis=1), 1e-9)
     inner_share = float(np.mean(cosine < 0))
+    # The inside of the far wall tells how far away the axis is, which a noisy front alone leaves open.
+    inner = sample[cosine < -0.35]
     # At grazing incidence stereo rounds the silhouette off backwards, which would make the body wider.
     sample = sample[cosine > 0.35]
     near = np.abs(np.linalg.norm(sample[:, :2] - origin, axis=1) - best[1]) < max(0.008, 0.15 * best[1])
     axis, model = origin, None
+    opposite = np.zeros((0, 3))
     for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
-        p = sample[near]
-        if len(p) < 25:
+        if np.count_nonzero(near) < 25:
             return None
+        p = np.concatenate([sample[near], opposite])
         local, z = p[:, :2] - origin, p[:, 2] / height
         matrix = np.column_stack([2 * local, np.ones(len(p)), z, z**2])
         model = np.linalg.lstsq(matrix, np.sum(local**2, axis=1), rcond=None)[0]
@@ -88,6 +91,12 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
         radius = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6))
         residual = np.linalg.norm(sample[:, :2] - axis, axis=1) - radius
         near = np.abs(residual) < width
+        if len(inner):
+            away = inner[:, :2] - axis
+            reach = np.linalg.norm(away, axis=1, keepdims=True)
+            z = inner[:, 2:] / height
+            beyond = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6)) - wall - reach
+            opposite = np.column_stack([inner[:, :2] + away / np.maximum(reach, 1e-6) * wall, inner[:, 2]])[np.abs(beyond[:, 0]) < width]
     seen = sample[:, :2] - axis
     widest = max(float(np.ptp(seen @ np.array([np.cos(t), np.sin(t)]))) for t in np.linspace(0, np.pi, 12, endpoint=False))
     if 2 * float(np.median(radius)) > 1.12 * widest:
@@ -215,7 +224,7 @@ def build_round(
 
     points (N, 3) with the camera (N, 3) that saw each; height and noise as for :func:`magic_perception.primitives.recognise`.
     """
-    body = round_body(points, eyes, height, noise, parameters.seed)
+    body = round_body(points, eyes, height, noise, parameters.wall, parameters.seed)
     if body is None:
         return None
     if height > body.profile[-1, 1] + 0.012:

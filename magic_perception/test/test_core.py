@@ -309,6 +309,68 @@ def test_empty_table_and_bad_frames():
         Parameters(region_low=(0, 0, 0), region_high=(1, -1, 1))
 
 
+# ---------------------------------------------------------------- free space
+
+
+def hoop(radius=0.03, wall=0.003, height=0.02, stands=False):
+    ring = primitives.turn_ring(np.array([[radius - wall, 0], [radius, 0], [radius, height], [radius - wall, height]]), np.zeros(2))
+    return scenes.placed(ring.transformed(transforms.from_rpy(np.pi / 2, 0, 0)) if stands else ring, 0.5, 0.0, 0.9)
+
+
+@pytest.mark.parametrize("names", [("left",), ("right",), ("left", "right")])
+def test_a_hoop_is_no_solid(names):
+    for stands, most in ((False, 0.45), (True, 0.8)):
+        mesh = hoop(stands=stands)
+        report = Report()
+        scene = perceive([scenes.capture([mesh], name, i)[0] for i, name in enumerate(names)], report=report)
+        (item,) = scene.objects
+        solid = tight(item.mesh)
+        assert report.shapes[item.id] not in ("sphere", "cylinder", "round")
+        assert solid.volume < most * solid.convex_hull.volume
+        # Nothing is in the hoop's middle, neither in the mesh nor in a piece.
+        middle = transforms.apply(transforms.inverse(item.world_from_object), mesh.bounds.mean(axis=0))
+        for piece in item.pieces:
+            hull = piece.to_trimesh().convex_hull
+            assert np.max(hull.face_normals @ middle - np.sum(hull.face_normals * hull.triangles[:, 0], axis=1)) > 0
+
+
+def test_a_mug_without_its_handle_in_sight_is_no_solid():
+    mesh = scenes.shape("mug", 3, 0.5, 0.0, 0.0)
+    for yaw in np.linspace(0, 2 * np.pi, 4, endpoint=False):
+        turned = scenes.placed(mesh.transformed(transforms.from_rpy(0, 0, yaw)), 0.0, 0.0)
+        turned = scenes.placed(turned.transformed(transforms.make(None, [-x for x in turned.bounds.mean(axis=0)])), 0.5, 0.0)
+        report = Report()
+        (item,) = perceive([scenes.capture([turned])[0]], report=report).objects
+        assert report.shapes[item.id] in ("round", "round with handle")
+        solid = tight(item.mesh)
+        assert solid.volume < 0.5 * solid.convex_hull.volume
+
+
+def test_what_agrees_with_a_ring():
+    from magic_perception.sight import Sight, agreement
+
+    mesh = hoop()
+    frame, ids = scenes.capture([mesh], noise=0.0)
+    sight = Sight(
+        frame.intrinsics, frame.world_from_camera, ids == 0, np.zeros(ids.shape, bool), frame.depth, np.zeros(ids.shape, np.float32), 1e-3
+    )
+    true, filled = agreement(mesh, [sight]), agreement(mesh.convex_hull(), [sight])
+    assert true.overlap > 0.95 and true.through < 0.01
+    assert filled.through > 0.4 and filled.score < 0.4 * true.score
+
+
+def test_level_surface_of_a_ball():
+    from magic_perception.carved import level_surface
+
+    axes = [np.arange(-0.03, 0.031, 0.002)] * 3
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    field = np.pad((np.clip((0.02 - np.sqrt(x**2 + y**2 + z**2)) / 0.004, -0.5, 0.5) + 0.5).astype(np.float32), 1)
+    ball = level_surface(field, [a + 1.0 for a in axes], 0.5)
+    solid = tight(ball)
+    assert solid.volume == pytest.approx(4 / 3 * np.pi * 0.02**3, rel=0.03) and solid.euler_number == 2
+    np.testing.assert_allclose(solid.centroid, 1.0, atol=1e-4)
+
+
 # ---------------------------------------------------------------- pieces and measures
 
 
@@ -655,3 +717,21 @@ def test_missing_weights_are_named(tmp_path):
     with pytest.raises(MagicError) as error:
         make_segmenter("sam2", str(tmp_path / "nothing"))
     assert error.value.code is Code.SEGMENTER_WEIGHTS and "nothing" in error.value.message
+
+
+# ---------------------------------------------------------------- speed
+
+
+def test_speed_is_measured(tmp_path):
+    import json
+
+    from magic_perception.evaluate import main
+
+    with pytest.raises(SystemExit) as status:
+        main(["--speed", "--frames", "2", "--out", str(tmp_path)])
+    assert status.value.code == 0
+    found = json.loads((tmp_path / "evaluation.json").read_text())["speed"]
+    assert found["frames"] == 2 and len(found["shapes"]) == 4 and len(found["memory_mib"]) == 2
+    seconds = found["seconds"]
+    assert seconds["masks to meshes"]["cpu_median"] == seconds["meshes"]["cpu_median"] > 0
+    assert seconds["all"]["wall_least"] >= seconds["images to meshes"]["wall_least"] > seconds["meshes"]["wall_least"]
