@@ -8,13 +8,23 @@ import pickle
 import tempfile
 import threading
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from magic_matcher import __name__ as PACKAGE
 
-#: Counted up when the meaning of what is kept changes.
-VERSION = 1
+#: Entries in a folder; a network's are a few megabytes each.
+KEPT = 64
+
+
+@lru_cache(maxsize=1)
+def code() -> str:
+    """A digest of this package's sources: what an older version has kept is not taken for what this one would compute."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def default_folder() -> Path:
@@ -33,7 +43,7 @@ class Cache:
         self._lock = threading.Lock()
 
     def _path(self, key: str) -> Path:
-        return self.folder / f"{hashlib.sha256(f'{VERSION} {key}'.encode()).hexdigest()}.pickle"
+        return self.folder / f"{hashlib.sha256(f'{code()} {key}'.encode()).hexdigest()}.pickle"
 
     def get(self, key: str, make: Callable[[], Any]) -> Any:
         """The entry of that key, made and kept where there is none; a folder that cannot be written only costs time."""
@@ -51,6 +61,13 @@ class Cache:
                 with os.fdopen(handle, "wb") as file:
                     pickle.dump(value, file, protocol=pickle.HIGHEST_PROTOCOL)
                 os.replace(name, path)
+                self._prune()
             except OSError:
                 pass
             return value
+
+    def _prune(self) -> None:
+        """Delete the entries that were made first, until ``KEPT`` are left."""
+        entries = sorted(self.folder.glob("*.pickle"), key=lambda entry: entry.stat().st_mtime)
+        for entry in entries[:-KEPT]:
+            entry.unlink(missing_ok=True)

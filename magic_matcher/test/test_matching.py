@@ -187,3 +187,16 @@ def test_cache_keeps_and_survives_damage(tmp_path):
     for path in tmp_path.iterdir():
         path.write_bytes(b"not a pickle")
     assert cache.get("a", lambda: calls.append(1) or {"x": 3}) == {"x": 3} and len(calls) == 2
+
+
+def test_the_cache_keeps_no_more_than_it_may_and_nothing_of_other_code(tmp_path, monkeypatch):
+    from magic_matcher import cache as module
+
+    monkeypatch.setattr(module, "KEPT", 3)
+    kept = Cache(tmp_path)
+    for k in range(6):
+        assert kept.get(f"key {k}", lambda k=k: k) == k
+    assert len(list(tmp_path.glob("*.pickle"))) == 3
+    assert kept.get("key 5", lambda: "made anew") == 5
+    monkeypatch.setattr(module, "code", lambda: "another version")
+    assert kept.get("key 5", lambda: "made anew") == "made anew"
