@@ -25,6 +25,7 @@ from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures
 from magic_core.shapes.shape import section_view
 from magic_core.strategy import Strategy, find
+from magic_core.threads import one_thread
 from magic_planner.budget import Budget
 from magic_planner.collision import mass_centre
 from magic_planner.object_motion import plan_tool_motion
@@ -130,6 +131,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--family", nargs="*", default=None, help="only these families of tools")
     parser.add_argument("--timeout", type=float, default=10.0, help="seconds for one plan")
     options = parser.parse_args(arguments)
+    one_thread()
     planner = None
     if "arm" in options.variant:
         from magic_planner.arm import ArmPlanner

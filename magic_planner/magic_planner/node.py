@@ -18,6 +18,7 @@ from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import describe, parameter, run
+from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
 from magic_planner.giving_way import GAP, GAP_IN_HAND
@@ -41,6 +42,7 @@ class PlannerNode(Node):
         self._timeout = parameter(self, "timeout", 10.0, "Wall time in s for one goal that names none.", low=0.05, high=3600.0)
         self._busy = threading.Lock()
         self._arm = self._load_arm() if parameter(self, "arm", True, "Load the arm; without it only the variant fg is served.") else None
+        self._threads = one_thread()
         self._server = ActionServer(
             self,
             PlanMotion,

@@ -4,87 +4,26 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 import planner_scenes as scenes
 import pytest
+from planner_graph import DEADLINE, ask, goal, planner, wait
 
-from magic_core import strategy as strategies
 from magic_core.errors import Code
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("magic_interfaces.action")
 
-DEADLINE = 20.0
 #: Of this file's nodes alone.
 DOMAIN = 74
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("strategies")
-    strategies.save(scenes.pulling(), path / "pulling")
-    return path
-
-
-@pytest.fixture(scope="module")
-def graph(folder):
-    from rclpy.action import ActionClient
-    from rclpy.executors import MultiThreadedExecutor
-    from rclpy.parameter import Parameter
-
-    from magic_interfaces.action import PlanMotion
-    from magic_planner.node import PlannerNode
-
-    rclpy.init(domain_id=DOMAIN)
-    node = PlannerNode(parameter_overrides=[Parameter("strategies", value=str(folder))])
-    user = rclpy.create_node("user")
-    client = ActionClient(user, PlanMotion, "plan_motion")
-    executor = MultiThreadedExecutor(4)
-    executor.add_node(node)
-    executor.add_node(user)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
-    assert client.wait_for_server(DEADLINE)
-    yield client
-    executor.shutdown(timeout_sec=2.0)
-    client.destroy()
-    node.destroy_node()
-    user.destroy_node()
-    rclpy.try_shutdown()
-    thread.join(5.0)
-
-
-def goal(**changes):
-    from magic_core import conversions as convert
-    from magic_interfaces.action import PlanMotion
-
-    tool, tool_contact = scenes.hook()
-    target, target_contact = scenes.standing_cylinder()
-    head = convert.header("panda_link0")
-    message = PlanMotion.Goal(strategy="pulling", variant="arm", reflection="keep", timeout=10.0)
-    message.tool = convert.object_to_msg(tool, head)
-    message.target = convert.object_to_msg(target, head)
-    message.candidate = convert.candidate_to_msg(scenes.candidate(tool, tool_contact, target_contact))
-    for name, value in changes.items():
-        setattr(message, name, value)
-    return message
-
-
-def wait(future):
-    end = time.monotonic() + DEADLINE
-    while not future.done():
-        assert time.monotonic() < end, "no answer"
-        time.sleep(0.002)
-    return future.result()
-
-
-def ask(client, message, feedback=None):
-    handle = wait(client.send_goal_async(message, feedback_callback=feedback))
-    assert handle.accepted
-    return wait(handle.get_result_async()).result
+def graph(tmp_path_factory):
+    with planner(tmp_path_factory.mktemp("strategies"), DOMAIN) as client:
+        yield client
 
 
 def test_an_arm_motion_comes_with_feedback(graph):
