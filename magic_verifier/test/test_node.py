@@ -4,99 +4,32 @@ import os
 import threading
 import time
 
-os.environ["ROS_DOMAIN_ID"] = "76"
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
-import numpy as np
 import pytest
-import scenes
 
-rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("rclpy")
 
-from dataclasses import replace
-
-from rclpy.action import ActionClient
-from rclpy.executors import MultiThreadedExecutor
-from rclpy.parameter import Parameter
+from verifier_graph import ask, goal_message, verifier, wait
 
 from magic_core import conversions as convert
-from magic_core import strategy as strategies
 from magic_core.errors import Code
-from magic_core.mesh import Mesh
-from magic_core.scene import CanonicalView
-from magic_interfaces.action import VerifyMotion
 from magic_interfaces.msg import SceneObject as SceneObjectMsg
-from magic_verifier import node as verifier
-from magic_verifier.node import VerifierNode
+from magic_verifier import node as verifier_node
 
-
-def _save(folder, name, goal):
-    strategy, *_ = scenes.hooking("L")
-    tetrahedron = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
-    view = CanonicalView(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), 0.01, np.eye(4))
-    strategies.save(
-        replace(strategy, name=name, tool_mesh=tetrahedron, target_mesh=tetrahedron, tool_view=view, target_view=view, goal=goal),
-        folder / name,
-    )
-
-
+#: Of this file's nodes alone.
+DOMAIN = 76
 SIMULATED: list[int] = []
 
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory):
-    """A verifier, an action client and the executor that spins both."""
-    folder = tmp_path_factory.mktemp("strategies")
-    _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
-    _save(folder, "juggling", strategies.Goal("juggle"))
-    simulate = verifier.verify
-    verifier.verify = lambda *a, **k: SIMULATED.append(1) or simulate(*a, **k)
-    rclpy.init()
-    node = VerifierNode(parameter_overrides=[Parameter("strategies", value=str(folder))])
-    peer = rclpy.create_node("peer")
-    client = ActionClient(peer, VerifyMotion, "verify_motion")
-    executor = MultiThreadedExecutor(4)
-    executor.add_node(node)
-    executor.add_node(peer)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
-    assert client.wait_for_server(timeout_sec=20)
-    yield client
-    verifier.verify = simulate
-    executor.shutdown(timeout_sec=5)
-    thread.join(timeout=5)
-    client.destroy()
-    node.destroy_node()
-    peer.destroy_node()
-    rclpy.try_shutdown()
-
-
-def goal_message(name="hooking", kind="L", **fields):
-    _, tool, target, plan = scenes.hooking(kind)
-    head = convert.header("panda_link0")
-    goal = VerifyMotion.Goal(
-        strategy=name,
-        tool=convert.object_to_msg(tool, head),
-        target=convert.object_to_msg(target, head),
-        table=convert.plane_to_msg(scenes.TABLE),
-        plan=convert.plan_to_msg(plan, tool.id),
-    )
-    for key, value in fields.items():
-        setattr(goal, key, value)
-    return goal
-
-
-def wait(future, seconds=30.0):
-    done = threading.Event()
-    future.add_done_callback(lambda _f: done.set())
-    assert done.wait(seconds), f"no answer within {seconds} s"
-    return future.result()
-
-
-def ask(client, goal, feedback=None):
-    handle = wait(client.send_goal_async(goal, feedback_callback=feedback))
-    assert handle.accepted
-    return wait(handle.get_result_async()).result
+    """A client of a verifier that counts its simulations."""
+    simulate = verifier_node.verify
+    verifier_node.verify = lambda *a, **k: SIMULATED.append(1) or simulate(*a, **k)
+    with verifier(tmp_path_factory.mktemp("strategies"), DOMAIN) as client:
+        yield client
+    verifier_node.verify = simulate
 
 
 def test_a_good_motion_passes_with_metrics_film_and_feedback(graph):

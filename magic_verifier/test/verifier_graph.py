@@ -1,0 +1,91 @@
+"""A verifier node, a client of its action and goals for it, for the tests over ROS."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import scenes
+
+from magic_core import conversions as convert
+from magic_core import strategy as strategies
+from magic_core.mesh import Mesh
+from magic_core.scene import CanonicalView
+
+
+def _save(folder, name, goal):
+    strategy, *_ = scenes.hooking("L")
+    tetrahedron = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    view = CanonicalView(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), 0.01, np.eye(4))
+    strategies.save(
+        replace(strategy, name=name, tool_mesh=tetrahedron, target_mesh=tetrahedron, tool_view=view, target_view=view, goal=goal),
+        folder / name,
+    )
+
+
+@contextmanager
+def verifier(folder, domain: int) -> Iterator:
+    """An action client of a verifier node that has the strategies ``hooking`` and ``juggling``; folder: where these may be written."""
+    import rclpy
+    from rclpy.action import ActionClient
+    from rclpy.executors import MultiThreadedExecutor
+    from rclpy.parameter import Parameter
+
+    from magic_interfaces.action import VerifyMotion
+    from magic_verifier.node import VerifierNode
+
+    _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
+    _save(folder, "juggling", strategies.Goal("juggle"))
+    rclpy.init(domain_id=domain)
+    node = VerifierNode(parameter_overrides=[Parameter("strategies", value=str(folder))])
+    peer = rclpy.create_node("peer")
+    client = ActionClient(peer, VerifyMotion, "verify_motion")
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(node)
+    executor.add_node(peer)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    assert client.wait_for_server(timeout_sec=20)
+    yield client
+    executor.shutdown(timeout_sec=5)
+    thread.join(timeout=5)
+    client.destroy()
+    node.destroy_node()
+    peer.destroy_node()
+    rclpy.try_shutdown()
+
+
+def goal_message(name="hooking", kind="L", tool=None, target=None, plan=None, **fields):
+    """A goal that passes (an L hook that pulls), with some of it exchanged."""
+    from magic_interfaces.action import VerifyMotion
+
+    _, own_tool, own_target, own_plan = scenes.hooking(kind)
+    head = convert.header("panda_link0")
+    goal = VerifyMotion.Goal(
+        strategy=name,
+        tool=convert.object_to_msg(tool or own_tool, head),
+        target=convert.object_to_msg(target or own_target, head),
+        table=convert.plane_to_msg(scenes.TABLE),
+        plan=convert.plan_to_msg(plan or own_plan, own_tool.id),
+    )
+    for key, value in fields.items():
+        setattr(goal, key, value)
+    return goal
+
+
+def wait(future, seconds=30.0):
+    """The result of a future; fails after so many seconds."""
+    done = threading.Event()
+    future.add_done_callback(lambda _f: done.set())
+    assert done.wait(seconds), f"no answer within {seconds} s"
+    return future.result()
+
+
+def ask(client, goal, feedback=None):
+    """The result of a goal."""
+    handle = wait(client.send_goal_async(goal, feedback_callback=feedback))
+    assert handle.accepted
+    return wait(handle.get_result_async()).result
