@@ -50,8 +50,10 @@ class Dinov2Features:
         try:
             import torch
             from transformers import AutoConfig, AutoModel
+            from transformers.utils import logging
         except ImportError as error:
             raise MagicError(Code.FEATURE_WEIGHTS, "dinov2 features", str(error), "an environment with torch and transformers") from error
+        logging.disable_progress_bar()  # a log is no place for it, and an error is one line
         try:
             config = AutoConfig.from_pretrained(weights)
             if config.model_type not in MODELS:

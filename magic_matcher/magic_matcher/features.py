@@ -180,7 +180,12 @@ def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: 
                 weights,
                 "a hub name such as facebook/dinov2-base, or a folder with config.json and model.safetensors",
             )
-        return Dinov2Features(weights if not Path(weights).expanduser().is_dir() else str(Path(weights).expanduser()), device, **options)
+        folder = Path(weights).expanduser()
+        if folder.is_dir():
+            return Dinov2Features(str(folder), device, **options)
+        if weights.startswith(("/", ".", "~")) or weights.count("/") > 1:  # no hub name looks like this
+            raise MagicError(Code.FEATURE_WEIGHTS, "weights", weights, "a folder that exists, or a hub name such as facebook/dinov2-base")
+        return Dinov2Features(weights, device, **options)
     from magic_matcher.embedded import EmbeddedFeatures
 
     return EmbeddedFeatures(**options)

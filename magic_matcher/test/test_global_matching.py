@@ -174,6 +174,8 @@ def test_bad_weights_and_names_have_codes(tmp_path):
     for arguments, code in (
         (("dinov2", str(tmp_path)), Code.FEATURE_WEIGHTS),
         (("dinov2", ""), Code.FEATURE_WEIGHTS),
+        (("dinov2", str(tmp_path / "nothing")), Code.FEATURE_WEIGHTS),
+        (("dinov2", "./nothing"), Code.FEATURE_WEIGHTS),
         (("resnet", ""), Code.UNKNOWN_FEATURES),
     ):
         with pytest.raises(MagicError) as caught:
