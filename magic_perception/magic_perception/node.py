@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import MarkerArray
 
@@ -111,6 +114,8 @@ class Perception(Node):
         self.tracker = Tracker()
         self.known: tuple[SceneObject, ...] = ()
         self.known_problem: tuple[Code, str] | None = None
+        self.unheard: dict[str, str] = {}
+        self.distortion: dict[str, float] = {}
         self.done_stamp = -math.inf
         self.done = 0
         self.outcome: tuple[bytes, Code, str, dict[str, object]] = (DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
@@ -135,11 +140,11 @@ class Perception(Node):
         try:
             from tf2_msgs.msg import TFMessage
 
-            self.create_subscription(TFMessage, "/tf", partial(self.on_tf, False), RELIABLE, callback_group=inputs)
-            self.create_subscription(TFMessage, "/tf_static", partial(self.on_tf, True), STATIC_TF, callback_group=inputs)
+            self.listen(TFMessage, "/tf", partial(self.on_tf, False), RELIABLE, inputs)
+            self.listen(TFMessage, "/tf_static", partial(self.on_tf, True), STATIC_TF, inputs)
         except ImportError:
             self.get_logger().error("tf2_msgs is not installed: poses of cameras must be given as parameters extrinsics.NAME")
-        self.create_subscription(SceneObjectArray, "known_objects", self.on_known, LATCHED, callback_group=inputs)
+        self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
         self.objects_out = self.create_publisher(SceneObjectArray, "objects", LATCHED)
         self.markers_out = self.create_publisher(MarkerArray, "perception/markers", LATCHED)
         self.diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
@@ -165,6 +170,22 @@ class Perception(Node):
         self.get_logger().debug(f"warmed up in {time.monotonic() - begin:.2f} s")
 
     # ------------------------------------------------------------ input
+
+    def listen(self, kind: type, topic: str, callback: Callable, qos: QoSProfile, group: MutuallyExclusiveCallbackGroup) -> None:
+        """Subscribe; a publisher whose QoS keeps its messages from coming is named in the diagnostics."""
+
+        def incompatible(event: object) -> None:
+            what = event.last_policy_kind  # type: ignore[attr-defined]
+            policy = getattr(what, "name", str(what)).lower()
+            self.unheard[topic] = f"{self.resolve_topic_name(topic)}: a publisher's QoS does not fit ({policy}); wanted {_wanted(qos)}"
+            self.get_logger().warning(self.unheard[topic])
+
+        try:
+            self.create_subscription(
+                kind, topic, callback, qos, callback_group=group, event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible)
+            )
+        except UnsupportedEventTypeError:
+            self.create_subscription(kind, topic, callback, qos, callback_group=group)
 
     def on_image(self, camera: str, what: str, msg: Image) -> None:
         """One colour or depth image."""
@@ -203,6 +224,8 @@ class Perception(Node):
         with self.lock:
             try:
                 intrinsics = cv.intrinsics_from_msg(msg)
+                _check_matrix(msg, intrinsics)
+                self.distortion[camera] = max((abs(x) for x in msg.d), default=0.0)
                 if of_depth:
                     stream.depth_intrinsics = intrinsics
                     stream.last[what] = now
@@ -401,6 +424,16 @@ class Perception(Node):
             if self.done == 0 and code is Code.NO_FRAMES and worst:
                 message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
             states.append(pc.status(f"{self.get_name()}: scene", level, message, code, values))
+            for topic, message in self.unheard.items():
+                states.append(
+                    pc.status(
+                        f"{self.get_name()}: topic {topic}",
+                        DiagnosticStatus.ERROR,
+                        f"[{int(Code.NO_FRAMES)} QoS] {message}",
+                        Code.NO_FRAMES,
+                        {},
+                    )
+                )
             if self.known_problem is not None:
                 states.append(
                     pc.status(
@@ -428,6 +461,8 @@ class Perception(Node):
         if stream.pairs:
             values["frame"] = stream.pairs[-1].frame_id
             values["stamp"] = f"{stream.pairs[-1].stamp:.3f}"
+        if self.distortion.get(camera, 0.0) > 1e-3:
+            values["distortion"] = f"up to {self.distortion[camera]:.3f}, left out: publish rectified images"
         name = f"{self.get_name()}: camera {camera}"
         for what in ("camera_info", "depth_camera_info", "color", "depth", "stamps", "pairing", "frames"):
             if what in stream.problems:
@@ -456,6 +491,24 @@ class Perception(Node):
                     name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values
                 )
         return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
+
+
+def _wanted(qos: QoSProfile) -> str:
+    return f"{qos.reliability.name.lower()}, {qos.durability.name.lower()}"
+
+
+def _check_matrix(msg: CameraInfo, intrinsics: Intrinsics) -> None:
+    """Raises ``BAD_INTRINSICS`` for a matrix that is no camera's: skewed, transposed, or with its centre outside of the image."""
+    k = [float(x) for x in msg.k]
+    if abs(k[1]) > 1e-6 * k[0] or any(abs(x) > 1e-9 for x in (k[3], k[6], k[7])) or abs(k[8] - 1) > 1e-6:
+        raise MagicError(Code.BAD_INTRINSICS, "K", k, "fx, 0, cx, 0, fy, cy, 0, 0, 1, row by row")
+    if not (0 < intrinsics.cx < intrinsics.width and 0 < intrinsics.cy < intrinsics.height):
+        raise MagicError(
+            Code.BAD_INTRINSICS,
+            "cx, cy",
+            (intrinsics.cx, intrinsics.cy),
+            f"a centre inside of {intrinsics.width} x {intrinsics.height} pixels",
+        )
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ import os
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magic_core import conversions as cv
+from magic_core import transforms
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene
 from magic_interfaces.msg import SceneObjectArray
@@ -56,11 +59,12 @@ class Bench:
             )
 
     def __enter__(self):
-        used = self.node.cameras
-        self.until(
-            lambda: all(p.get_subscription_count() for name in used for p in self.out[name]) and self.tf.get_subscription_count(),
-            "discovery",
-        )
+        used = [self.out[name][i] for name in self.node.cameras for i in ((0, 1, 2) if self.node.aligned else (0, 2))]
+        try:
+            self.until(lambda: all(p.get_subscription_count() for p in [*used, self.tf]), "discovery")
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_):
@@ -91,7 +95,7 @@ class Bench:
         self.tf.publish(tf2_msgs.TFMessage(transforms=stamped))
 
     def send(self, frame, encoding="16UC1", info=True, **changes):
-        head = cv.header(f"{frame.camera}_color_optical_frame", frame.stamp)
+        head = cv.header(changes.get("frame_id", f"{frame.camera}_color_optical_frame"), frame.stamp)
         color, depth, camera_info = self.out[frame.camera]
         if info:
             camera_info.publish(changes.get("info_msg") or cv.intrinsics_to_msg(frame.intrinsics, head))
@@ -100,6 +104,8 @@ class Bench:
         msg.encoding = encoding
         if "step" in changes:
             msg.step = changes["step"]
+        if "depth_pixels" in changes:
+            msg = cv.image_to_msg(changes["depth_pixels"], "16UC1", head)
         color.publish(cv.image_to_msg(frame.color, "rgb8", head))
         depth.publish(msg)
 
@@ -230,6 +236,201 @@ def test_bad_input_is_answered_by_diagnostics(frames):
 
 def later(frame, seconds):
     return type(frame)(frame.color, frame.depth, frame.intrinsics, frame.world_from_camera, frame.camera, seconds)
+
+
+def altered(message, **changes):
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def test_more_bad_input_is_answered_by_diagnostics(frames):
+    frame = frames[0]
+    clock = iter(range(10, 100000))
+    good = cv.intrinsics_to_msg(frame.intrinsics)
+    half = Intrinsics(320, 240, 307.0, 307.0, 160.0, 120.0)
+    k = list(good.k)
+
+    def depth(values):
+        return type(frame)(frame.color, values.astype(np.float32), frame.intrinsics, frame.world_from_camera, "left", float(next(clock)))
+
+    def send(**changes):
+        return lambda: bench.send(later(frame, float(next(clock))), **changes)
+
+    def info(**changes):
+        return send(info_msg=altered(cv.intrinsics_to_msg(frame.intrinsics), **changes))
+
+    def short(bench):
+        head = cv.header("left_color_optical_frame", float(next(clock)))
+        bench.out["left"][2].publish(good)
+        bench.out["left"][0].publish(cv.image_to_msg(frame.color, "rgb8", head))
+        whole = cv.image_to_msg(np.nan_to_num(frame.depth * 1000).round(), "16UC1", head)
+        bench.out["left"][1].publish(altered(whole, data=bytes(whole.data)[:-100]))
+
+    with Bench(camera_timeout=0.3, cameras=["left"]) as bench:
+        bench.transforms()
+        for what, code, act in [
+            ("infinite depth", "NO_DEPTH", lambda: bench.send(depth(np.full_like(frame.depth, np.inf)), "32FC1")),
+            ("depth of zeros", "NO_DEPTH", lambda: bench.send(depth(np.zeros_like(frame.depth)))),
+            ("negative depth", "NO_DEPTH", lambda: bench.send(depth(np.full_like(frame.depth, -1.0)), "32FC1")),
+            ("depth of another size", "BAD_IMAGE", send(depth_pixels=np.ones((240, 320)))),
+            ("camera_info of another size", "BAD_IMAGE", send(info_msg=cv.intrinsics_to_msg(half))),
+            ("data cut short", "BAD_IMAGE", lambda: short(bench)),
+            ("NaN in K", "BAD_INTRINSICS", info(k=[float("nan")] * 9)),
+            ("negative focal length", "BAD_INTRINSICS", info(k=[-k[0], *k[1:]])),
+            ("transposed K", "BAD_INTRINSICS", info(k=np.reshape(k, (3, 3)).T.ravel().tolist())),
+            ("centre off the image", "BAD_INTRINSICS", info(k=[*k[:2], 5000.0, *k[3:]])),
+            ("no size", "BAD_INTRINSICS", info(width=0, height=0)),
+            ("no frame_id", "NO_TRANSFORM", send(frame_id="")),
+            ("unknown frame_id", "NO_TRANSFORM", send(frame_id="nowhere")),
+        ]:
+            bench.diagnostics.clear()
+            count = len(bench.objects)
+            bench.until(lambda code=code: bench.diagnostics and code in bench.codes(), f"{code} for {what}", tick=act)
+            assert all(o.objects for o in bench.objects[count:]), what
+        bench.until(lambda: bench.objects and bench.objects[-1].objects, "objects after bad input", tick=send())
+
+
+def test_sprinkled_bad_pixels_do_no_harm(frames):
+    clock = iter(range(10, 100000))
+    rng = np.random.default_rng(0)
+    depth = frames[0].depth.copy()
+    for value in (np.nan, np.inf, -np.inf, -1.0, 0.0, 60.0):
+        depth[rng.random(depth.shape) < 0.01] = value
+    with Bench(cameras=["left"]) as bench:
+        bench.transforms()
+
+        def act():
+            f = frames[0]
+            bench.send(type(f)(f.color, depth, f.intrinsics, f.world_from_camera, "left", float(next(clock))), "32FC1")
+
+        bench.until(lambda: bench.objects, "objects", tick=act)
+        assert len(bench.objects[-1].objects) == 2
+
+
+def test_stale_images_are_refused(frames):
+    with Bench(cameras=["left"], max_age=5.0) as bench:
+        bench.transforms()
+        bench.until(lambda: "STALE_DATA" in bench.codes(), "STALE_DATA", tick=lambda: bench.send(later(frames[0], 1000.0)))
+        assert not bench.objects
+        bench.until(lambda: bench.objects, "objects of fresh images", tick=lambda: bench.send(later(frames[0], time.time())))
+
+
+def assert_places(found, meshes):
+    """As many objects as meshes, each where one of them is and as large."""
+    assert len(found) == len(meshes)
+    bounds = np.stack([o.mesh.transformed(o.world_from_object).bounds for o in found])
+    for mesh in meshes:
+        assert np.abs(bounds - mesh.bounds).max(axis=(1, 2)).min() < 0.007
+
+
+def test_pixels_need_not_be_square():
+    wide = Intrinsics(640, 480, 640.0, 500.0, 322.0, 236.0)
+    meshes = things()
+    clock = iter(range(10, 100000))
+    frame, _ = scenes.capture(meshes, "left", intrinsics=wide)
+    with Bench(cameras=["left"]) as bench:
+        bench.transforms()
+        bench.until(lambda: bench.objects, "objects", tick=lambda: bench.send(later(frame, float(next(clock)))))
+        assert_places(cv.scene_from_msg(bench.objects[-1]).objects, meshes)
+
+
+def test_depth_that_is_not_aligned(frames):
+    """Depth measured 15 mm beside the colour camera by a camera of its own comes out at the same places."""
+    color_from_depth = transforms.from_rpy(0.0, 0.0, 0.004, [0.015, 0.0, 0.0])
+    depth_camera = Intrinsics(640, 480, 460.0, 460.0, 320.0, 240.0)
+    meshes = things()
+    seen, _ = scenes.capture(meshes, "left", world_from_camera=scenes.POSES["left"] @ color_from_depth, intrinsics=depth_camera)
+    clock = iter(range(10, 100000))
+    with Bench(cameras=["left"], aligned=False) as bench:
+        bench.transforms()
+        stamped = TransformStamped(child_frame_id="left_depth_optical_frame", transform=cv.transform_to_msg(color_from_depth))
+        stamped.header.frame_id = "left_color_optical_frame"
+        bench.tf.publish(tf2_msgs.TFMessage(transforms=[stamped]))
+        depth_out = bench.tester.create_publisher(Image, "camera/left/depth/image_rect_raw", SENSOR)
+        info_out = bench.tester.create_publisher(CameraInfo, "camera/left/depth/camera_info", SENSOR)
+
+        def act(with_info=True):
+            seconds = float(next(clock))
+            color, depth = cv.header("left_color_optical_frame", seconds), cv.header("left_depth_optical_frame", seconds)
+            bench.out["left"][2].publish(cv.intrinsics_to_msg(frames[0].intrinsics, color))
+            bench.out["left"][0].publish(cv.image_to_msg(frames[0].color, "rgb8", color))
+            if with_info:
+                info_out.publish(cv.intrinsics_to_msg(depth_camera, depth))
+            depth_out.publish(cv.image_to_msg(np.nan_to_num(seen.depth * 1000).round(), "16UC1", depth))
+
+        bench.until(
+            lambda: any("camera/left/depth/camera_info" in m for m in bench.messages()), "the missing camera_info", tick=lambda: act(False)
+        )
+        bench.until(lambda: bench.objects, "objects", tick=act)
+        assert_places(cv.scene_from_msg(bench.objects[-1]).objects, meshes)
+
+
+def test_a_publisher_of_other_qos_is_named():
+    from rclpy.qos import QoSProfile
+
+    with Bench(cameras=["left"]) as bench:
+        bench.tester.create_publisher(SceneObjectArray, "known_objects", QoSProfile(depth=1))
+        bench.until(lambda: any("known_objects" in m and "durability" in m for m in bench.messages()), "the name of the topic and policy")
+
+
+BAG = Path(__file__).resolve().parents[2] / "bags/hooking"
+
+
+@pytest.mark.skipif(not BAG.is_dir(), reason=f"no bag at {BAG}")
+def test_a_bag_through_the_node_and_through_the_core():
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    from rclpy.serialization import deserialize_message
+
+    from magic_perception.averaging import average
+
+    kinds = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CameraInfo": CameraInfo, "tf2_msgs/msg/TFMessage": tf2_msgs.TFMessage}
+    with highlevel.AnyReader([BAG]) as reader:
+        messages = [(c.topic, kinds[c.msgtype], bytes(raw)) for c, _, raw in reader.messages() if c.msgtype in kinds]
+    poses, infos, images = {}, {}, {}
+    for topic, kind, raw in messages:
+        msg = deserialize_message(raw, kind)
+        if kind is tf2_msgs.TFMessage:
+            poses.update({t.child_frame_id: cv.transform_from_msg(t.transform) for t in msg.transforms})
+        elif topic.endswith("color/camera_info"):
+            infos[topic.split("/")[2]] = cv.intrinsics_from_msg(msg)
+        elif topic.endswith("image_raw"):
+            images.setdefault(topic.split("/")[2], {}).setdefault(cv.time_from_msg(msg.header.stamp), {})[
+                "depth" if "depth" in topic else "color"
+            ] = msg
+    frames = [
+        average(
+            [
+                RgbdFrame(
+                    cv.color_from_msg(p["color"]),
+                    cv.depth_from_msg(p["depth"]),
+                    infos[name],
+                    poses[p["color"].header.frame_id],
+                    name,
+                    stamp,
+                )
+                for stamp, p in sorted(pairs.items())
+            ]
+        )
+        for name, pairs in sorted(images.items())
+    ]
+    count = len(images["left"])
+    expected = perceive(frames, parameters=Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5)))
+    with Bench(average=count, camera_timeout=10.0) as bench:
+        out = {t: bench.tester.create_publisher(k, t, SENSOR) for t, k, _ in messages if t.startswith("/camera")}
+        used = {t: p for t, p in out.items() if "aligned_depth_to_color/camera_info" not in t}
+        bench.until(lambda: all(p.get_subscription_count() for p in used.values()), "discovery")
+        for topic, _, raw in messages:
+            (bench.tf if topic == "/tf_static" else out[topic]).publish(raw) if topic in out or topic == "/tf_static" else None
+            for _ in range(5):
+                bench.executor.spin_once(timeout_sec=0.01)
+        bench.until(lambda: bench.objects, "objects of the bag", 30.0)
+        found = cv.scene_from_msg(bench.objects[-1])
+    assert len(found.objects) == len(expected.objects) > 1
+    for got, want in zip(found.objects, expected.objects, strict=True):
+        np.testing.assert_allclose(got.mesh.vertices, want.mesh.vertices, atol=1e-6)
+        np.testing.assert_allclose(got.world_from_object, want.world_from_object, atol=1e-6)
+        np.testing.assert_array_equal(got.mask, want.mask)
 
 
 def test_swapped_topics_are_named(frames):
