@@ -70,7 +70,7 @@ def test_it_pulls_with_the_hook(planner):
 
 
 def test_a_wider_gripper_takes_what_a_narrow_one_cannot(planner, config):
-    tool, tool_contact = scenes.hook()
+    tool, _ = scenes.hook()
     block = scenes.item("tool", [scenes.box([0.3, 0.085, 0.085])], transforms.make(translation=[0.45, 0.25, 0.0425]), scenes.DOWN)
     target, target_contact = scenes.standing_cylinder(at=(0.72, 0.0))
     candidate = scenes.candidate(tool, scenes.contact(scenes.DOWN, [-0.15, 0, 0], [-1, 0, 0]), target_contact)
