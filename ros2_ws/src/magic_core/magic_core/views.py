@@ -19,8 +19,10 @@ _DIRECTIONS = 24
 _PROBE = 80
 
 
-def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None = None, size: int = VIEW_SIZE) -> CanonicalView:
-    """Draw an object (object frame, z up) in its canonical view.
+def find_view(
+    mesh: Mesh | NDArray[np.float64], pieces: Sequence[Mesh] | None = None, kind: str | None = None, size: int = VIEW_SIZE
+) -> CanonicalView:
+    """Draw an object (object frame, z up), a mesh or a cloud (N, 3), in its canonical view.
 
     kind ``top``: from above, the object's x to the right.  ``side``: along the horizontal direction in which the
     silhouette shows a hole best, else the one that is least convex (a handle), else the widest; up is +z, and what
@@ -30,8 +32,14 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
     that the object is convex.
 
     ``confidence``: how far the chosen picture tells more than the alternatives; 1 where a hole decides it.
-    Raises ``BAD_MESH`` for an empty mesh, ``BAD_REQUEST_IMAGE`` for an unknown kind.
+    Of a cloud only what was seen is drawn (:func:`mesh_of_cloud`; paint it there).
+    Raises ``BAD_MESH`` for an empty mesh or cloud, ``BAD_REQUEST_IMAGE`` for an unknown kind.
     """
+    if not isinstance(mesh, Mesh):
+        cloud = np.asarray(mesh, float)
+        if kind == "section":
+            return _section_of_cloud(cloud, size)
+        mesh = mesh_of_cloud(cloud)
     if len(mesh.faces) == 0:
         raise MagicError(Code.BAD_MESH, "mesh to look at", "no faces", "at least one triangle")
     if kind is not None and kind not in VIEW_KINDS:
@@ -53,6 +61,57 @@ def find_view(mesh: Mesh, pieces: Sequence[Mesh] | None = None, kind: str | None
     if told > 1.2 * from_above and told > 0.03:
         return _drawn(mesh, direction, (0, 0, 1), "side", size, confidence)
     return _top(mesh, size, float(np.clip(0.5 + from_above - told, 0.1, 1.0)))
+
+
+def mesh_of_cloud(points: NDArray[np.float64], colors: NDArray[np.uint8] | None = None, spacing: float | None = None) -> Mesh:
+    """A cloud (N, 3) with colours (N, 3) as small octahedra, so that it can be looked at like a mesh: neighbours touch, holes stay open.
+
+    ``spacing`` metres between points; found from the cloud if not given, and thinned to it.  Raises ``BAD_MESH`` for fewer than 10 finite points.
+    """
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise MagicError(Code.BAD_MESH, "shape of the cloud", points.shape, "(N, 3)")
+    finite = np.all(np.isfinite(points), axis=1)
+    points = points[finite]
+    if len(points) < 10:
+        raise MagicError(Code.BAD_MESH, "points of the cloud", len(points), "at least 10, finite")
+    if spacing is None:
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(points)
+        # The third neighbour of a scattered surface is about as far as the gaps are wide.
+        few = points[:: max(1, len(points) // 1000)]
+        spacing = float(np.percentile(tree.query(few, k=4)[0][:, 3], 90))
+        spacing = max(spacing, float(np.ptp(points, axis=0).max()) / 200, 1e-5)
+    keys = np.floor(points / spacing).astype(np.int64)
+    _, first = np.unique(keys, axis=0, return_index=True)
+    first = np.sort(first)
+    centres = points[first]
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]) * spacing
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    paint = None if colors is None else np.repeat(np.asarray(colors)[finite][first], 6, axis=0)
+    return Mesh((centres[:, None] + corners).reshape(-1, 3), (6 * np.arange(len(centres))[:, None, None] + faces).reshape(-1, 3), paint)
+
+
+def _section_of_cloud(points: NDArray[np.float64], size: int) -> CanonicalView:
+    """The points near the upright plane along the long axis, seen from the side; what was not seen (an underside) is missing."""
+    whole = mesh_of_cloud(points)
+    axis, centre = _plan(whole)
+    side = np.array([-axis[1], axis[0], 0.0])
+    width = float(np.ptp(whole.vertices @ side))
+    lateral = np.abs((whole.vertices - centre) @ side).reshape(-1, 6).mean(axis=1)
+    near = lateral < max(0.08 * width, 0.004)
+    if np.count_nonzero(near) < 10:
+        raise MagicError(Code.BAD_MESH, "points of the cloud near its middle plane", int(near.sum()), "at least 10")
+    faces = whole.faces.reshape(-1, 8, 3)[near].reshape(-1, 3)
+    used, faces = np.unique(faces, return_inverse=True)
+    part = Mesh(whole.vertices[used], faces.reshape(-1, 3))
+    # The wider end, where the bowl is, goes to the right.
+    along, across = (whole.vertices - centre) @ axis, (whole.vertices - centre) @ side
+    half = (along.min() + along.max()) / 2
+    if np.ptp(across[along < half]) > np.ptp(across[along >= half]):
+        axis = -axis
+    return _drawn(part, np.cross(axis, [0.0, 0.0, -1.0]), (0, 0, 1), "section", size, 0.5)
 
 
 def _top(mesh: Mesh, size: int, confidence: float) -> CanonicalView:

@@ -62,3 +62,41 @@ def test_a_kind_can_be_given():
     with pytest.raises(MagicError) as error:
         find_view(Mesh(np.zeros((0, 3)), np.zeros((0, 3))))
     assert error.value.code is Code.BAD_MESH
+
+
+def cloud_of(family, seed, count=8000):
+    import trimesh
+
+    made = shapes.make(family, seed).mesh
+    return made, np.asarray(trimesh.sample.sample_surface(made.to_trimesh(), count, seed=0)[0])
+
+
+@pytest.mark.parametrize("family, seed, kind", [("mug", 1, "side"), ("mug", 3, "side"), ("scissors", 1, "top"), ("hanger", 1, "top")])
+def test_a_cloud_is_seen_as_its_mesh_is(family, seed, kind):
+    mesh, points = cloud_of(family, seed)
+    view, true = find_view(points), find_view(mesh)
+    assert view.kind == true.kind == kind
+    if kind == "side":
+        assert abs(view.direction[0]) < 0.35
+    assert holes_of(view.mask).sum() > 0.005 * view.mask.sum()
+    # The same silhouette but for the points' size.
+    again = find_view(points, kind="top")
+    flat = find_view(mesh, kind="top")
+    pixels = flat.pixels(again.points(np.argwhere(again.mask)[::7, ::-1]))
+    u, v = np.clip(pixels.round().astype(int), 0, flat.mask.shape[0] - 1).T
+    assert cv2.dilate(flat.mask.astype(np.uint8), np.ones((15, 15)))[v, u].mean() > 0.97
+
+
+def test_the_cut_of_a_cloud_shows_the_bowl():
+    _, points = cloud_of("ladle", 2)
+    view = find_view(points, kind="section")
+    hull = np.zeros(view.mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(view.mask)[:, ::-1].astype(np.int32)), 1)
+    assert view.kind == "section" and view.mask.sum() < 0.6 * hull.sum()
+
+
+def test_no_cloud_is_refused():
+    for points in (np.zeros((3, 3)), np.full((50, 3), np.nan), np.zeros((50, 2))):
+        with pytest.raises(MagicError) as error:
+            find_view(points)
+        assert error.value.code is Code.BAD_MESH
