@@ -311,6 +311,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     """Match, plan and verify one case; the answer is plain data for ``results.json``."""
     import torch
 
+    from magic_bringup.pipeline import Agenda
     from magic_matcher.matching import Tool, tool_view
 
     _ready(options.variant)
@@ -348,19 +349,23 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         by_id = {tool.id: (tool, name) for tool, name in zip(tools, case.tools, strict=True)}
         last = None
         only_best = options.method == "no_verification"
-        for candidate in found.candidates[: 1 if only_best else None]:
-            tool, name = by_id[candidate.tool_id]
-            reflections = strategy.reflections if candidate.flipped else ("keep",)
-            for reflection in reflections[: 1 if only_best else None]:
-                entry, last, solved = _try(
-                    options, _strategy(options, name), candidate, reflection, tool, target, obstacles, seconds, answer
-                )
-                tried.append({"tool": _short(name), "score": float(candidate.score), "reflection": reflection, **entry})
-                if solved:
-                    answer["success"] = True
-                    break
-            if answer["success"]:
-                break
+        attempts = ARM_ATTEMPTS if options.variant == "arm" and not only_best else 1
+        agenda = Agenda(found.candidates[: 1 if only_best else None], strategy.reflections[: 1 if only_best else None], attempts)
+        entries: dict[tuple[int, str], dict[str, Any]] = {}
+        while not answer["success"] and (following := agenda.next()) is not None:
+            promise, trial = following
+            tool, name = by_id[trial.candidate.tool_id]
+            entry, tested_run = _try(options, _strategy(options, name), trial, tool, target, obstacles, seconds, answer)
+            last = tested_run or last
+            key = trial.index, trial.reflection
+            if key not in entries:
+                entries[key] = {"tool": _short(name), "score": float(trial.candidate.score), "reflection": trial.reflection, **entry}
+                tried.append(entries[key])
+            elif entry["stage"] == "verify":  # where no further grasp is found, what the last one came to says more
+                entries[key].update(entry)
+            entries[key]["attempts"] = trial.attempt + 1
+            answer["success"] = entry["code"] == Code.OK.name
+            agenda.failed(promise, trial, Code[entry["code"]])
         if not tried:
             answer["reason"] = "NO_MATCH"
         else:
@@ -384,63 +389,39 @@ def _reference(strategy: Strategy) -> Any:
 def _try(
     options: Options,
     strategy: Strategy,
-    candidate: Any,
-    reflection: str,
+    trial: Any,
     tool: SceneObject,
     target: SceneObject,
     obstacles: tuple[SceneObject, ...],
     seconds: dict[str, float],
     answer: dict[str, Any],
-) -> tuple[dict[str, Any], Any, bool]:
+) -> tuple[dict[str, Any], Any]:
+    """Plan and verify one trial: what is stored of it, and, if it was simulated, its verdict and tool."""
     from magic_core.motion import MotionPlan
+    from magic_planner.budget import Budget
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
     from magic_verifier.verification import verify
 
-    entry: dict[str, Any] = {"code": "", "message": ""}
-    last = None
-    for attempt in range(ARM_ATTEMPTS if options.variant == "arm" and options.method != "no_verification" else 1):
-        started = time.perf_counter()
-        try:
-            gap = GAP_IN_HAND if options.variant == "arm" else GAP
-            motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles, gap)
-            if options.variant == "arm":
-                from magic_planner.budget import Budget
-
-                plan = _arm_planner().plan(
-                    strategy,
-                    tool,
-                    target,
-                    candidate,
-                    reflection,
-                    motion,
-                    TABLE,
-                    obstacles,
-                    attempt=attempt,
-                    seed=options.seed,
-                    budget=Budget(PLANNING_TIME),
-                )
-            else:
-                plan = MotionPlan("fg", motion)
-        except MagicError as error:
-            if attempt:  # no further grasp: what the last one came to says more
-                return entry, last, False
-            return {"code": error.code.name, "message": error.message, "stage": "plan"}, last, False
-        finally:
-            seconds["plan"] += time.perf_counter() - started
-        verdict = verify(strategy, tool, target, obstacles, TABLE, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0)
-        seconds["verify"] += verdict.seconds
-        answer["simulations"] += 1
-        entry = {
-            "code": verdict.code.name,
-            "message": verdict.message,
-            "stage": "verify",
-            "metrics": {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)},
-        }
-        last = (verdict, tool)
-        if verdict.success:
-            return entry, last, True
-    return entry, last, False
+    started = time.perf_counter()
+    candidate, reflection = trial.candidate, trial.reflection
+    try:
+        gap = GAP_IN_HAND if options.variant == "arm" else GAP
+        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles, gap)
+        if options.variant == "arm":
+            given = (strategy, tool, target, candidate, reflection, motion, TABLE, obstacles)
+            plan = _arm_planner().plan(*given, attempt=trial.attempt, seed=options.seed, budget=Budget(PLANNING_TIME))
+        else:
+            plan = MotionPlan("fg", motion)
+    except MagicError as error:
+        return {"code": error.code.name, "message": error.message, "stage": "plan"}, None
+    finally:
+        seconds["plan"] += time.perf_counter() - started
+    verdict = verify(strategy, tool, target, obstacles, TABLE, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0)
+    seconds["verify"] += verdict.seconds
+    answer["simulations"] += 1
+    metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}
+    return {"code": verdict.code.name, "message": verdict.message, "stage": "verify", "metrics": metrics}, (verdict, tool)
 
 
 def _draw(path: Path, last: Any, target: SceneObject, obstacles: tuple[SceneObject, ...]) -> None:
