@@ -86,7 +86,7 @@ JOBS: dict[str, Job] = {
 
 #: What counts as held: standing off from the contact, sliding before it rests (half a radius is the drift that a pull may
 #: have), and the depth of the hollow, in radii.
-GAP, DRIFT, DEPTH = 1.05, 0.5, 0.3
+GAP, DRIFT, DEPTH = 0.6, 0.5, 0.3
 
 
 @dataclass(frozen=True)

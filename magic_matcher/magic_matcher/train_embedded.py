@@ -27,10 +27,15 @@ from magic_matcher import jobs
 from magic_matcher.embedded import DISTANCES, EmbeddedFeatures, default_weights
 from magic_matcher.features import make_reference
 
+#: By so much (rad) the local stage's normal, taken at a larger scale, may differ from the contour's.
+TILT = np.deg2rad(12.0)
+#: What a right place is worth that is not in the middle of a region, or not whatever the normal's error.
+ENDS = 0.1
+
 
 @dataclass(frozen=True)
 class Pair:
-    """One reference and one tool: distances (2, B, D), right (B,) whole regions, middle (B,) their middles."""
+    """One reference and one tool: distances (2, B, D), right (B,) whole regions, middle (B,) the steady places in them."""
 
     job: str
     reference: str
@@ -73,9 +78,12 @@ def pairs(per_family: int, seed: int, references: int = 8) -> list[Pair]:
                 if job.needs == "region":
                     middle = right & tool.near(found.points, found.normals, 3.0, share=0.5)
                 else:
-                    # Where the disc need not slide first.
+                    # Where the disc need not slide first, nor would if the normal were read a little otherwise.
                     held = tool.held(found.points, found.normals, radius)
                     middle = right & (held.drift <= 0.5 * jobs.DRIFT)
+                    for angle in (-TILT, TILT):
+                        c, s = np.cos(angle), np.sin(angle)
+                        middle &= tool.works(found.points, found.normals @ np.array([[c, s], [-s, c]]), radius)
                 if right.any():
                     made += 1
                     result.append(Pair(job.name, source, family, parts.astype(np.float32), right, middle if middle.any() else right))
@@ -111,8 +119,7 @@ def fit(data: list[Pair], steps: int, pull: float = 1e-3, temperature: float = 0
     good = torch.full((len(data), longest), -torch.inf)
     for k, pair in enumerate(data):
         distances[k, :, : len(kept[k])] = torch.from_numpy(pair.distances[:, kept[k]])
-        # The middle of a region is worth three times its ends.
-        worth = np.where(pair.middle, 0.0, np.where(pair.right, np.log(1 / 3), -np.inf)).astype(np.float32)
+        worth = np.where(pair.middle, 0.0, np.where(pair.right, np.log(ENDS), -np.inf)).astype(np.float32)
         good[k, : len(kept[k])] = torch.from_numpy(worth[kept[k]])
     raw = torch.from_numpy(np.log(np.expm1(np.maximum(default_weights(), 1e-3)))).float().requires_grad_(True)
     optimiser = torch.optim.Adam([raw], lr=0.06)
