@@ -211,14 +211,17 @@ def open_holes(truth: Mesh, view: CanonicalView, found: Mesh, least: float = 6e-
     return total, opened
 
 
-def meshes(folder: Path, segmenter: Segmenter, poses: int = 3, seed: int = 0) -> tuple[dict[str, object], list[NDArray[np.uint8]]]:
-    """Ray-cast captures of each mesh file in ``poses`` yaws; also a row of pictures for each mesh."""
+def meshes(
+    folder: Path, segmenter: Segmenter, poses: int = 3, seed: int = 0, count: int = 2
+) -> tuple[dict[str, object], list[NDArray[np.uint8]]]:
+    """Ray-cast captures of each mesh file in ``poses`` yaws by ``count`` cameras; also a row of pictures for each mesh."""
     from magic_core import sensor
 
     cameras = {
         "left": sensor.looking_at([0.94, 0.42, 0.66], [0.5, 0, 0.03]),
         "right": sensor.looking_at([0.94, -0.42, 0.66], [0.5, 0, 0.03]),
     }
+    cameras = dict(list(cameras.items())[:count])
     rows, pictures = [], []
     for number, path in enumerate(sorted(folder.glob("*/*.obj"))):
         for turn in range(poses):
@@ -397,6 +400,7 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("evaluation"), help="folder for the results (default ./evaluation)")
     parser.add_argument("--parts", nargs="+", choices=("osd", "captures", "meshes"), default=["osd", "captures", "meshes"])
     parser.add_argument("--poses", type=int, default=3, help="yaws of each mesh (default 3)")
+    parser.add_argument("--cameras", type=int, choices=(1, 2), default=2, help="cameras that see the meshes (default 2)")
     parser.add_argument("--segmenter", default="depth")
     parser.add_argument("--weights", default="")
     parser.add_argument("--no-split", action="store_true", help="do not part touching objects (osd)")
@@ -428,7 +432,7 @@ def main(args: list[str] | None = None) -> None:
             elif part == "captures":
                 result[part] = captures(folder, segmenter)
             else:
-                result[part], pictures = meshes(folder, segmenter, given.poses, given.seed)
+                result[part], pictures = meshes(folder, segmenter, given.poses, given.seed, given.cameras)
                 half = -(-len(pictures) // 2)
                 pictures += [np.zeros_like(pictures[0])] * (2 * half - len(pictures))
                 sheet = np.hstack([np.vstack(pictures[:half]), np.vstack(pictures[half:])])

@@ -228,6 +228,8 @@ def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.
         thickness = far - scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() - depth
         where = np.ix_(v, u)
         mask, told = sight.mask[where], ~sight.hidden[where]
+        with np.errstate(invalid="ignore"):
+            told &= mask | ~(sight.depth[where] < depth - 0.02)  # something in front of it
         overlaps.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
         inner = cv2.erode(drawn.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & told
         with np.errstate(invalid="ignore"):
