@@ -1,0 +1,109 @@
+"""Free motion of the arm, empty and with the tool in hand: straight where that is clear, else by RRT-Connect."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.errors import Code, MagicError
+from magic_planner import timing
+from magic_planner.budget import Budget
+from magic_planner.request import STAGES, ArmSettings, Branch, Request, StageError
+from magic_planner.robot import Robot
+from magic_planner.workspace import Workspace
+
+Array = NDArray[np.float64]
+#: Searches for one free path, each with its own random numbers.
+SEARCHES = 3
+
+
+class FreeMotion:
+    """Finds joint paths from one configuration to another."""
+
+    def __init__(self, space: Workspace, settings: ArmSettings) -> None:
+        self.space, self.robot, self.settings = space, space.robot, settings
+
+    def come(self, request: Request, goal: Array) -> Array:
+        """Joint path (n, J) of the empty hand from where the arm is to ``goal`` (J,) before the tool; raises StageError."""
+        self.space.lay(request, request.tool.world_from_object)
+        self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
+        return self._free(request, request.start, goal, "approach")
+
+    def carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
+        """Joint path (n, J) with the tool in hand from the lift to the start of the task; raises StageError."""
+        robot = self.robot
+        self.space.hold(request, branch.grasp)
+        for q, what in ((start, "lifted"), (goal, "at the start of the task")):
+            pair = robot.collision(q)
+            if pair is not None:
+                raise StageError(
+                    "transfer",
+                    MagicError(
+                        Code.PATH_IN_COLLISION, f"the tool {what}: {pair}", "in collision", "a tool in the hand clear of everything"
+                    ),
+                )
+        # A tool shifts a little in the hand when it is gripped: it is carried with room about it, where its ends leave that.
+        for room in (self.settings.room, self.settings.room / 3):
+            self.space.hold(request, branch.grasp, request.roomy(room))
+            robot.allow(request.tool.id, "table")
+            if robot.collides(start) or robot.collides(goal):
+                continue
+            try:
+                path = self._free(request, start, goal, "transfer")
+            except StageError:
+                continue
+            # What was left out: the table, above which the task may begin by a hair.
+            self.space.hold(request, branch.grasp)
+            if robot.first_collision(timing.swept(path, 0.03), budget=request.budget, stage="transfer") is None:
+                return path
+        self.space.hold(request, branch.grasp)
+        return self._free(request, start, goal, "transfer")
+
+    def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
+        """A collision-free joint path (n, J): straight where that is free, else by RRT-Connect and shortened."""
+        import mplib
+
+        robot = self.robot
+        line = np.stack([start, goal])
+        if robot.first_collision(line, step=0.03, budget=request.budget, stage=stage) is None:
+            return line
+        pair = robot.collision(start) or robot.collision(goal)
+        if pair is not None:
+            raise StageError(stage, MagicError(Code.PATH_IN_COLLISION, f"an end of the free motion: {pair}", "in collision", "free ends"))
+        rng = np.random.default_rng([request.seed, STAGES.index(stage)])
+        for n in range(SEARCHES):
+            request.budget.check(stage)
+            mplib.set_global_seed(int(request.seed) % 100_000 * 10 + n + 1)
+            seconds = min(self.settings.free_time, max(0.05, request.budget.left))
+            status, path = robot.planner.planner.plan(start, [goal], time=seconds, range=0.3, simplify=False)
+            if not str(status).startswith("Exact"):
+                continue
+            path = np.asarray(path, dtype=float)
+            # OMPL checks edges coarsely, and a spline swings out at corners; what that meets is found here.
+            for shorter in (_shorten(robot, path, rng, request.budget, stage), path):
+                if robot.first_collision(timing.swept(shorter, 0.03), budget=request.budget, stage=stage) is None:
+                    return shorter
+        raise StageError(
+            stage,
+            MagicError(
+                Code.NO_PATH,
+                f"free motion of stage {stage}",
+                f"none found in {SEARCHES * self.settings.free_time:.1f} s",
+                "a way around the obstacles",
+            ),
+        )
+
+
+def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str, rounds: int = 25) -> Array:
+    """Replace stretches of a path (n, J) by straight lines wherever those are free."""
+    for _ in range(rounds):
+        if len(path) < 3:
+            break
+        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        a, b = np.sort(rng.uniform(0, lengths[-1], 2))
+        if b - a < 1e-3:
+            continue
+        ends = np.stack([np.array([np.interp(s, lengths, path[:, j]) for j in range(path.shape[1])]) for s in (a, b)])
+        if robot.first_collision(ends, step=0.08, budget=budget, stage=stage) is None:
+            path = np.concatenate([path[lengths < a - 1e-9], ends, path[lengths > b + 1e-9]])
+    return path

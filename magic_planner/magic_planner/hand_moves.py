@@ -1,0 +1,118 @@
+"""Short straight moves of the hand: coming to the grasp, lifting the tool, taking the open hand away."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_planner.request import ArmSettings, Branch, Request, StageError
+from magic_planner.workspace import Workspace
+
+Array = NDArray[np.float64]
+
+
+class HandMoves:
+    """Plans the straight moves by tracked inverse kinematics."""
+
+    def __init__(self, space: Workspace, settings: ArmSettings) -> None:
+        self.space, self.robot, self.settings = space, space.robot, settings
+
+    def straight(self, start: Array, shift: Array, q: Array) -> list[Array | None]:
+        """Joint paths from each of q (N, J) along a straight move of the hand by ``shift`` (3,) metres, base axes; None where one
+        cannot follow."""
+        parts = max(2, int(np.ceil(np.linalg.norm(shift) / 0.01))) + 1
+        targets = np.repeat(start[None], parts, axis=0)
+        targets[:, :3, 3] += np.linspace(0, 1, parts)[:, None] * shift
+        paths, stopped, _ = self.robot.chain.track(np.repeat(targets[:, None], len(q), axis=1), q, jump=self.settings.jump)
+        return [paths[:, n] if stopped[n] == parts else None for n in range(len(q))]
+
+    def pick(self, request: Request, branch: Branch) -> tuple[Array, Array, Array]:
+        """Joint paths of coming to the grasp (n, J), the grasp itself (J,) and the lift (m, J)."""
+        robot, settings = self.robot, self.settings
+        request.feedback("lift", "picking the tool up")
+        tip = request.tool.world_from_object @ branch.grasp.tool_from_tcp
+        _, solutions = robot.inverse(tip[None], np.stack([branch.path[0], request.start]), seeds=16)
+        if not len(solutions):
+            raise StageError(
+                "approach",
+                MagicError(Code.NO_IK, f"the grasp of {request.tool.id} where it lies", "out of reach", "a tool that the arm can reach"),
+            )
+        # The posture nearest to both neighbours costs the least motion.
+        far = np.abs(solutions - branch.path[0]).max(axis=1) + np.abs(solutions - request.start).max(axis=1)
+        problem: StageError | None = None
+        ways: list[tuple[Array, Array]] = []
+        self.space.lay(request, request.tool.world_from_object)
+        solutions = solutions[np.argsort(far, kind="stable")][:8]
+        backs = [self.straight(tip, -share * settings.standoff * tip[:3, 2], solutions) for share in (1.0, 0.5)]
+        for n, q in enumerate(solutions):
+            request.budget.check("approach")
+            for back in (backs[0][n], backs[1][n]):
+                if back is None:
+                    problem = problem or StageError(
+                        "approach",
+                        MagicError(
+                            Code.NO_IK,
+                            f"coming straight to the grasp of {request.tool.id}",
+                            "out of reach",
+                            f"{settings.standoff} m of straight way",
+                        ),
+                    )
+                    continue
+                hit = robot.first_collision(back[::-1], budget=request.budget, stage="approach")
+                if hit is None:
+                    ways.append((back[::-1], q))
+                    break
+                problem = StageError(
+                    "approach",
+                    MagicError(Code.PATH_IN_COLLISION, f"coming to the grasp: {hit[1]}", "in collision", "a clear way to the tool"),
+                )
+            if len(ways) >= 3:
+                break
+        self.space.hold(request, branch.grasp)
+        # The tool leaves what it lies on.
+        robot.allow(request.tool.id, "table", *request.surroundings())
+        for back, q in ways:
+            for height in (settings.lift, settings.lift / 2):
+                up = self.straight(tip, height * request.plane[:3], q[None])[0]
+                if up is None:
+                    problem = StageError(
+                        "lift",
+                        MagicError(
+                            Code.NO_IK, f"lifting {request.tool.id} by {height:.2f} m", "out of reach", "a lift that the arm can follow"
+                        ),
+                    )
+                    continue
+                hit = robot.first_collision(up, budget=request.budget, stage="lift")
+                if hit is None:
+                    return back, q, up
+                problem = StageError(
+                    "lift", MagicError(Code.PATH_IN_COLLISION, f"lifting {request.tool.id}: {hit[1]}", "in collision", "a clear lift")
+                )
+        assert problem is not None
+        raise problem
+
+    def retreat(self, request: Request, branch: Branch, task: Array) -> Array:
+        """Joint path (n, J) of the open hand away from the released tool: back along its own axis, or as near to it as is clear."""
+        robot, settings = self.robot, self.settings
+        request.feedback("retreat", "taking the open hand away")
+        self.space.lay(request, request.poses[-1])
+        tip = request.poses[-1] @ branch.grasp.tool_from_tcp
+        problem: StageError | None = None
+        back = -tip[:3, 2]
+        for direction in (back, transforms.unit(back + 0.5 * request.plane[:3]), transforms.unit(back - 0.5 * request.plane[:3])):
+            path = self.straight(tip, settings.retreat * direction, task[-1:])[0]
+            if path is None:
+                problem = problem or StageError(
+                    "retreat", MagicError(Code.NO_IK, "taking the open hand away", "out of reach", f"{settings.retreat} m of straight way")
+                )
+                continue
+            hit = robot.first_collision(path, budget=request.budget, stage="retreat")
+            if hit is None:
+                return path
+            problem = StageError(
+                "retreat", MagicError(Code.PATH_IN_COLLISION, f"taking the open hand away: {hit[1]}", "in collision", "a clear way back")
+            )
+        assert problem is not None
+        raise problem

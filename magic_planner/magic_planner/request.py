@@ -1,0 +1,130 @@
+"""What a request for an arm motion consists of, the ways found to serve it, and how their failures are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.errors import MagicError
+from magic_core.motion import ToolMotion
+from magic_core.scene import SceneObject
+from magic_core.strategy import Strategy
+from magic_planner.budget import Budget
+from magic_planner.cloud import cloud_name
+from magic_planner.collision import grown, shell, solid_pieces
+from magic_planner.grasps import Grasp
+
+Array = NDArray[np.float64]
+#: The stages of a plan in the order in which they are decided: a later one is a better failure.
+STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", "timing")
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """key_length, key_angle: spacing of the poses at which grasps are compared.  grasps: how many are compared at once, rounds:
+    how many such lots.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
+    lift, retreat: metres.  room: metres about a tool that is carried.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
+    neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path
+    (searches take some 20 ms; the limit is wide so that a loaded machine finds the same path)."""
+
+    key_length: float = 0.02
+    key_angle: float = np.deg2rad(8.0)
+    grasps: int = 40
+    rounds: int = 3
+    tries: int = 10
+    standoff: float = 0.08
+    lift: float = 0.06
+    retreat: float = 0.08
+    room: float = 0.015
+    dwell: float = 0.5
+    jump: float = 0.5
+    time_step: float = 0.02
+    free_time: float = 1.0
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One way to take the tool along the key poses: which grasp, and the joint positions (K, J)."""
+
+    grasp: Grasp
+    path: Array
+    cost: float
+
+
+@dataclass
+class Request:
+    """What one call of :meth:`ArmPlanner.plan` works on."""
+
+    strategy: Strategy
+    tool: SceneObject
+    target: SceneObject
+    obstacles: tuple[SceneObject, ...]
+    motion: ToolMotion
+    plane: Array
+    start: Array
+    seed: int
+    budget: Budget
+    feedback: Callable[[str, str], None]
+    times: Array  # (T,) of the task: the tool's motion up to the release
+    poses: Array  # (T, 4, 4)
+    keys: NDArray[np.int64]  # (K,) indices into times
+    met: float  # seconds at which the tool meets the target
+    shapes: list[Any]  # the tool's surface
+    marks: tuple[tuple[str, float], ...]  # names of the places the tool's motion passes, and when
+    cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
+    _grown: dict[float, list[Any]] = field(default_factory=dict)
+
+    def roomy(self, margin: float) -> list[Any]:
+        """The tool's surface grown by ``margin`` metres."""
+        if margin <= 0:
+            return self.shapes
+        if margin not in self._grown:
+            self._grown[margin] = shell(grown(solid_pieces(self.tool), margin))
+        return self._grown[margin]
+
+    def surroundings(self, target: bool = True) -> list[str]:
+        """Names of all that is in the collision world besides table and tool; without the target on request."""
+        items = (self.target, *self.obstacles) if target else self.obstacles
+        return [item.id for item in items] + [cloud_name(item) for item in items if item.id in self.cloud]
+
+    def place(self, index: int) -> str:
+        """A sentence's name for a sample of the task: the waypoint it leads to."""
+        now = float(self.times[index])
+        marks = self.marks
+        name = next((n for n, t in marks if t >= now - 1e-6), marks[-1][0])
+        return f"waypoint {name!r} (at {now:.2f} s of the tool's motion)"
+
+
+class StageError(Exception):
+    """A try that ended at a stage of :data:`STAGES`."""
+
+    def __init__(self, stage: str, error: MagicError) -> None:
+        super().__init__(str(error))
+        self.stage = stage
+        self.error = error
+
+
+class Failures:
+    """The failures of the tries, of which the one that came furthest counts."""
+
+    def __init__(self) -> None:
+        self._best: tuple[int, MagicError] | None = None
+        self.count = 0
+
+    def add(self, stage: str, error: MagicError) -> None:
+        """Note that a try ended at a stage."""
+        self.count += 1
+        rank = STAGES.index(stage)
+        if self._best is None or rank > self._best[0]:
+            self._best = (rank, error)
+
+    def error(self) -> MagicError:
+        """The failure to report."""
+        assert self._best is not None
+        rank, error = self._best
+        tail = f"; {self.count} tries failed, this one came furthest" if self.count > 1 else ""
+        return MagicError(error.code, f"stage {STAGES[rank]}: {error.message}{tail}")

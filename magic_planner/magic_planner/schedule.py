@@ -1,0 +1,170 @@
+"""The whole motion on one clock: the paths timed and joined, the phases named, the limits checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
+from magic_planner import timing
+from magic_planner.collision import mass_centre, solid_pieces
+from magic_planner.request import ArmSettings, Branch, Request, StageError
+from magic_planner.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class Schedule:
+    """Makes a plan of joint paths."""
+
+    def __init__(self, robot: Robot, settings: ArmSettings) -> None:
+        self.robot, self.settings = robot, settings
+
+    def timed(
+        self,
+        request: Request,
+        branch: Branch,
+        come: Array,
+        pick: tuple[Array, Array, Array],
+        carry: Array,
+        task: Array,
+        retreat: Array | None,
+    ) -> MotionPlan:
+        """The plan that consists of joint paths (n, J): come, (approach, grasp, lift) of ``pick``, carry, task and retreat.
+
+        Raises StageError where no timing keeps the limits of joints and torques.
+        """
+        robot, settings = self.robot, self.settings
+        velocity, acceleration, step = robot.velocity_limits, robot.acceleration_limits, settings.time_step
+        track = timing.Track(robot.count)
+        names: list[tuple[str, float]] = []
+        try:
+            track.append(timing.parameterise(come, velocity, acceleration, step, corners=True))
+            track.append(timing.parameterise(pick[0], velocity * 0.6, acceleration, step))
+            grasp_time = track.now
+            track.hold(settings.dwell, step)
+            names.append(("grasp", track.now))
+            track.append(timing.parameterise(pick[2], velocity * 0.6, acceleration, step))
+            track.append(timing.parameterise(carry, velocity, acceleration, step, corners=True))
+            names.append(("transfer", track.now))
+            began = track.now
+            clock = track.follow(request.times, task, self._rests(request), velocity, acceleration, step)
+        except timing.Infeasible as error:
+            raise StageError(
+                "timing",
+                MagicError(
+                    Code.TIME_PARAMETERISATION, "time parameterisation", str(error), "a path that velocity and acceleration limits allow"
+                ),
+            ) from error
+        for phase in request.motion.phases:
+            if phase.start < request.times[-1] - 1e-9:
+                names.append((phase.name, began + float(clock(min(phase.end, float(request.times[-1]))))))
+        release_time = None
+        if retreat is not None:
+            release_time = track.now
+            track.hold(settings.dwell, step)
+            names.append(("release", track.now))
+            try:
+                track.append(timing.parameterise(retreat, velocity * 0.6, acceleration, step))
+            except timing.Infeasible as error:
+                raise StageError(
+                    "timing",
+                    MagicError(
+                        Code.TIME_PARAMETERISATION, "time parameterisation of the retreat", str(error), "a path that the limits allow"
+                    ),
+                ) from error
+            names.append(("retreat", track.now))
+        times, q, qd, qdd = track.arrays()
+        self._check_limits(request, branch, times, q, qd, qdd, grasp_time, release_time)
+        held = (times >= grasp_time) & (times <= (np.inf if release_time is None else release_time))
+        poses = np.empty((len(times), 4, 4))
+        poses[held] = robot.chain.forward(q[held]) @ transforms.inverse(branch.grasp.tool_from_tcp)
+        poses[times < grasp_time] = request.tool.world_from_object
+        if release_time is not None:
+            poses[times > release_time] = poses[held][-1]
+        phases = _phases(names)
+        return MotionPlan(
+            "arm",
+            ToolMotion(times, poses, phases),
+            ArmMotion(
+                times, robot.chain.names, q, qd, qdd, branch.grasp.tool_from_tcp, branch.grasp.width, grasp_time, release_time, phases
+            ),
+        )
+
+    def _rests(self, request: Request) -> list[int]:
+        """Indices of task samples at which the tool stands still, so that its motion may be timed piece by piece."""
+        last = len(request.times) - 1
+        if request.strategy.mode != "plan":
+            return [0, last]
+        found = {0, last}
+        for _, when in request.marks:
+            found.add(min(last, int(np.abs(request.times - when).argmin())))
+        return sorted(found)
+
+    def _check_limits(
+        self, request: Request, branch: Branch, times: Array, q: Array, qd: Array, qdd: Array, grasp_time: float, release_time: float | None
+    ) -> None:
+        robot = self.robot
+        over = np.argwhere((q < robot.chain.lower - 1e-6) | (q > robot.chain.upper + 1e-6))
+        if len(over):
+            i, j = over[0]
+            raise StageError(
+                "timing",
+                MagicError(
+                    Code.JOINT_LIMIT,
+                    f"{robot.chain.names[j]} at {times[i]:.2f} s",
+                    round(float(q[i, j]), 4),
+                    f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad",
+                ),
+            )
+        for values, limits, unit in (
+            (qd, robot.chain.velocity, "rad/s"),
+            (qdd, np.array(robot.acceleration_limits) / robot.config.acceleration_scale, "rad/s^2"),
+        ):
+            over = np.argwhere(np.abs(values) > limits * 1.001)
+            if len(over):
+                i, j = over[0]
+                raise StageError(
+                    "timing",
+                    MagicError(
+                        Code.DYNAMIC_LIMIT,
+                        f"{robot.chain.names[j]} at {times[i]:.2f} s",
+                        f"{values[i, j]:.3f} {unit}",
+                        f"up to {limits[j]:.3f} {unit}",
+                    ),
+                )
+        some = np.unique(np.linspace(0, len(times) - 1, min(len(times), 60)).astype(int))
+        held = (times[some] >= grasp_time) & (times[some] <= (np.inf if release_time is None else release_time))
+        volume, centre = mass_centre(solid_pieces(request.tool))
+        mass = volume * request.strategy.physics.tool_density
+        for rows, load in ((some[held], mass), (some[~held], 0.0)):
+            if not len(rows):
+                continue
+            torques = np.abs(
+                robot.chain.gravity_torques(q[rows], load, transforms.apply(transforms.inverse(branch.grasp.tool_from_tcp), centre))
+            )
+            over = np.argwhere(torques > robot.chain.effort)
+            if len(over):
+                i, j = over[0]
+                raise StageError(
+                    "timing",
+                    MagicError(
+                        Code.DYNAMIC_LIMIT,
+                        f"{robot.chain.names[j]} at {times[rows[i]]:.2f} s with {load:.2f} kg in hand",
+                        f"{torques[i, j]:.1f} N m",
+                        f"up to {robot.chain.effort[j]} N m",
+                    ),
+                )
+
+
+def _phases(ends: Sequence[tuple[str, float]]) -> tuple[Phase, ...]:
+    phases, start = [], 0.0
+    for name, end in ends:
+        if end > start + 1e-9:
+            phases.append(Phase(name, start, end))
+            start = end
+    return tuple(phases)

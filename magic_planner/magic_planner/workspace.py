@@ -1,0 +1,64 @@
+"""The collision world of one request, in its states: the tool lying, in the hand, left where it was let go."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_planner.cloud import CloudSettings, cloud_name
+from magic_planner.collision import shell, solid_pieces
+from magic_planner.grasps import Grasp
+from magic_planner.request import Request
+from magic_planner.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class Workspace:
+    """What the arm may touch, and what it may not, as the request proceeds."""
+
+    def __init__(self, robot: Robot, cloud: CloudSettings) -> None:
+        self.robot = robot
+        self.cloud = cloud
+
+    def build(self, request: Request) -> None:
+        """Table, target, obstacles with their clouds, and the tool where it lies; whatever was there before is gone."""
+        robot = self.robot
+        robot.clear()
+        robot.add_table(request.plane)
+        for item in (request.target, *request.obstacles):
+            robot.add(item.id, shell(solid_pieces(item)), item.world_from_object)
+            if item.id in request.cloud:
+                robot.add_cloud(cloud_name(item), request.cloud[item.id], self.cloud.resolution)
+        robot.add(request.tool.id, request.shapes, request.tool.world_from_object)
+
+    def hold(self, request: Request, grasp: Grasp, shapes: list[Any] | None = None) -> None:
+        """The world with the tool (or other shapes in its frame) in the closed hand; it may touch nothing else yet."""
+        robot, name = self.robot, request.tool.id
+        robot.detach()
+        if robot.world.has_object(name):
+            robot.world.remove_object(name)
+        robot.open_to(grasp.width)
+        robot.attach(name, shapes or request.shapes, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
+        robot.allow(name, "table", *request.surroundings(), allowed=False)
+        self.ignore_target(request, False)
+
+    def lay(self, request: Request, pose: Array) -> None:
+        """The world with the tool lying at a pose and the hand open about it; only the fingers may touch it."""
+        robot, name = self.robot, request.tool.id
+        robot.detach()
+        robot.open_to(robot.config.opening)
+        robot.add(name, request.shapes, pose)
+        robot.allow(name, *robot.finger_links)
+        robot.allow(name, "table", *request.surroundings())
+        self.ignore_target(request, False)
+
+    def ignore_target(self, request: Request, ignored: bool) -> None:
+        """Let the arm touch the target (once it moves with the tool, where it is is not known any more), or forbid it again."""
+        links = list(self.robot.planner.user_link_names)
+        self.robot.allow(request.target.id, *links, allowed=ignored)
+        if request.target.id in request.cloud:
+            self.robot.allow(cloud_name(request.target), *links, allowed=ignored)
