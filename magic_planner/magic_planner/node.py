@@ -89,12 +89,15 @@ class PlannerNode(Node):
             agreement=parameter(self, "grasp.agreement", 0.9, "Least cosine between the normals at the two fingers.", low=0.0, high=1.0),
             samples=parameter(self, "grasp.samples", 500, "Surface points tried for a grasp.", low=10, high=20000),
             clearance=parameter(self, "grasp.clearance", 0.0015, "Metres between hand and table.", low=0.0, high=0.1),
+            grip_force=parameter(self, "grasp.grip_force", 60.0, "Newtons of each finger, for the ranking by slip.", low=1.0, high=1000.0),
+            friction=parameter(self, "grasp.friction", 0.6, "Friction between pad and tool, for the ranking by slip.", low=0.05, high=3.0),
             away=parameter(self, "grasp.away", 0.035, "Metres around the contact in which no finger is placed.", low=0.0, high=1.0),
         )
         settings = ArmSettings(
             standoff=parameter(self, "standoff", 0.08, "Metres of straight way to the grasp.", low=0.01, high=0.5),
             lift=parameter(self, "lift", 0.06, "Metres straight up after the grasp.", low=0.005, high=0.5),
             retreat=parameter(self, "retreat", 0.08, "Metres straight away after a release.", low=0.01, high=0.5),
+            room=parameter(self, "room", 0.015, "Metres of room about a tool that is carried.", low=0.0, high=0.1),
             dwell=parameter(self, "dwell", 0.5, "Seconds for the fingers to close or open.", low=0.0, high=10.0),
             time_step=parameter(self, "time_step", 0.02, "Seconds between the points of the trajectory.", low=0.002, high=0.2),
         )
