@@ -18,10 +18,10 @@ DEADLINE = 20.0
 def planner(folder, domain: int, **parameters) -> Iterator:
     """An action client of a planner node that has the strategy ``pulling``; folder: where that may be written."""
     import rclpy
-    from rclpy.action import ActionClient
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
+    from magic_core.actions import ActionClient
     from magic_interfaces.action import PlanMotion
     from magic_planner.node import PlannerNode
 

@@ -30,10 +30,10 @@ def _save(folder, name, goal):
 def verifier(folder, domain: int) -> Iterator:
     """An action client of a verifier node that has the strategies ``hooking`` and ``juggling``; folder: where these may be written."""
     import rclpy
-    from rclpy.action import ActionClient
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
+    from magic_core.actions import ActionClient
     from magic_interfaces.action import VerifyMotion
     from magic_verifier.node import VerifierNode
 
