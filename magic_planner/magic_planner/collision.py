@@ -228,8 +228,8 @@ class Body:
         self.centres = transforms.apply(self.pose, self.local)
         self.object.set_pose(fcl_pose(self.pose))
 
-    def touches(self, other: Body) -> bool:
-        """Whether this body and the other have a point in common."""
+    def touches(self, other: Body, inside: bool = True) -> bool:
+        """Whether this body and the other have a point in common; without ``inside`` their surfaces only, which is quicker."""
         from mplib.collision_detection import fcl
 
         reach = self.radii[:, None] + other.radii[None, :]
@@ -238,6 +238,8 @@ class Body:
             return False
         if fcl.collide(self.object, other.object).is_collision():
             return True
+        if not inside:
+            return False
         # The surfaces are apart: a piece is wholly inside another one, with any of its points, or outside.
         return self._holds(other, near) or other._holds(self, near[:, ::-1])
 

@@ -42,6 +42,8 @@ MOST = 0.10
 NEAR = 0.012
 #: How far ahead, metres, the tool looks when it may step aside.
 LOOK_AHEAD = 0.04
+#: Displacements below this, metres, are left out where nothing asks for them.
+CLEAR = 3e-4
 #: Least way, metres, over which a displacement is smoothed.
 SMOOTHING = 0.03
 #: A piece with more corners is represented by the outermost ones in so many directions: what is cut off its curves is below
@@ -92,8 +94,9 @@ def separations(tool: Pieces, pose: Array, walls: Pieces, mine: NDArray[np.int64
     G faces are the wall's piece's, the others the tool's.
     """
     rotation, shift = pose[:3, :3], pose[:3, 3]
-    normals = (tool.normals @ rotation.T)[mine]  # (K, F, 3)
-    corners = (tool.corners @ rotation.T + shift)[mine]  # (K, V, 3)
+    some, which = np.unique(mine, return_inverse=True)
+    normals = (tool.normals[some] @ rotation.T)[which]  # (K, F, 3)
+    corners = (tool.corners[some] @ rotation.T + shift)[which]  # (K, V, 3)
     wall_normals, wall_corners = walls.normals[theirs], walls.corners[theirs]
     before = np.matmul(wall_normals, corners.transpose(0, 2, 1)).min(axis=2) - walls.offsets[theirs]
     beyond = np.matmul(normals, wall_corners.transpose(0, 2, 1)).min(axis=2) - tool.offsets[mine] - normals @ shift
@@ -171,15 +174,15 @@ def give_way(
 
 def _both_walks(walk: _Walk, first: int, last: int) -> Array:
     """Displacements (T, 2) of the two walks over a path that is not clear from sample ``first`` to ``last``."""
-    found = walk.displacements(np.zeros((len(walk.poses), 2)), first - 1, last)
+    found = walk.displacements(np.zeros((len(walk.poses), 2)), first - 1, last, stride=2)
     if not np.isfinite(found).all():
         return found
     smooth = _smoothed(found, walk.poses)
-    moved = np.flatnonzero(np.linalg.norm(smooth, axis=1) > 1e-4)
+    moved = np.flatnonzero(np.linalg.norm(smooth, axis=1) > CLEAR)
     if not len(moved):
         return found
-    smooth[: max(1, moved[0])] = 0.0
-    return walk.displacements(smooth, int(moved[0]), len(smooth))
+    smooth[: max(1, moved[0])] = smooth[moved[-1] + 1 :] = 0.0
+    return walk.displacements(smooth, int(moved[0]) - 1, max(last, int(moved[-1])))
 
 
 def _allowed(shifts: Array) -> NDArray[np.bool_]:
@@ -189,9 +192,17 @@ def _allowed(shifts: Array) -> NDArray[np.bool_]:
 def _hits(poses: Array, tool: Body, walls: Sequence[Body]) -> NDArray[np.bool_]:
     """(T,) whether the tool touches any of the walls."""
     hits = np.zeros(len(poses), dtype=bool)
-    for index, pose in enumerate(poses if walls else ()):
-        tool.move(pose)
-        hits[index] = any(tool.touches(wall) for wall in walls)
+    if not walls:
+        return hits
+    low, high = (tool.local - tool.radii[:, None]).min(axis=0), (tool.local + tool.radii[:, None]).max(axis=0)
+    centres = poses[:, :3, :3] @ ((low + high) / 2) + poses[:, :3, 3]
+    halves = np.abs(poses[:, :3, :3]) @ ((high - low) / 2)
+    for wall in walls:
+        # Between a clear pose and one wholly inside there is one that touches: the surfaces are enough.
+        low, high = (wall.centres - wall.radii[:, None]).min(axis=0), (wall.centres + wall.radii[:, None]).max(axis=0)
+        for index in np.flatnonzero(~hits & np.all((centres - halves <= high) & (centres + halves >= low), axis=1)):
+            tool.move(poses[index])
+            hits[index] = tool.touches(wall, inside=False)
     return hits
 
 
@@ -232,6 +243,8 @@ class _Walk:
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
         self.ahead = np.minimum(np.searchsorted(way, way + LOOK_AHEAD), len(poses) - 1)
         self.gap = gap
+        ends = tool.corners.min(axis=1), tool.corners.max(axis=1)
+        self.middles, self.halves = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
         self.low, self.high = walls.corners.min(axis=1), walls.corners.max(axis=1)
         flat = plane[:3] @ basis
         length = float(np.linalg.norm(flat))
@@ -240,16 +253,18 @@ class _Walk:
         heights = ((plane[:3] @ poses[:, :3, :3]) @ corners.T).min(axis=1) + poses[:, :3, 3] @ plane[:3] + plane[3]
         self.floor = np.minimum(clearance - heights, 0.0) / max(length, IN_PLANE)
 
-    def displacements(self, preferred: Array, first: int, last: int) -> Array:
+    def displacements(self, preferred: Array, first: int, last: int, stride: int = 1) -> Array:
         """(T, 2): for each pose the displacement nearest to the preferred one (T, 2) that keeps clear; infinite where none does.
 
-        Poses up to ``first``, and after ``last`` once the preferred displacement is reached again, are taken as preferred.
+        Poses up to ``first``, and after ``last`` once the preferred displacement is reached again, are taken as preferred.  Of
+        the others every ``stride``-th is looked at.
         """
         result = preferred.copy()
         first = max(first, 0)
         now = preferred[first]
         before = self._pose(first, now)
-        for index in range(first + 1, len(preferred)):
+        at = first
+        for index in range(first + stride, len(preferred), stride):
             if index > last and np.linalg.norm(now - preferred[index]) < 1e-9:
                 break
             ahead = self._pose(int(self.ahead[index]), now) if self.aside else None
@@ -266,7 +281,9 @@ class _Walk:
             # What is further away than this was not looked at.  A part of the way keeps to the half spaces that now keeps to.
             now = found if size <= NEAR - self.gap or np.any(directions @ now < least) else now + step * ((NEAR - self.gap) / size)
             before = self._pose(index, now)
-            result[index] = now
+            # Between those that are looked at, in proportion.
+            result[at + 1 : index + 1] = result[at] + (now - result[at]) * np.arange(1, index - at + 1)[:, None] / (index - at)
+            at = index
         return result
 
     def _pose(self, index: int, shift: Array) -> Array:
@@ -279,8 +296,8 @@ class _Walk:
         (M,) the tool has to go along each from the second pose, negative where there is room.
 
         ahead: the pose by which the side is chosen where the tool may step aside."""
-        corners = self.tool.corners @ pose[:3, :3].T + pose[:3, 3]
-        low, high = corners.min(axis=1) - NEAR, corners.max(axis=1) + NEAR
+        middles, halves = transforms.apply(pose, self.middles), self.halves @ np.abs(pose[:3, :3]).T + NEAR
+        low, high = middles - halves, middles + halves
         close = np.all((low[:, None] < self.high) & (high[:, None] > self.low), axis=2)
         if not close.any():
             return np.zeros((0, 2)), np.zeros(0)
