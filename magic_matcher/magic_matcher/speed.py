@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magic_matcher import features, jobs, matching
 from magic_matcher.features import Reference, make_reference
@@ -49,6 +50,8 @@ def random_vit_s(folder: str) -> str:
 
 def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[str, Any]:
     """Seconds a match of both backends after the reference is prepared, DINOv2's one network pass, memory over many requests."""
+    import torch
+
     job = jobs.JOBS["hooking"]
     shown = jobs.example("hooking", "l_hook", 5000)
     contact = shown.contact("inner")
@@ -67,22 +70,34 @@ def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[s
         network.prepare(reference)
         picture = np.zeros((1, backend.size, backend.size, 3), np.uint8)
         backend.extract(picture)
-        # In turns, so that what else runs on the machine slows both alike.
-        passes, matches = [], []
-        for _ in range(repeats):
-            passes.append(timed_once(lambda: backend.extract(picture)))
-            matches.append(timed_once(lambda: match(network, tools[0])))
+
+        def turns() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            """Passes and matches in turns, so that what else runs on the machine slows both alike."""
+            pairs = [(timed_once(lambda: backend.extract(picture)), timed_once(lambda: match(network, tools[0]))) for _ in range(repeats)]
+            return np.array([p for p, _ in pairs]), np.array([m for _, m in pairs])
+
+        passes, matches = turns()
+        threads = torch.get_num_threads()
+        # Threads that wait for each other's core cost time of their own on a busy machine; one alone does not.
+        torch.set_num_threads(1)
+        try:
+            alone, alone_matches = turns()
+        finally:
+            torch.set_num_threads(threads)
         one, all_ = np.median(passes, axis=0), np.median(matches, axis=0)
         result["dinov2"] = {
             "weights": weights or "ViT-S/14, random",
             "side_px": backend.size,
             "pass_s": float(one[0]),
             "match_s": float(all_[0]),
-            "ratio": float(np.median(np.array(matches)[:, 0] / np.array(passes)[:, 0])),
-            "ratio_of_least": float(np.min(matches, axis=0)[0] / np.min(passes, axis=0)[0]),
+            "threads": threads,
+            "ratio": float(np.median(matches[:, 0] / passes[:, 0])),
+            "ratio_of_least": float(matches[:, 0].min() / passes[:, 0].min()),
             "pass_cpu_s": float(one[1]),
             "match_cpu_s": float(all_[1]),
-            "ratio_cpu": float(np.median(np.array(matches)[:, 1] / np.array(passes)[:, 1])),
+            "ratio_cpu": float(np.median(matches[:, 1] / passes[:, 1])),
+            "one_thread_ratio": float(np.median(alone_matches[:, 0] / alone[:, 0])),
+            "one_thread_ratio_cpu": float(np.median(alone_matches[:, 1] / alone[:, 1])),
         }
     memory = []
     for k in range(requests):
