@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -17,7 +14,7 @@ from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS, MotionPlan
-from magic_core.node import describe, parameter, run
+from magic_core.node import OneGoalServer, describe, parameter, run
 from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
@@ -40,17 +37,10 @@ class PlannerNode(Node):
         super().__init__("planner", **kwargs)
         self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
         self._timeout = parameter(self, "timeout", 10.0, "Wall time in s for one goal that names none.", low=0.05, high=3600.0)
-        self._busy = threading.Lock()
         self._arm = self._load_arm() if parameter(self, "arm", True, "Load the arm; without it only the variant fg is served.") else None
         self._threads = one_thread()
-        self._server = ActionServer(
-            self,
-            PlanMotion,
-            "plan_motion",
-            self._execute,
-            goal_callback=lambda _goal: GoalResponse.ACCEPT,
-            cancel_callback=lambda _handle: CancelResponse.ACCEPT,
-            callback_group=ReentrantCallbackGroup(),
+        self._server = OneGoalServer(
+            self, PlanMotion, "plan_motion", self._answer, "another motion is being planned; send the goal again when it has ended"
         )
         self.get_logger().info("ready: waiting for goals of plan_motion")
 
@@ -113,34 +103,17 @@ class PlannerNode(Node):
         self.get_logger().info(f"arm {config.urdf or 'panda'} ready after {time.monotonic() - started:.2f} s")
         return planner
 
-    def _execute(self, handle: Any) -> PlanMotion.Result:
-        started = time.monotonic()
-        result = PlanMotion.Result()
-        if not self._busy.acquire(blocking=False):
-            result.code, result.message = int(Code.BUSY), "another motion is being planned; send the goal again when it has ended"
-            handle.abort()
-            return result
+    def _answer(self, handle: Any, result: PlanMotion.Result) -> None:
+        goal, started = handle.request, time.monotonic()
         try:
             plan = self._plan(handle)
-            result.plan = convert.plan_to_msg(plan, handle.request.tool.id)
+            result.plan = convert.plan_to_msg(plan, goal.tool.id)
             end = (plan.arm_motion or plan.tool_motion).times[-1]
             result.code, result.message = int(Code.OK), f"a motion of {end:.1f} s in {len(plan.tool_motion.phases)} phases"
-        except Exception as error:  # no handler lets an exception out
+        except Exception as error:  # into the answer, and into the log with the goal's name
             result.code, result.message = describe(self, error)
-        finally:
-            self._busy.release()
-        result.seconds = time.monotonic() - started
-        self.get_logger().info(
-            f"{handle.request.strategy} {handle.request.variant} {handle.request.tool.id}: {Code(result.code).name}: "
-            f"{result.message} ({result.seconds:.2f} s)"
-        )
-        if result.code == Code.OK:
-            handle.succeed()
-        elif result.code == Code.CANCELED and handle.is_cancel_requested:
-            handle.canceled()
-        else:
-            handle.abort()
-        return result
+        name, seconds = Code(result.code).name, time.monotonic() - started
+        self.get_logger().info(f"{goal.strategy} {goal.variant} {goal.tool.id}: {name}: {result.message} ({seconds:.2f} s)")
 
     def _plan(self, handle: Any) -> MotionPlan:
         goal = handle.request

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import threading
 import time
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
-from magic_core.node import describe, parameter, run
+from magic_core.node import OneGoalServer, describe, parameter, run
 from magic_interfaces.action import VerifyMotion
 from magic_verifier.arm_simulation import ArmOptions
 from magic_verifier.floating import Perturbation
@@ -26,6 +23,8 @@ from magic_verifier.verification import DEFAULTS, Limits, Verdict, verify
 
 #: More repetitions than this in one goal are refused.
 MAX_REPETITIONS = 1000
+#: Goals that end so were not judged.
+UNJUDGED = (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY)
 
 
 class VerifierNode(Node):
@@ -73,16 +72,15 @@ class VerifierNode(Node):
             finger_friction=parameter(self, "arm.finger_friction", 1.5, "Friction coefficient of the finger pads.", low=0.0, high=10.0),
         )
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
-        self._busy = threading.Lock()
         self._last: tuple[VerifyMotion.Goal, Verdict] | None = None
-        self._server = ActionServer(
+        self._server = OneGoalServer(
             self,
             VerifyMotion,
             "verify_motion",
-            self._execute,
-            goal_callback=lambda _goal: GoalResponse.ACCEPT,
-            cancel_callback=lambda _handle: CancelResponse.ACCEPT,
-            callback_group=ReentrantCallbackGroup(),
+            self._answer,
+            "a simulation is running; send the goal again when it has ended",
+            # A verdict is an answer, whatever it says; only what could not be judged aborts.
+            lambda code: code in UNJUDGED,
         )
         self._warm_up()
         self.get_logger().info("ready: waiting for goals of verify_motion")
@@ -102,35 +100,15 @@ class VerifierNode(Node):
         world.add("cube", usable_pieces("cube", (Mesh(cube, np.zeros((0, 3))),)), np.eye(4), DYNAMIC, 500.0, 0.5)
         world.step()
 
-    def _execute(self, handle: Any) -> VerifyMotion.Result:
-        started = time.monotonic()
-        result = VerifyMotion.Result()
-        if not self._busy.acquire(blocking=False):
-            result.code, result.message = int(Code.BUSY), "a simulation is running; send the goal again when it has ended"
-            handle.abort()
-            return result
-        try:
-            verdict, film = self._verify(handle, started)
-            result.code, result.message = int(verdict.code), verdict.message
-            result.success = verdict.success
-            result.success_rate = float(verdict.success_rate)
-            result.metric_names = list(verdict.metrics)
-            result.metric_values = [float(v) for v in verdict.metrics.values()]
-            result.simulated = float(verdict.simulated)
-            result.film = film
-        except Exception as error:  # no handler lets an exception out
-            result.code, result.message = describe(self, error)
-        finally:
-            self._busy.release()
-        result.seconds = time.monotonic() - started
-        # A verdict is an answer, whatever it says; only what could not be judged aborts.
-        if result.code == Code.CANCELED and handle.is_cancel_requested:
-            handle.canceled()
-        elif result.code in (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY):
-            handle.abort()
-        else:
-            handle.succeed()
-        return result
+    def _answer(self, handle: Any, result: VerifyMotion.Result) -> None:
+        verdict, film = self._verify(handle, time.monotonic())
+        result.code, result.message = int(verdict.code), verdict.message
+        result.success = verdict.success
+        result.success_rate = float(verdict.success_rate)
+        result.metric_names = list(verdict.metrics)
+        result.metric_values = [float(v) for v in verdict.metrics.values()]
+        result.simulated = float(verdict.simulated)
+        result.film = film
 
     def _verify(self, handle: Any, started: float) -> tuple[Verdict, Image]:
         goal = handle.request

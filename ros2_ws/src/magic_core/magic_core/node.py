@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
+import time
 import traceback
 from collections.abc import Callable
 from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
@@ -83,6 +87,62 @@ def parameter(
     if choices is not None and value not in choices:
         raise MagicError(Code.BAD_REQUEST, f"parameter {name}", value, choices)
     return value
+
+
+class OneGoalServer:
+    """An action server that works on one goal at a time; a goal during another one is answered BUSY at once, nothing is queued.
+
+    The action's result has the fields ``code``, ``message`` and ``seconds``.  ``work(handle, result)`` fills the result in; an
+    exception out of it becomes its code and message.  Cancel requests are accepted; ``work`` looks for them and raises CANCELED.
+    ``aborts(code)``: whether a goal that ended with this code aborts rather than succeeds.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        action: Any,
+        name: str,
+        work: Callable[[Any, Any], None],
+        busy: str,
+        aborts: Callable[[int], bool] = lambda code: code != Code.OK,
+    ) -> None:
+        self._node, self._action, self._work, self._message, self._aborts = node, action, work, busy, aborts
+        self._busy = threading.Lock()
+        self._server = ActionServer(
+            node,
+            action,
+            name,
+            self._execute,
+            goal_callback=lambda _goal: GoalResponse.ACCEPT,
+            cancel_callback=lambda _handle: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
+
+    def destroy(self) -> None:
+        """Take the server down, before its node."""
+        self._server.destroy()
+
+    def _execute(self, handle: Any) -> Any:
+        started = time.monotonic()
+        result = self._action.Result()
+        if not self._busy.acquire(blocking=False):
+            result.code, result.message = int(Code.BUSY), self._message
+            handle.abort()
+            return result
+        try:
+            self._work(handle, result)
+        except Exception as error:  # no handler lets an exception out
+            result.code, result.message = describe(self._node, error)
+        finally:
+            self._busy.release()
+        result.seconds = time.monotonic() - started
+        if result.code == Code.CANCELED and handle.is_cancel_requested:
+            handle.canceled()
+        elif self._aborts(result.code):
+            handle.abort()
+        else:
+            handle.succeed()
+        return result
 
 
 def describe(node: Node, error: BaseException) -> tuple[int, str]:
