@@ -16,7 +16,7 @@ from magic_perception.sight import Sight, surfaces
 from magic_perception.solids import Reconstruction, joined
 
 
-def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: int = 6000) -> Reconstruction:
+def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: int = 20000) -> Reconstruction:
     """The carved solid.  ``cells``: of the grid, at most, none smaller than 2 mm; ``faces``: of the mesh, at most."""
     points, _ = surfaces(sights)
     low = np.append(np.percentile(points[:, :2], 0.5, axis=0) - 0.008, 0.0)
@@ -37,7 +37,11 @@ def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: i
     field = _largest(_blurred(field, 0.7))
     if np.count_nonzero(field > 0.5) < 20:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "carved cells of one object", int(np.count_nonzero(field > 0.5)), "at least 20")
-    mesh = _thinned(level_surface(field, axes, 0.5), faces)
+    field = _joined_edges(field, 0.5)
+    mesh = surface_net(field, axes, 0.5)
+    if not closed(mesh):
+        mesh = level_surface(field, axes, 0.5)
+    mesh = _thinned(mesh, faces)
     return Reconstruction(mesh, tuple(_pieces(field, axes)), "carved", 0.6)
 
 
@@ -80,6 +84,69 @@ def _largest(field: NDArray[np.float32], share: float = 0.03) -> NDArray[np.floa
     keep = sizes >= share * sizes.max(initial=1)
     keep[0] = True
     return np.where(keep[parts], field, np.float32(0))
+
+
+def _joined_edges(field: NDArray[np.float32], level: float, rounds: int = 10) -> NDArray[np.float32]:
+    """The field with cells filled in where two others touch along an edge alone: there no surface would be closed."""
+    field = field.copy()
+    for _ in range(rounds):
+        changed = False
+        for axis in range(3):
+            plane = np.moveaxis(field, axis, 0)  # a view: writing to it writes to the field
+            above = plane > level
+            a, b, c, d = above[:, :-1, :-1], above[:, 1:, :-1], above[:, :-1, 1:], above[:, 1:, 1:]
+            for alone, shift in ((a & d & ~b & ~c, (1, 0)), (b & c & ~a & ~d, (0, 0))):
+                i, j, k = np.nonzero(alone)
+                if len(i):
+                    plane[i, j + shift[0], k + shift[1]] = level + 0.05
+                    changed = True
+        if not changed:
+            break
+    return field
+
+
+def surface_net(field: NDArray[np.float32], axes: list[NDArray[np.float64]], level: float) -> Mesh:
+    """The surface around where a field is above a level, a vertex for each cell that it crosses (Gibson 1998); closed but where cells touch
+    along an edge or a corner only.
+
+    field (X, Y, Z) with a border of cells below the level around the values at ``axes``.
+    """
+    shape = np.array(field.shape)
+    steps = np.array([float(a[1] - a[0]) for a in axes])
+    start = np.array([float(a[0]) for a in axes]) - steps
+    above = field > level
+    total, count = np.zeros((field.size, 3)), np.zeros(field.size)
+    weights = np.array([shape[1] * shape[2], shape[2], 1])
+    quads = []
+    for axis in range(3):
+        u, v = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]] @ weights
+        low, high = (tuple(slice(a, b) if i == axis else slice(None) for i in range(3)) for a, b in ((0, -1), (1, None)))
+        spots = np.argwhere(above[low] != above[high])
+        first = spots @ weights
+        ahead = first + weights[axis]
+        values = field.ravel()
+        place = spots.astype(float)
+        place[:, axis] += (level - values[first]) / (values[ahead] - values[first])
+        cells = np.stack([first - u - v, first - v, first, first - u], axis=1)
+        for corner in cells.T:
+            count += np.bincount(corner, minlength=field.size)
+            for i in range(3):
+                total[:, i] += np.bincount(corner, place[:, i], minlength=field.size)
+        out = above.ravel()[first]
+        quads.append(np.where(out[:, None], cells, cells[:, ::-1]))
+    used = np.flatnonzero(count)
+    number = np.zeros(field.size, np.int64)
+    number[used] = np.arange(len(used))
+    corners = number[np.concatenate(quads)]
+    vertices = start + total[used] / count[used, None] * steps
+    vertices[:, 2] = np.maximum(vertices[:, 2], 0.0)
+    return Mesh(vertices, np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]))
+
+
+def closed(mesh: Mesh) -> bool:
+    """Whether every edge belongs to two triangles."""
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1).astype(np.int64)
+    return bool(np.all(np.unique(edges[:, 0] * (len(mesh.vertices) + 1) + edges[:, 1], return_counts=True)[1] == 2))
 
 
 #: The six tetrahedra of a cube, all around its diagonal from corner 0 to corner 7; corner bits are x, y, z.
@@ -142,10 +209,8 @@ def _thinned(mesh: Mesh, faces: int) -> Mesh:
 
     solid = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces))
     solid = solid.simplify_quadric_decimation(faces)
-    kept = np.asarray(solid.triangles)
-    edges = np.sort(np.concatenate([kept[:, [0, 1]], kept[:, [1, 2]], kept[:, [2, 0]]]), axis=1)
-    _, count = np.unique(edges[:, 0].astype(np.int64) * (len(solid.vertices) + 1) + edges[:, 1], return_counts=True)
-    return Mesh(np.asarray(solid.vertices), kept) if np.all(count == 2) else mesh
+    thinned = Mesh(np.asarray(solid.vertices), np.asarray(solid.triangles))
+    return thinned if closed(thinned) else mesh
 
 
 def _pieces(field: NDArray[np.float32], axes: list[NDArray[np.float64]], block: float = 0.012, most: int = 100) -> list[Mesh]:

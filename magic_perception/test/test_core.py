@@ -359,16 +359,30 @@ def test_what_agrees_with_a_ring():
     assert filled.through > 0.4 and filled.score < 0.4 * true.score
 
 
-def test_level_surface_of_a_ball():
-    from magic_perception.carved import level_surface
+@pytest.mark.parametrize("name", ["level_surface", "surface_net"])
+def test_surface_of_a_ball(name):
+    from magic_perception import carved
 
     axes = [np.arange(-0.03, 0.031, 0.002)] * 3
     x, y, z = np.meshgrid(*axes, indexing="ij")
     field = np.pad((np.clip((0.02 - np.sqrt(x**2 + y**2 + z**2)) / 0.004, -0.5, 0.5) + 0.5).astype(np.float32), 1)
-    ball = level_surface(field, [a + 1.0 for a in axes], 0.5)
+    ball = getattr(carved, name)(field, [a + 1.0 for a in axes], 0.5)
     solid = tight(ball)
+    assert carved.closed(ball)
     assert solid.volume == pytest.approx(4 / 3 * np.pi * 0.02**3, rel=0.03) and solid.euler_number == 2
     np.testing.assert_allclose(solid.centroid, 1.0, atol=1e-4)
+
+
+def test_surfaces_of_noise_are_closed():
+    from magic_perception import carved
+
+    axes = [np.arange(12) * 0.002] * 3
+    field = np.pad(np.random.default_rng(0).random((12, 12, 12)).astype(np.float32), 1)
+    assert carved.closed(carved.level_surface(field, axes, 0.6))
+    # Cells that touch along an edge alone are joined first.
+    assert not carved.closed(carved.surface_net(field, axes, 0.8))
+    filled = carved._joined_edges(field, 0.8)
+    assert carved.closed(carved.surface_net(filled, axes, 0.8)) and (filled > 0.8).mean() < 0.5
 
 
 # ---------------------------------------------------------------- pieces and measures
