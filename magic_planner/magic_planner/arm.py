@@ -245,39 +245,46 @@ class ArmPlanner:
                 final = request.strategy.releases and index == last
                 (swept if final else static).append(transforms.apply(transforms.inverse(request.poses[index]), np.concatenate(there)))
         swept_points, static_points = np.concatenate(swept), np.concatenate(static) if static else np.zeros((0, 3))
-        grasps = propose(
-            self.robot,
-            request.tool,
-            tool_from_contact,
-            request.plane,
-            poses,
-            settings,
-            request.seed,
-            static_points,
-            swept_points,
-            request.budget,
-        )
         checks = [(request.tool.world_from_object, [target, *others])]
         for index in sorted({0, min(met, last), last}):
             checks.append((request.poses[index], [target, *others] if fixed or index <= met else others))
-        free, blocked = collision_free(
-            self.robot,
-            grasps,
-            request.tool,
-            checks,
-            self.settings.grasps * self.settings.rounds,
-            request.budget,
-            way=self.settings.standoff / 2,
-        )
-        if not free:
+        problem: MagicError | None = None
+        for finer in (1, 4):  # a tool that seems to have no grasp is looked at more closely before that is said
+            closer = replace(
+                settings, samples=settings.samples * finer, pairs=settings.pairs * finer, angles=settings.angles + 8 * (finer > 1)
+            )
+            request.budget.check("grasp")
+            try:
+                grasps = propose(
+                    self.robot,
+                    request.tool,
+                    tool_from_contact,
+                    request.plane,
+                    poses,
+                    closer,
+                    request.seed,
+                    static_points,
+                    swept_points,
+                    request.budget,
+                )
+            except MagicError as error:
+                if error.code != Code.NO_GRASP:
+                    raise
+                problem = error
+                continue
+            most = self.settings.grasps * self.settings.rounds
+            free, blocked = collision_free(self.robot, grasps, request.tool, checks, most, request.budget, way=self.settings.standoff / 2)
+            if free:
+                return free
             name = max(blocked, key=lambda k: blocked[k])
-            raise MagicError(
+            problem = MagicError(
                 Code.NO_GRASP,
                 f"stage grasp: {len(grasps)} grasps of {request.tool.id}",
                 f"hand and {name} in collision for {blocked[name]} of them",
                 "an open hand clear of everything",
             )
-        return free
+        assert problem is not None
+        raise problem
 
     def _complete(self, request: Request, branch: Branch, only_check: bool) -> MotionPlan | None:
         """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError."""
