@@ -557,7 +557,8 @@ def explained(
     conic = int(np.argmax(fits)) if fits.any() else circle
     for k in range(min(conic + 1, circle, _FILLETS)):  # larger than, or as large as, what a conic explains
         found = fillet(x[use[k]], -y[use[k]] if concave else y[use[k]], contour.blur)
-        if found is not None and found[1] <= RESIDUE and (k < conic or found[1] < 0.9 * left[conic]):
+        # An ellipse's tip looks a little like a fillet, and noise may let it pass: a fillet is clearly no conic.
+        if found is not None and found[1] <= min(RESIDUE, 0.65 * float(left[k])):
             return (-1.0 if concave else 1.0) / found[0], float(scales[k])
     if conic < circle and (circle == len(scales) or scales[circle] < scales[conic] / FAR or scales[conic] == largest):
         return float(conics[conic]), float(scales[conic])

@@ -43,6 +43,19 @@ def hook(radius=24.0, width=18.0, turn=0.0, scale=1.0, mirror=False, shift=(0.0,
     return mask, linear @ corner + shift, linear @ np.array([-1, -1]) / np.sqrt(2) / scale
 
 
+@pytest.mark.parametrize(("a", "b", "median", "each"), [(40, 20, 0.06, 0.15), (60, 30, 0.03, 0.08)])
+def test_small_tips_are_not_taken_for_fillets(a, b, median, each):
+    random = np.random.default_rng(5)
+    errors = []
+    for _ in range(20):
+        turn = random.uniform(0, 2 * np.pi)
+        c, s = np.cos(turn), np.sin(turn)
+        x, y = (U - CENTRE[0]) * c + (V - CENTRE[1]) * s, (V - CENTRE[1]) * c - (U - CENTRE[0]) * s
+        edge = contour.extract((x / a) ** 2 + (y / b) ** 2 <= 1)
+        errors.append(abs(curvature.estimate(edge, edge.nearest(CENTRE + (a * c, a * s))).radius / (b * b / a) - 1))
+    assert np.median(errors) <= median and max(errors) <= each
+
+
 #: Largest error of the radius by the radius in pixels, over random places and directions: (median, each).
 DISCS = {6: (0.04, 0.06), 8: (0.02, 0.04), 10: (0.015, 0.03), 15: (0.01, 0.03), 30: (0.005, 0.02), 60: (0.005, 0.01), 120: (0.005, 0.01)}
 FILLETS = {8: (0.05, 0.3), 10: (0.04, 0.1), 12: (0.03, 0.08), 14: (0.03, 0.08), 20: (0.03, 0.1), 40: (0.02, 0.05), 60: (0.02, 0.05)}
