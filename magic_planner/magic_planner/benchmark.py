@@ -143,21 +143,21 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"arm ready after {time.perf_counter() - started:.2f} s")
     for task in options.task:
         strategy = find(task, options.strategies)
-        results: dict[str, list[tuple[bool, float]]] = {v: [] for v in options.variant}
+        results: dict[str, list[tuple[bool, float, float]]] = {v: [] for v in options.variant}
         for family, region in TASKS[task][0]:
             if options.family and family not in options.family:
                 continue
             for seed in range(options.count):
                 case = make_case(strategy, family, region, seed)
-                motion, started = None, time.perf_counter()
+                motion, started, busy = None, time.perf_counter(), time.process_time()
                 try:
                     motion = plan_tool_motion(strategy, case.tool, case.target, case.candidate, "keep", (0, 0, 1, 0), case.obstacles)
                     text = f"ok, {motion.times[-1]:.1f} s of motion"
                 except MagicError as error:
                     text = str(error)
-                fg = time.perf_counter() - started
+                fg, fg_busy = time.perf_counter() - started, time.process_time() - busy
                 if "fg" in options.variant:
-                    results["fg"].append((motion is not None, fg))
+                    results["fg"].append((motion is not None, fg, fg_busy))
                     print(f"{task:9} fg  {case.name:28} {1e3 * fg:7.1f} ms  {text}")
                 if planner is None:
                     continue
@@ -178,15 +178,16 @@ def main(arguments: list[str] | None = None) -> int:
                         text = f"ok, {plan.arm_motion.times[-1]:.1f} s of motion, {1e3 * plan.arm_motion.grasp_width:.0f} mm grasp"
                     except MagicError as error:
                         motion, text = None, str(error)
-                arm = time.perf_counter() - started
-                results["arm"].append((motion is not None, arm))
+                arm, arm_busy = time.perf_counter() - started, time.process_time() - busy
+                results["arm"].append((motion is not None, arm, arm_busy))
                 print(f"{task:9} arm {case.name:28} {1e3 * arm:7.1f} ms  {text}")
         for variant, rows in results.items():
-            seconds = np.array([s for _, s in rows])
+            seconds, busy_seconds = np.array([s for _, s, _ in rows]), np.array([s for _, _, s in rows])
             if len(rows):
                 print(
-                    f"{task:9} {variant:3} {sum(ok for ok, _ in rows)} of {len(rows)} planned; "
-                    f"mean {seconds.mean():.3f} s, median {np.median(seconds):.3f} s, longest {seconds.max():.3f} s"
+                    f"{task:9} {variant:3} {sum(ok for ok, _, _ in rows)} of {len(rows)} planned; "
+                    f"mean {seconds.mean():.3f} s, median {np.median(seconds):.3f} s, longest {seconds.max():.3f} s; "
+                    f"of the processor mean {busy_seconds.mean():.3f} s, longest {busy_seconds.max():.3f} s"
                 )
     return 0
 
