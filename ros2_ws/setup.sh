@@ -231,7 +231,8 @@ where="$WS $MODE $("$VENV/bin/python" -V)"
 if [ $REBUILD = 1 ] || { [ -f "$WS/install/.build_where" ] && [ "$(cat "$WS/install/.build_where")" != "$where" ]; }; then
   rm -rf "$WS/build" "$WS/install"
 fi
-[ ${#skip[@]} = 0 ] || skip=(--packages-skip "${skip[@]}")
+# Not --packages-skip: of a package that is skipped but known, colcon wants the installation in this workspace.
+[ ${#skip[@]} = 0 ] || skip=(--packages-ignore "${skip[@]}")
 # colcon runs on the environment's Python, because the scripts that it installs name the Python that it runs on.
 build() {
   cd "$WS" && "$VENV/bin/python" -c 'import sys; from colcon_core.command import main; sys.exit(main())' build --symlink-install \
