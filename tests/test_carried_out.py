@@ -15,7 +15,12 @@ from magic_core.errors import Code
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "hanging"
 HOME = [0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4]
-SERVER = {"execute": True, "trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}
+SERVER = {
+    "execute": True,
+    "state_age": 10.0,
+    "trajectory_action": "arm/follow_joint_trajectory",
+    "gripper_action": "gripper/gripper_action",
+}
 
 
 def test_a_mug_is_hung_by_arm_and_gripper(tmp_path):
