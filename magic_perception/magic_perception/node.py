@@ -121,6 +121,8 @@ class Perception(Node):
         self.outcome: tuple[bytes, Code, str, dict[str, object]] = (DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
         self.lock = threading.Lock()
         self.started = time.monotonic()
+        # When images began to come after nobody had sent any for a while: from then on a camera that says nothing is waited for.
+        self.resumed = self.heard = -math.inf
 
         inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
         self.topics: dict[str, dict[str, str]] = {}
@@ -192,6 +194,9 @@ class Perception(Node):
         now = time.monotonic()
         stream = self.streams[camera]
         with self.lock:
+            if now - self.heard > self.patience:
+                self.resumed = now
+            self.heard = now
             try:
                 stamp = cv.time_from_msg(msg.header.stamp)
                 if not msg.header.frame_id:
@@ -324,10 +329,10 @@ class Perception(Node):
             if newest <= self.done_stamp:
                 return [], notes
             for camera, stream in self.streams.items():
-                silent = now - max(stream.last.get("pair", self.started), self.started)
+                silent = now - max(stream.last.get("pair", -math.inf), self.resumed)
                 if silent < self.patience and (stream.intrinsics is None or len(stream.pairs) < self.count):
                     # The first frames of a camera that speaks, or the wait for one that has not spoken yet.
-                    first = stream.pairs[0].arrived if stream.pairs else self.started
+                    first = stream.pairs[0].arrived if stream.pairs else self.resumed
                     if now - first < self.patience:
                         return [], notes
                 if stream.intrinsics is None:

@@ -22,7 +22,7 @@ OBJECTS = (("l_hook", 1, 0.50, -0.10, 0.4), ("cylinder", 1, 0.62, 0.12, 0.0), ("
 #: Eyes of the two cameras, which look at the table's middle.
 EYES = ((0.25, 0.45, 0.62), (0.25, -0.45, 0.62))
 
-#: What of the stages the issue of speed is about: from the masks on, and from the images on, to meshes with convex pieces.
+#: What is measured in all: from the masks on, and from the images on, to meshes with convex pieces.
 SUMS = {"masks to meshes": ("meshes",), "images to meshes": ("table", "masks", "meshes"), "all": ("table", "masks", "meshes", "views")}
 
 

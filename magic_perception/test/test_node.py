@@ -177,6 +177,18 @@ def test_one_camera_is_enough_and_the_other_is_named(frames):
         assert any("camera/right" in m for m in bench.messages())
 
 
+def test_cameras_that_begin_late_are_waited_for(frames):
+    """A bag played, or cameras started, long after the node: the first to speak is not taken for the only one."""
+    with Bench(camera_timeout=10.0) as bench:
+        bench.node.started -= 60.0
+        bench.transforms()
+        left = bench.node.streams["left"]
+        bench.until(lambda: left.pairs and left.intrinsics is not None, "frames of the left camera", tick=lambda: bench.send(frames[0]))
+        assert bench.node.gather(time.monotonic()) == ([], [])
+        bench.until(lambda: bench.objects, "objects of both cameras", tick=lambda: [bench.send(f) for f in frames])
+        assert bench.node.outcome[3]["cameras"] == "left, right"
+
+
 def test_known_objects_are_merged(frames):
     cylinder = things()[1]
     scene = perceive(list(frames))
