@@ -32,7 +32,7 @@ class Token:
         self._closing = False
 
     def cancel(self, closing: bool = False) -> None:
-        """Make all present and later waits end with CANCELED; ``closing``: without courtesy to other nodes."""
+        """Make all present and later waits end with CANCELED; ``closing``: without waiting for what other nodes say to that."""
         with self._condition:
             self._canceled = True
             self._closing = self._closing or closing
@@ -187,9 +187,9 @@ class RemoteAction(_Remote):
         return future.result()
 
     def _cancel(self, handle: Any, future: Any, token: Token) -> None:
+        handle.cancel_goal_async()  # also where this node closes: an arm must not go on without it
         if token.closing:
             return
-        handle.cancel_goal_async()
         try:
             token.wait(future.done, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=self._still_there)
         except MagicError:

@@ -318,6 +318,9 @@ class StrategyServer(Node):
         """Let a run in progress end, so that its thread does not hold up the process."""
         for token in list(self._goals.values()):
             token.cancel(closing=True)
+        deadline = time.monotonic() + 1.0  # its goals are being canceled: the clients have to last until then
+        while self._goals and time.monotonic() < deadline:
+            time.sleep(0.005)
         super().destroy_node()
 
 
