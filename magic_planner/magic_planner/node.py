@@ -14,7 +14,8 @@ from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS, MotionPlan
-from magic_core.node import OneGoalServer, describe, parameter, run
+from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
+from magic_core.robot import PANDA_ACCELERATION, RobotConfig
 from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
@@ -54,19 +55,11 @@ class PlannerNode(Node):
         from magic_planner.arm import ArmPlanner, ArmSettings
         from magic_planner.cloud import CloudSettings
         from magic_planner.grasps import GraspSettings
-        from magic_planner.robot import PANDA_ACCELERATION, PANDA_HOME, Robot, RobotConfig
+        from magic_planner.robot import Robot
 
         started = time.monotonic()
         config = RobotConfig(
-            urdf=parameter(self, "robot.urdf", "", "URDF of arm and gripper; empty: the Panda of example-robot-data."),
-            srdf=parameter(self, "robot.srdf", "", "SRDF with the pairs of links that may touch."),
-            package_root=parameter(
-                self, "robot.package_root", "", "Folder that package:// stands for; empty: found from the URDF's place."
-            ),
-            move_group=parameter(self, "robot.move_group", "panda_hand_tcp", "Link between the fingertips, z out of the hand."),
-            closing_axis=parameter(self, "robot.closing_axis", "y", "Axis of that link along which the fingers close.", choices=("x", "y")),
-            opening=parameter(self, "robot.opening", 0.08, "Metres between the open fingers.", low=0.005, high=1.0),
-            home=tuple(parameter(self, "robot.home", list(PANDA_HOME), "Home configuration, rad.")),
+            **robot_parameters(self),
             acceleration=tuple(
                 parameter(self, "robot.acceleration", list(PANDA_ACCELERATION), "Acceleration limits, rad/s^2, one a joint or one for all.")
             ),

@@ -1,18 +1,16 @@
 """The arm and its gripper: where their description is, how they move, what they touch.
 
-Everything that is particular to one arm is in :class:`RobotConfig`.  MPlib loads
+Everything that is particular to one arm is in :class:`magic_core.robot.RobotConfig`.  MPlib loads
 URDF and SRDF, checks collisions and plans free motion; :mod:`magic_planner.kinematics`
 answers the many small questions.
 """
 
 from __future__ import annotations
 
-import os
-import re
 import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -23,60 +21,13 @@ from scipy.spatial import cKDTree
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_core.robot import Description, RobotConfig
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, fcl_pose, hull
 from magic_planner.kinematics import Chain, load_chain
 
-#: Franka's ready pose.
-PANDA_HOME = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
-#: Franka's joint acceleration limits, rad/s^2 (Franka Control Interface documentation); a URDF has none.
-PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
-
-
-@dataclass(frozen=True)
-class RobotConfig:
-    """Which arm and gripper, and how fast.
-
-    urdf, srdf: files; empty: the Panda of the package ``example-robot-data``.  package_root: what
-    ``package://`` in the URDF stands for; empty: the folder above the URDF in which its meshes are found.
-    move_group: the link between the fingertips, z out of the hand.  closing_axis: along which axis of
-    that link the fingers close.  opening: metres between the open fingers.  home: joint positions.
-    acceleration: limits in rad/s^2, one for each joint or one for all.  scales: share of the limits used.
-    """
-
-    urdf: str = ""
-    srdf: str = ""
-    package_root: str = ""
-    move_group: str = "panda_hand_tcp"
-    closing_axis: str = "y"
-    opening: float = 0.08
-    home: tuple[float, ...] = PANDA_HOME
-    acceleration: tuple[float, ...] = PANDA_ACCELERATION
-    velocity_scale: float = 0.3
-    acceleration_scale: float = 0.2
-    seeds: int = 6000
-
-    def __post_init__(self) -> None:
-        if self.closing_axis not in ("x", "y"):
-            raise MagicError(Code.BAD_REQUEST, "closing axis", self.closing_axis, ("x", "y"))
-        if not 0.005 <= self.opening <= 1.0:
-            raise MagicError(Code.BAD_REQUEST, "gripper opening", self.opening, "0.005 to 1 m")
-        for name in ("velocity_scale", "acceleration_scale"):
-            if not 0 < getattr(self, name) <= 1:
-                raise MagicError(Code.BAD_REQUEST, name, getattr(self, name), "above 0, up to 1")
-
-
-def panda_folder() -> Path:
-    """The Panda's description in the package ``example-robot-data``, wherever it is installed."""
-    try:
-        for file in metadata.files("example-robot-data") or ():
-            if file.name == "panda.urdf":
-                return Path(str(file.locate())).resolve().parents[1]
-    except metadata.PackageNotFoundError:
-        pass
-    raise MagicError(
-        Code.BAD_REQUEST, "URDF of the Panda", "not found", "the Python package example-robot-data, or parameters urdf and srdf"
-    )
+#: Joint positions that are tried as starts of the inverse kinematics.
+SEEDS = 6000
 
 
 @dataclass(frozen=True)
@@ -105,24 +56,18 @@ class Robot:
         """Load the arm; raises BAD_REQUEST for a file, link or joint that is not there."""
         import mplib
 
-        self.config = config or RobotConfig()
-        urdf, srdf = Path(self.config.urdf), Path(self.config.srdf)
-        if not self.config.urdf:
-            folder = panda_folder()
-            urdf, srdf = folder / "urdf" / "panda.urdf", folder / "srdf" / "panda.srdf"
-        for path, what in ((urdf, "URDF"), (srdf, "SRDF")):
-            if not path.is_file():
-                raise MagicError(Code.BAD_REQUEST, what, str(path), "an existing file")
+        self.description = Description(config)
+        self.config, urdf = self.description.config, self.description.urdf
         self.chain: Chain = load_chain(urdf, self.config.move_group)
-        text = urdf.read_text()
-        root = Path(self.config.package_root) if self.config.package_root else _package_root(urdf.resolve(), text)
         # MPlib writes a copy of a URDF that names package:// beside it; ours goes to a folder that can be written.
         with tempfile.TemporaryDirectory() as scratch:
             copy = Path(scratch) / urdf.name
             # ... where it reads mesh names, absolute ones too, relative to the URDF.
-            copy.write_text(text.replace("package://", os.path.relpath(root.resolve(), Path(scratch).resolve()) + "/"))
+            copy.write_text(ET.tostring(self.description.tree(Path(scratch)), encoding="unicode"))
             try:
-                self.planner = mplib.Planner(urdf=str(copy), srdf=str(srdf), move_group=self.config.move_group, new_package_keyword="")
+                self.planner = mplib.Planner(
+                    urdf=str(copy), srdf=str(self.description.srdf), move_group=self.config.move_group, new_package_keyword=""
+                )
             except (RuntimeError, ValueError, AssertionError) as error:
                 raise MagicError(
                     Code.BAD_REQUEST, f"robot {urdf}", str(error).splitlines()[0], "a URDF and SRDF that MPlib reads"
@@ -130,8 +75,6 @@ class Robot:
         self.world = self.planner.planning_world
         self.count = self.chain.count
         self.home = np.array(self.config.home, dtype=float)
-        if self.home.shape != (self.count,):
-            raise MagicError(Code.BAD_REQUEST, "home configuration", self.home.tolist(), f"{self.count} joint positions")
         self.velocity_limits = self.chain.velocity * self.config.velocity_scale
         acceleration = np.array(self.config.acceleration, dtype=float)
         if acceleration.size not in (1, self.count):
@@ -140,7 +83,7 @@ class Robot:
         names = self.planner.user_joint_names
         if list(names[: self.count]) != list(self.chain.names):
             raise MagicError(Code.BAD_REQUEST, "joints of the URDF", list(names), f"the arm's joints first: {list(self.chain.names)}")
-        self.fingers = self.planner.joint_limits[self.count :]
+        self.fingers = names[self.count :]
         self.link = self.planner.link_name_2_idx[self.config.move_group]
         self.hand: dict[str, Mesh] = {}
         self._read_hand()
@@ -156,7 +99,10 @@ class Robot:
 
     def _finger_positions(self, width: float) -> NDArray[np.float64]:
         share = np.clip(width / self.config.opening, 0.0, 1.0)
-        return self.fingers[:, 0] + share * (self.fingers[:, 1] - self.fingers[:, 0])
+        robot = self.description
+        positions = robot.closed + share * (robot.opened - robot.closed)
+        by_name = {joint.name: position for joint, position in zip(robot.fingers, positions, strict=True)}
+        return np.array([by_name[name] for name in self.fingers])
 
     def open_to(self, width: float) -> None:
         """Set the distance between the fingers in the collision world."""
@@ -224,7 +170,7 @@ class Robot:
         self.world.add_object(fcl.FCLObject(name, fcl_pose(world_from_object), solids, [fcl_pose(np.eye(4))] * len(solids)))
 
     def add_table(self, plane: NDArray[np.float64], name: str = "table", gap: float = 0.001) -> None:
-        """Put the table in as a slab 0.2 m thick whose top lies ``gap`` below the plane (4,); the arm's base may touch it."""
+        """Put the table in as a slab 0.2 m thick whose top lies ``gap`` below the plane (4,); what of the arm never moves may touch it."""
         from mplib.collision_detection import fcl
 
         normal = plane[:3]
@@ -232,7 +178,7 @@ class Robot:
         if self.world.has_object(name):
             self.world.remove_object(name)
         self.world.add_object(fcl.FCLObject(name, fcl_pose(pose), [fcl.CollisionObject(fcl.Box(4.0, 4.0, 0.2))], [fcl_pose(np.eye(4))]))
-        self.allow(name, self.chain.base_link)
+        self.allow(name, *self.description.foot)
 
     def add_cloud(self, name: str, points: NDArray[np.float64], resolution: float) -> None:
         """Put a point cloud (N, 3), world metres, into the world as an octree with voxels of edge ``resolution``."""
@@ -306,7 +252,7 @@ class Robot:
             rng = np.random.default_rng(20)
             lower, upper = self.chain.lower, self.chain.upper
             margin = 0.05 * (upper - lower)
-            q = rng.uniform(lower + margin, upper - margin, (self.config.seeds, self.count))
+            q = rng.uniform(lower + margin, upper - margin, (SEEDS, self.count))
             tips = self.chain.forward(q)
             useful = (tips[:, 2, 3] > -0.1) & (tips[:, 2, 2] < 0.7)
             q, tips = q[useful], tips[useful]
@@ -356,19 +302,6 @@ class Robot:
             keep_index += [i] * len(mine)
             keep_q += mine
         return np.array(keep_index, dtype=int), np.array(keep_q).reshape(-1, self.count)
-
-
-def _package_root(urdf: Path, text: str) -> Path:
-    """The folder above a URDF under which the first mesh that it names by package:// lies."""
-    named = re.search(r"package://([^\"']+)", text)
-    if named:
-        for folder in urdf.parents:
-            if (folder / named.group(1)).is_file():
-                return folder
-        raise MagicError(
-            Code.BAD_REQUEST, f"mesh of {urdf}", named.group(0), "parameter package_root: the folder that package:// stands for"
-        )
-    return urdf.parent
 
 
 def _shape_points(geometry: Any) -> NDArray[np.float64]:

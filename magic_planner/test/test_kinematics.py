@@ -7,8 +7,8 @@ import pytest
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.robot import PANDA_HOME, RobotConfig, panda_folder
 from magic_planner.kinematics import load_chain, pose_error
-from magic_planner.robot import PANDA_HOME, RobotConfig, panda_folder
 
 
 @pytest.fixture(scope="module")

@@ -82,7 +82,7 @@ def test_empty_messages_are_answered_too(graph):
 
 
 def test_a_start_in_another_order_is_understood_and_an_incomplete_one_refused(graph):
-    from magic_planner.robot import PANDA_HOME
+    from magic_core.robot import PANDA_HOME
 
     message = goal()
     message.start.name = ["panda_finger_joint1", *(f"panda_joint{i}" for i in range(7, 0, -1))]

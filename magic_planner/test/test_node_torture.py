@@ -138,7 +138,7 @@ def test_a_tool_out_of_reach(graph):
 
 def test_starts_in_collision(graph):
     from magic_core import conversions as convert
-    from magic_planner.robot import PANDA_HOME
+    from magic_core.robot import PANDA_HOME
 
     head = convert.header("panda_link0")
     start = transforms.make(translation=[0.56, -0.06, 0.12])

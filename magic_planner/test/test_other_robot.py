@@ -11,10 +11,10 @@ import dataclasses
 import numpy as np
 import planner_scenes as scenes
 import pytest
-import six_axis
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.testing import six_axis
 from magic_planner.arm import ArmPlanner
 from magic_planner.object_motion import plan_tool_motion
 from magic_planner.robot import Robot

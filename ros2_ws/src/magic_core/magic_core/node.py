@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -15,43 +16,50 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from magic_core.errors import Code, MagicError
+from magic_core.executor import ThreadedExecutor
+from magic_core.robot import RobotConfig
 
-#: How long a thread keeps Python's lock while others wait for it, s.
-SWITCH_INTERVAL = 2e-4
+#: What a node is given to wind down while messages still flow, and then its callbacks to end, s.
+WINDING_DOWN, ENDING = 5.0, 2.0
+#: What the last answers of a node that has wound down are given to go out, s.
+LAST_WORDS = 0.1
 
 
 def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None = None) -> None:
-    """Spin one node until SIGINT, SIGTERM or shutdown; ends the process's main cleanly on each.
+    """Spin one node until SIGINT, SIGTERM or shutdown, and end the process.
 
-    A node that cannot start (a bad parameter, for one) logs why and exits with status 1.
+    A node that has begun something elsewhere may have a method ``wind_down() -> bool``: it is called again and again, while
+    the node still spins, until it says that all is over.  A node that cannot start (a bad parameter, for one) logs why; the
+    status is 1 then, else 0.
     """
-    # rclpy's executor asks without pause for a callback that it has handed to a thread until that thread has begun. A computation
-    # that lets go of Python's lock in every call into a library then waits a whole switch interval, 5 ms, to get it back:
-    # a scene took up to 21 s instead of 0.5.
-    sys.setswitchinterval(SWITCH_INTERVAL)
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    asked = threading.Event()
+    spinning = False
 
-    def stop(signum: int, _frame: Any) -> None:
-        raise KeyboardInterrupt
+    def stop(_signum: int, _frame: Any) -> None:
+        asked.set()
+        if not spinning:  # else whatever the executor has in its hands is brought to its end
+            raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     node = None
-    executor = MultiThreadedExecutor(threads)
+    executor = ThreadedExecutor(threads)
     status = 0
     try:
         node = node_type()
         executor.add_node(node)
-        # spin() waits in C without a limit, and Python only runs a signal's handler between its own
-        # instructions: a node without timers would never notice.
-        while rclpy.ok():
+        spinning = True
+        # The wait is in C, and Python only runs a signal's handler between its own instructions: without
+        # a limit a node without timers would never notice.
+        while rclpy.ok() and not asked.is_set():
             executor.spin_once(timeout_sec=0.2)
-    except (KeyboardInterrupt, ExternalShutdownException):
+        _wind_down(node, executor)
+    except KeyboardInterrupt:
         pass
     except (MagicError, ParameterException) as error:
         print(f"{getattr(node_type, '__name__', 'node')} cannot start: {error}", file=sys.stderr)
@@ -60,11 +68,27 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         # A second signal during the shutdown must not leave a traceback behind.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        executor.shutdown(timeout_sec=2.0)
+        ended = executor.shutdown(timeout_sec=ENDING)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+    if not ended:  # Python would wait for such a thread without a limit
+        print("a callback has not ended in time and is left", file=sys.stderr, flush=True)
+        os._exit(status)
     sys.exit(status)
+
+
+def _wind_down(node: Node, executor: ThreadedExecutor) -> None:
+    """Let a node end what it has begun elsewhere, while requests and answers still get through."""
+    wind_down = getattr(node, "wind_down", None)
+    if wind_down is None:
+        return
+    deadline = time.monotonic() + WINDING_DOWN
+    while rclpy.ok() and not wind_down() and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.02)
+    deadline = time.monotonic() + LAST_WORDS
+    while rclpy.ok() and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.02)
 
 
 def parameter(
@@ -96,10 +120,45 @@ def parameter(
     return value
 
 
+def robot_parameters(node: Node) -> dict[str, Any]:
+    """Declare the parameters ``robot.*`` that every node with an arm has; the arguments of :class:`magic_core.robot.RobotConfig`."""
+    default = RobotConfig()
+    return {
+        "urdf": parameter(node, "robot.urdf", default.urdf, "URDF of arm and gripper; empty: the Panda of example-robot-data."),
+        "srdf": parameter(node, "robot.srdf", default.srdf, "SRDF with the pairs of links that may touch."),
+        "package_root": parameter(
+            node, "robot.package_root", default.package_root, "Folder that package:// stands for; empty: found from the URDF's place."
+        ),
+        "move_group": parameter(node, "robot.move_group", default.move_group, "Link between the fingertips, z out of the hand."),
+        "closing_axis": parameter(
+            node, "robot.closing_axis", default.closing_axis, "Axis of that link along which the fingers close.", choices=("x", "y")
+        ),
+        "opening": parameter(node, "robot.opening", default.opening, "Metres between the open fingers.", low=0.005, high=1.0),
+        "home": tuple(parameter(node, "robot.home", list(default.home), "Home configuration, rad (m where a joint slides).")),
+    }
+
+
+class Goal:
+    """A goal at work: what its handler needs of rclpy's handle.  ``is_cancel_requested`` also where the node winds down."""
+
+    def __init__(self, handle: Any, closing: threading.Event) -> None:
+        self._handle, self._closing = handle, closing
+        self.request = handle.request
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        """Whether the work is to stop."""
+        return self._closing.is_set() or bool(self._handle.is_cancel_requested)
+
+    def publish_feedback(self, feedback: Any) -> None:
+        """As rclpy's."""
+        self._handle.publish_feedback(feedback)
+
+
 class OneGoalServer:
     """An action server that works on one goal at a time; a goal during another one is answered BUSY at once, nothing is queued.
 
-    The action's result has the fields ``code``, ``message`` and ``seconds``.  ``work(handle, result)`` fills the result in; an
+    The action's result has the fields ``code``, ``message`` and ``seconds``.  ``work(goal, result)`` fills the result in; an
     exception out of it becomes its code and message.  Cancel requests are accepted; ``work`` looks for them and raises CANCELED.
     ``aborts(code)``: whether a goal that ended with this code aborts rather than succeeds.
     """
@@ -109,21 +168,27 @@ class OneGoalServer:
         node: Node,
         action: Any,
         name: str,
-        work: Callable[[Any, Any], None],
+        work: Callable[[Goal, Any], None],
         busy: str,
         aborts: Callable[[int], bool] = lambda code: code != Code.OK,
     ) -> None:
         self._node, self._action, self._work, self._message, self._aborts = node, action, work, busy, aborts
         self._busy = threading.Lock()
+        self._closing = threading.Event()
         self._server = ActionServer(
             node,
             action,
             name,
             self._execute,
-            goal_callback=lambda _goal: GoalResponse.ACCEPT,
+            goal_callback=lambda _goal: GoalResponse.REJECT if self._closing.is_set() else GoalResponse.ACCEPT,
             cancel_callback=lambda _handle: CancelResponse.ACCEPT,
             callback_group=ReentrantCallbackGroup(),
         )
+
+    def wind_down(self) -> bool:
+        """Take no more goals and cancel the one at work; true once there is none.  For the node's method of that name."""
+        self._closing.set()
+        return not self._busy.locked()
 
     def destroy(self) -> None:
         """Take the server down, before its node."""
@@ -137,7 +202,7 @@ class OneGoalServer:
             handle.abort()
             return result
         try:
-            self._work(handle, result)
+            self._work(Goal(handle, self._closing), result)
         except Exception as error:  # no handler lets an exception out
             result.code, result.message = describe(self._node, error)
         finally:

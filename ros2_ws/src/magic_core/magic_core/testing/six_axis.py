@@ -1,4 +1,4 @@
-"""A made-up arm with six axes and a parallel gripper, to see that nothing in the planner is the Panda's.
+"""A made-up arm with six axes and a parallel gripper, to see that nothing in planner and verifier is the Panda's.
 
 Shoulder, elbow and wrist of an ordinary industrial arm, with a reach of about 0.9 m; the fingers close along x of the tip
 frame, and open to 0.1 m.  All shapes are boxes.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from magic_planner.robot import RobotConfig
+from magic_core.robot import RobotConfig
 
 #: name, parent, origin of the joint in the parent, axis, limits (rad)
 JOINTS = (

@@ -1,0 +1,359 @@
+"""Which arm and which gripper: what planner and verifier read off the same URDF and SRDF.
+
+:class:`RobotConfig` is what a user sets (parameters ``robot.*`` of both nodes);
+:class:`Description` is what follows from it: the joints of the arm, the two
+fingers, the links that stand still, the shapes.  Neither a collision library nor a
+physics engine is needed for that.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+
+#: Franka's ready pose.
+PANDA_HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
+#: Franka's joint acceleration limits, rad/s^2 (Franka Control Interface documentation); a URDF has none.
+PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+#: Kinds of joints that move.
+TURNING, SLIDING = ("revolute", "continuous"), "prismatic"
+#: How far the fingers' way may deviate from the closing axis: cosine of about 8 degrees.
+ALONG = 0.99
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """Which arm and gripper, and how fast.
+
+    urdf, srdf: files; empty: the Panda of the package ``example-robot-data``.  package_root: what
+    ``package://`` in the URDF stands for; empty: the folder above the URDF in which a mesh is found, else
+    the share folder of the ROS package.  move_group: the link between the fingertips, z out of the hand.
+    closing_axis: along which axis of that link the fingers close.  opening: metres between the open fingers.
+    home: joint positions.  acceleration: limits in rad/s^2, one for each joint or one for all.  scales: share
+    of the limits used.
+    """
+
+    urdf: str = ""
+    srdf: str = ""
+    package_root: str = ""
+    move_group: str = "panda_hand_tcp"
+    closing_axis: str = "y"
+    opening: float = 0.08
+    home: tuple[float, ...] = PANDA_HOME
+    acceleration: tuple[float, ...] = PANDA_ACCELERATION
+    velocity_scale: float = 0.3
+    acceleration_scale: float = 0.2
+
+    def __post_init__(self) -> None:
+        if self.closing_axis not in ("x", "y"):
+            raise MagicError(Code.BAD_REQUEST, "closing axis", self.closing_axis, ("x", "y"))
+        if not 0.005 <= self.opening <= 1.0:
+            raise MagicError(Code.BAD_REQUEST, "gripper opening", self.opening, "0.005 to 1 m")
+        for name in ("velocity_scale", "acceleration_scale"):
+            if not 0 < getattr(self, name) <= 1:
+                raise MagicError(Code.BAD_REQUEST, name, getattr(self, name), "above 0, up to 1")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint of a URDF: parent_from_joint (4, 4), unit axis (3,), limits in rad or m, effort in Nm or N."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    parent_from_joint: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    lower: float
+    upper: float
+    effort: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is anything but fixed."""
+        return self.kind in TURNING or self.sliding
+
+    @property
+    def sliding(self) -> bool:
+        """Whether it moves along its axis (m, N) rather than about it (rad, Nm)."""
+        return self.kind == SLIDING
+
+    def motion(self, position: float) -> NDArray[np.float64]:
+        """What the joint does at a position: (4, 4)."""
+        return transforms.make(translation=position * self.axis) if self.sliding else transforms.from_rotvec(position * self.axis)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One visual or collision shape: link_from_shape (4, 4); kind ``box``, ``sphere``, ``cylinder``, ``capsule`` or ``mesh``;
+    size: edges, radius, or radius and length in metres, or the scales of a mesh; file of a mesh, None where it is not found;
+    color RGB 0 to 255 where the URDF gives one."""
+
+    link_from_shape: NDArray[np.float64]
+    kind: str
+    size: tuple[float, ...]
+    file: Path | None = None
+    color: tuple[int, int, int] | None = None
+
+
+def panda_folder() -> Path:
+    """The Panda's description in the package ``example-robot-data``, wherever it is installed."""
+    try:
+        for file in metadata.files("example-robot-data") or ():
+            if file.name == "panda.urdf":
+                return Path(str(file.locate())).resolve().parents[1]
+    except metadata.PackageNotFoundError:
+        pass
+    raise MagicError(
+        Code.BAD_REQUEST, "URDF of the Panda", "not found", "the Python package example-robot-data, or parameters urdf and srdf"
+    )
+
+
+class Description:
+    """An arm with a parallel gripper as its URDF and SRDF give it; raises BAD_REQUEST with what is wrong with them.
+
+    arm: the moving joints from the root to the move group, in order.  fingers: two sliding joints beyond the last of these,
+    closed (2,) and opened (2,) their positions in metres.  finger_links: what moves with the fingers; foot: what never moves.
+    Moving joints beside arm and fingers (a head, a second arm) are held at zero.  disabled: pairs of links that may touch.
+    """
+
+    def __init__(self, config: RobotConfig | None = None) -> None:
+        self.config = config = config or RobotConfig()
+        self.urdf, self.srdf = Path(config.urdf), Path(config.srdf)
+        if not config.urdf:
+            folder = panda_folder()
+            self.urdf, self.srdf = folder / "urdf" / "panda.urdf", folder / "srdf" / "panda.srdf"
+        for path, what in ((self.urdf, "URDF"), (self.srdf, "SRDF")):
+            if not path.is_file():
+                raise MagicError(Code.BAD_REQUEST, what, str(path), "an existing file")
+        self._root = _parsed(self.urdf, "URDF")
+        try:
+            self.joints = {joint.name: joint for joint in map(_joint, self._root.findall("joint"))}
+        except (ValueError, TypeError, AttributeError) as error:
+            raise MagicError(Code.BAD_REQUEST, f"joints of {self.urdf}", str(error), "joints with parent, child and numbers") from error
+        self._links = {link.get("name", ""): link for link in self._root.findall("link")}
+        self._above = {joint.child: joint for joint in self.joints.values()}
+        for joint in self.joints.values():
+            for link in {joint.parent, joint.child} - set(self._links):
+                raise MagicError(Code.BAD_REQUEST, f"link of {joint.name} in {self.urdf}", link, list(self._links))
+        self._below: dict[str, list[Joint]] = {link: [] for link in self._links}
+        for joint in self.joints.values():
+            self._below[joint.parent].append(joint)
+        roots = [link for link in self._links if link not in self._above]
+        self.base = roots[0] if roots else ""
+        if len(roots) != 1 or len(self._above) != len(self.joints) or len(self._beyond(self.base)) != len(self._links):
+            raise MagicError(Code.BAD_REQUEST, f"links of {self.urdf}", f"roots {roots}", "one tree with one root")
+        self.arm = self._chain()
+        if len(config.home) != len(self.arm):
+            raise MagicError(Code.BAD_REQUEST, "home configuration", list(config.home), f"{len(self.arm)} joint positions")
+        self.foot = frozenset(self._beyond(self.base, rigid=True))
+        self.fingers = self._fingers()
+        # Grippers count from closed: the limit further from zero is where they are open.
+        far = [abs(joint.upper) >= abs(joint.lower) for joint in self.fingers]
+        self.closed = np.array([joint.lower if up else joint.upper for joint, up in zip(self.fingers, far, strict=True)])
+        self.opened = np.array([joint.upper if up else joint.lower for joint, up in zip(self.fingers, far, strict=True)])
+        self.finger_links = frozenset(link for joint in self.fingers for link in self._beyond(joint.child, rigid=True))
+        self.disabled = frozenset(
+            frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in _parsed(self.srdf, "SRDF").findall("disable_collisions")
+        )
+        for joint in self.arm:
+            if not joint.effort > 0:
+                raise MagicError(
+                    Code.BAD_REQUEST, f"effort limit of {joint.name} in {self.urdf}", joint.effort, "above 0 (Nm; N if it slides)"
+                )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the arm's joints."""
+        return tuple(joint.name for joint in self.arm)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of all links."""
+        return tuple(self._links)
+
+    # ------------------------------------------------------------ the tree
+
+    def _chain(self) -> tuple[Joint, ...]:
+        link, chain = self.config.move_group, []
+        if link not in self._links:
+            raise MagicError(Code.BAD_REQUEST, "tip link (move_group)", link, list(self._links))
+        while link in self._above:
+            joint = self._above[link]
+            chain.insert(0, joint)
+            link = joint.parent
+        moving = tuple(joint for joint in chain if joint.moves)
+        if not moving:
+            raise MagicError(Code.BAD_REQUEST, "tip link (move_group)", self.config.move_group, "a link that at least one joint moves")
+        return moving
+
+    def _beyond(self, link: str, rigid: bool = False) -> list[str]:
+        """A link and those beyond it, nearer ones first; ``rigid``: only those that fixed joints join to it."""
+        found = [link]
+        for name in found:
+            found += [joint.child for joint in self._below[name] if not (rigid and joint.moves)]
+        return found
+
+    def _fingers(self) -> tuple[Joint, ...]:
+        hand = self._beyond(self.arm[-1].child, rigid=True)
+        fingers = tuple(joint for joint in self.joints.values() if joint.moves and joint.parent in hand)
+        if len(fingers) != 2 or not all(joint.sliding for joint in fingers):
+            raise MagicError(
+                Code.BAD_REQUEST,
+                f"gripper of {self.urdf}",
+                ", ".join(f"{joint.name} ({joint.kind})" for joint in fingers) or "no joints",
+                "two prismatic joints on the links that the arm's last joint moves",
+            )
+        poses = self.poses({})
+        tip_from_world = transforms.inverse(poses[self.config.move_group])
+        for joint in fingers:
+            direction = (tip_from_world @ poses[joint.parent] @ joint.parent_from_joint)[:3, :3] @ joint.axis
+            if abs(direction["xy".index(self.config.closing_axis)]) < ALONG:
+                raise MagicError(
+                    Code.BAD_REQUEST,
+                    f"closing axis {self.config.closing_axis} of {self.config.move_group}: {joint.name} slides along",
+                    direction.round(3).tolist(),
+                    "the axis along which the fingers close, x or y",
+                )
+            if not joint.upper > joint.lower:
+                raise MagicError(Code.BAD_REQUEST, f"limits of {joint.name}", [joint.lower, joint.upper], "lower below upper")
+        return fingers
+
+    def poses(self, positions: Mapping[str, float]) -> dict[str, NDArray[np.float64]]:
+        """base_from_link (4, 4) of each link for joint positions by name; joints not named are at zero."""
+        poses = {self.base: np.eye(4)}
+        for link in self._beyond(self.base):
+            for joint in self._below[link]:
+                poses[joint.child] = poses[link] @ joint.parent_from_joint @ joint.motion(float(positions.get(joint.name, 0.0)))
+        return poses
+
+    def arm_positions(self, joints: NDArray[np.float64]) -> dict[str, float]:
+        """Positions by name out of (J + 2,): the arm's joints in rad (m), then the fingers in m."""
+        return dict(zip((*self.names, *(j.name for j in self.fingers)), np.asarray(joints, dtype=float).tolist(), strict=True))
+
+    # ------------------------------------------------------------ shapes and masses
+
+    def shapes(self, link: str, what: str = "collision") -> list[Shape]:
+        """The ``collision`` or ``visual`` shapes of a link."""
+        colors = {m.get("name", ""): m.find("color") for m in self._root.findall("material")}
+        return [shape for element in self._links[link].findall(what) if (shape := self._shape(element, colors)) is not None]
+
+    def _shape(self, element: ET.Element, colors: Mapping[str, ET.Element | None]) -> Shape | None:
+        geometry = element.find("geometry")
+        if geometry is None or len(geometry) == 0:
+            return None
+        body, at, material = geometry[0], _origin(element.find("origin")), element.find("material")
+        color = None
+        if material is not None:
+            found = material.find("color")
+            found = found if found is not None else colors.get(material.get("name", ""))
+            if found is not None:
+                red, green, blue = (int(255 * v) for v in _numbers(found.get("rgba"), "0.7 0.7 0.7 1")[:3].clip(0, 1))
+                color = (red, green, blue)
+        sizes = {
+            "box": lambda: _numbers(body.get("size"), ""),
+            "sphere": lambda: _numbers(body.get("radius"), ""),
+            "cylinder": lambda: np.concatenate([_numbers(body.get("radius"), ""), _numbers(body.get("length"), "")]),
+            "mesh": lambda: _numbers(body.get("scale"), "1 1 1"),
+        }
+        sizes["capsule"] = sizes["cylinder"]
+        if body.tag not in sizes:
+            return None
+        size = tuple(float(v) for v in sizes[body.tag]())
+        return Shape(at, body.tag, size, self._mesh_file(body.get("filename", "")) if body.tag == "mesh" else None, color)
+
+    def _mesh_file(self, name: str) -> Path | None:
+        """Where a mesh that the URDF names lies; None where it is not found."""
+        if not name.startswith("package://"):
+            path = self.urdf.resolve().parent / name.removeprefix("file://")
+            return path if path.is_file() else None
+        rest = name.removeprefix("package://")
+        root = self.config.package_root
+        for folder in (Path(root).resolve(),) if root else self.urdf.resolve().parents:
+            if (folder / rest).is_file():
+                return folder / rest
+        try:
+            from ament_index_python.packages import get_package_share_directory
+
+            package, _, inside = rest.partition("/")
+            path = Path(get_package_share_directory(package)) / inside
+        except (ImportError, LookupError, ValueError):
+            return None
+        return path if path.is_file() else None
+
+    def tree(self, folder: Path) -> ET.Element:
+        """The URDF as a collision library or a physics engine needs it, to be written into ``folder``.
+
+        Links with their collision shapes and inertia, and joints; meshes named relative to the folder; the fingers' coupling and
+        whatever is not part of robot left out; joints beside arm and fingers fixed.  Raises BAD_REQUEST for a mesh that is missing.
+        """
+        tree = ET.Element("robot", {"name": self._root.get("name", "robot")})
+        moving = {*self.names, *(joint.name for joint in self.fingers)}
+        for element in copy.deepcopy([*self._root.findall("link"), *self._root.findall("joint")]):
+            for unused in [*element.findall("visual"), *element.findall("mimic")]:
+                element.remove(unused)
+            if element.tag == "joint" and element.get("name") not in moving:
+                element.set("type", "fixed")
+            for mesh in element.iterfind("collision/geometry/mesh"):
+                path = self._mesh_file(mesh.get("filename", ""))
+                if path is None:
+                    raise MagicError(
+                        Code.BAD_REQUEST,
+                        f"mesh of {self.urdf}",
+                        mesh.get("filename"),
+                        "an existing file; parameter package_root: the folder that package:// stands for",
+                    )
+                mesh.set("filename", os.path.relpath(path, folder.resolve()))
+            tree.append(element)
+        return tree
+
+
+def _parsed(path: Path, what: str) -> ET.Element:
+    try:
+        return ET.fromstring(path.read_text())
+    except (OSError, ET.ParseError, ValueError) as error:
+        raise MagicError(Code.BAD_REQUEST, f"{what} {path}", f"{type(error).__name__}: {error}", f"a readable {what}") from error
+
+
+def _numbers(text: str | None, default: str) -> NDArray[np.float64]:
+    return np.array([float(x) for x in (text or default).split()])
+
+
+def _origin(element: ET.Element | None) -> NDArray[np.float64]:
+    if element is None:
+        return np.eye(4)
+    return transforms.from_rpy(*_numbers(element.get("rpy"), "0 0 0"), translation=_numbers(element.get("xyz"), "0 0 0"))
+
+
+def _joint(element: ET.Element) -> Joint:
+    limit, axis = element.find("limit"), element.find("axis")
+
+    def bound(key: str) -> float:
+        return float(limit.get(key, 0)) if limit is not None else 0.0
+
+    kind = element.get("type", "fixed")
+    # Generators write the axis "0 0 0" for joints that have none.
+    direction = _numbers(axis.get("xyz"), "1 0 0") if axis is not None and kind != "fixed" else np.array([1.0, 0.0, 0.0])
+    return Joint(
+        element.get("name", ""),
+        kind,
+        element.find("parent").get("link", ""),  # type: ignore[union-attr]
+        element.find("child").get("link", ""),  # type: ignore[union-attr]
+        _origin(element.find("origin")),
+        transforms.unit(direction),
+        bound("lower"),
+        bound("upper"),
+        bound("effort"),
+    )
