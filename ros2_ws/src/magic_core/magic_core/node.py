@@ -28,6 +28,9 @@ WINDING_DOWN, ENDING = 5.0, 2.0
 #: What the last answers of a node that has wound down are given to go out, s.
 LAST_WORDS = 0.1
 
+#: Set when a signal has told this process to end.
+_TOLD_TO_END = threading.Event()
+
 
 def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None = None) -> None:
     """Spin one node until SIGINT, SIGTERM or shutdown, and end the process.
@@ -37,11 +40,10 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
     status is 1 then, else 0.
     """
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    asked = threading.Event()
     spinning = False
 
     def stop(_signum: int, _frame: Any) -> None:
-        asked.set()
+        _TOLD_TO_END.set()
         if not spinning:  # else whatever the executor has in its hands is brought to its end
             raise KeyboardInterrupt
 
@@ -56,7 +58,7 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         spinning = True
         # The wait is in C, and Python only runs a signal's handler between its own instructions: without
         # a limit a node without timers would never notice.
-        while rclpy.ok() and not asked.is_set():
+        while rclpy.ok() and not _TOLD_TO_END.is_set():
             executor.spin_once(timeout_sec=0.2)
         _wind_down(node, executor)
     except KeyboardInterrupt:
@@ -139,16 +141,16 @@ def robot_parameters(node: Node) -> dict[str, Any]:
 
 
 class Goal:
-    """A goal at work: what its handler needs of rclpy's handle.  ``is_cancel_requested`` also where the node winds down."""
+    """What a handler needs of rclpy's handle of its goal.  ``is_cancel_requested`` is also true where the process is told to end."""
 
-    def __init__(self, handle: Any, closing: threading.Event) -> None:
-        self._handle, self._closing = handle, closing
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
         self.request = handle.request
 
     @property
     def is_cancel_requested(self) -> bool:
         """Whether the work is to stop."""
-        return self._closing.is_set() or bool(self._handle.is_cancel_requested)
+        return _TOLD_TO_END.is_set() or bool(self._handle.is_cancel_requested)
 
     def publish_feedback(self, feedback: Any) -> None:
         """As rclpy's."""
@@ -174,21 +176,15 @@ class OneGoalServer:
     ) -> None:
         self._node, self._action, self._work, self._message, self._aborts = node, action, work, busy, aborts
         self._busy = threading.Lock()
-        self._closing = threading.Event()
         self._server = ActionServer(
             node,
             action,
             name,
             self._execute,
-            goal_callback=lambda _goal: GoalResponse.REJECT if self._closing.is_set() else GoalResponse.ACCEPT,
+            goal_callback=lambda _goal: GoalResponse.ACCEPT,
             cancel_callback=lambda _handle: CancelResponse.ACCEPT,
             callback_group=ReentrantCallbackGroup(),
         )
-
-    def wind_down(self) -> bool:
-        """Take no more goals and cancel the one at work; true once there is none.  For the node's method of that name."""
-        self._closing.set()
-        return not self._busy.locked()
 
     def destroy(self) -> None:
         """Take the server down, before its node."""
@@ -202,7 +198,7 @@ class OneGoalServer:
             handle.abort()
             return result
         try:
-            self._work(Goal(handle, self._closing), result)
+            self._work(Goal(handle), result)
         except Exception as error:  # no handler lets an exception out
             result.code, result.message = describe(self._node, error)
         finally:

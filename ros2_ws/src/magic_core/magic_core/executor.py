@@ -1,0 +1,56 @@
+"""An executor with worker threads that waits for them instead of asking them without pause."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import threading
+import traceback
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.executors import ConditionReachedException, Executor, ExternalShutdownException, ShutdownException, TimeoutException
+from rclpy.logging import get_logger
+
+
+class ThreadedExecutor(Executor):
+    """Takes what comes in one thread, and has callbacks done by others; otherwise like rclpy's ``MultiThreadedExecutor``.
+
+    That one goes on asking for a callback that it has handed to a thread until that thread has begun, and holds Python's lock
+    while it does: with cameras at 30 Hz it takes a whole core, loses most of the images and holds up every computation.  This
+    one waits until the thread has begun.
+
+    An exception out of a callback is logged; the others go on.
+    """
+
+    def __init__(self, threads: int, *, context: Context | None = None) -> None:
+        super().__init__(context=context)
+        self._pool = concurrent.futures.ThreadPoolExecutor(threads, thread_name_prefix="callback")
+        self._begun: set[concurrent.futures.Future[None]] = set()
+        self._closed = False
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Wait for one callback, and until a thread has begun it; each at most ``timeout_sec``, s."""
+        try:
+            callback, _, _ = self.wait_for_ready_callbacks(timeout_sec=timeout_sec)
+        except (TimeoutException, ConditionReachedException, ShutdownException, ExternalShutdownException):
+            return
+        begun = threading.Event()
+        future = self._pool.submit(self._work, callback, begun)
+        self._begun.add(future)
+        future.add_done_callback(self._begun.discard)
+        # Where no thread is free by then, the callback comes once more, which does no harm: it is only done once.
+        begun.wait(timeout_sec)
+
+    def _work(self, callback: Any, begun: threading.Event) -> None:
+        begun.set()
+        callback()
+        error = callback.exception() if callback.done() else None
+        if error is not None and not self._closed:  # what a node's entities say after its end is no news
+            get_logger("executor").error("".join(traceback.format_exception(error)))
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Take nothing more, and wait for the callbacks at work; false where some have not ended in ``timeout_sec``, s."""
+        self._closed = True
+        super().shutdown(timeout_sec)
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        return not concurrent.futures.wait(set(self._begun), timeout_sec).not_done
