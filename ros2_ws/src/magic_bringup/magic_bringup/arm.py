@@ -61,8 +61,8 @@ class Arm:
     def __init__(self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, group: CallbackGroup) -> None:
         self._node = node
         self.settings = settings
-        self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group)
-        self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group)
+        self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group, Code.EXECUTION_FAILED)
+        self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group, Code.EXECUTION_FAILED)
         self._state: JointState | None = None
         self._came = -math.inf
 

@@ -234,10 +234,11 @@ class Watcher:
             ("matcher", "match_contact"),
             ("planner", "plan_motion/_action/send_goal"),
             ("verifier", "verify_motion/_action/send_goal"),
-            ("strategy_server", "run_strategy/_action/send_goal"),
         ):
             if self.node.resolve_service_name(name) not in services:
                 missing.append(server)
+        if not self.client.server_is_ready():  # more than that its name is known: a goal sent before that is lost
+            missing.append("strategy_server")
         if ("perception", "/") not in self.node.get_node_names_and_namespaces() or not self.node.count_publishers("objects"):
             missing.append("perception")
         return missing

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from control_msgs.action import FollowJointTrajectory, GripperCommand
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -204,6 +204,7 @@ class FakeArm(Node):
 
     ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort).  ``thickness`` is what is
     between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code, error_string).
+    ``asked`` is set by the first trajectory, which is accepted once ``admits`` is set; ``moving`` by the first accepted one.
     ``positions`` of the joints, rad, are told at 50 Hz while ``tells`` is set, ``late`` seconds late.  With ``squeezes`` the
     fingers close as far as they can, whatever they are told.
     """
@@ -216,7 +217,9 @@ class FakeArm(Node):
         self.positions = [0.0] * len(JOINTS)
         self.tells, self.squeezes = True, False
         self.late = 0.0
-        self.moving = threading.Event()
+        self.moving, self.admits = threading.Event(), threading.Event()
+        self.admits.set()
+        self.asked = threading.Event()
         self.on_move: Callable[[Any, Callable[[], bool]], tuple[int, str]] = lambda trajectory, canceled: (0, "")
         group = ReentrantCallbackGroup()
         self._states = self.create_publisher(JointState, "joint_states", qos.RELIABLE)
@@ -226,6 +229,7 @@ class FakeArm(Node):
                 FollowJointTrajectory,
                 "arm/follow_joint_trajectory",
                 self._move,
+                goal_callback=self._admit,
                 cancel_callback=lambda handle: CancelResponse.ACCEPT,
                 callback_group=group,
             ),
@@ -239,6 +243,10 @@ class FakeArm(Node):
             stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
             self._states.publish(message)
+
+    def _admit(self, goal: Any) -> GoalResponse:
+        self.asked.set()
+        return GoalResponse.ACCEPT if self.admits.wait(10.0) else GoalResponse.REJECT
 
     def _move(self, handle: Any) -> Any:
         trajectory = handle.request.trajectory

@@ -48,6 +48,11 @@ class Token:
         """Whether the node itself is going down."""
         return self._closing
 
+    def check(self) -> None:
+        """Raise CANCELED where :meth:`cancel` was called: before something is begun that a wait would only regret."""
+        if self._canceled:
+            raise MagicError(Code.CANCELED, "canceled")
+
     def poke(self, *_: Any) -> None:
         """Make waiters look at their condition again; fits as a future's done callback."""
         with self._condition:
@@ -128,8 +133,9 @@ class RemoteAction(_Remote):
     #: How long a canceled or late goal is given to end by itself, s.
     CANCEL_PATIENCE = 2.0
 
-    def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup) -> None:
+    def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup, refusal: Code = Code.BUSY) -> None:
         super().__init__(node, name, server)
+        self._refusal = refusal
         self._client = ActionClient(node, kind, name, callback_group=group)
 
     def ready(self) -> bool:
@@ -158,50 +164,52 @@ class RemoteAction(_Remote):
     def respond(self, goal: Any, timeout: float, token: Token, presence: float = 5.0, feedback: Callable[[Any], None] | None = None) -> Any:
         """The response to a goal, of any action: its ``status`` and ``result``.
 
-        A cancel, and a timeout, are forwarded to the goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, BUSY or CANCELED.
+        A cancel, and a timeout, are forwarded to the goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, CANCELED, or
+        BUSY (``refusal``); the message says where the goal, canceled, may still be at work.
         """
         deadline = time.monotonic() + timeout
         self.require(min(presence, timeout), token)
+        token.check()
         callback = None if feedback is None else (lambda message: feedback(message.feedback))
         accepting = self._client.send_goal_async(goal, feedback_callback=callback)
         accepting.add_done_callback(token.poke)
         try:
-            accepted = token.wait(accepting.done, deadline, alive=self._still_there)
-        except MagicError:
-            self._cancel_when_accepted(accepting)
-            raise
-        if not accepted:
-            self._cancel_when_accepted(accepting)
-            raise self._late("did not accept the goal", timeout)
-        handle = accepting.result()
-        if not handle.accepted:
-            raise MagicError(Code.BUSY, f"the {self.server} ({self.name}) refused the goal")
-        future = handle.get_result_async()
-        future.add_done_callback(token.poke)
-        try:
+            if not token.wait(accepting.done, deadline, alive=self._still_there):
+                raise self._late("did not accept the goal", timeout)
+            handle = accepting.result()
+            if not handle.accepted:
+                raise MagicError(self._refusal, f"the {self.server} ({self.name}) refused the goal")
+            future = handle.get_result_async()
+            future.add_done_callback(token.poke)
             if not token.wait(future.done, deadline, alive=self._still_there):
                 raise self._late("did not finish", timeout)
-        except MagicError:
-            self._cancel(handle, future, token)
-            raise
+        except MagicError as error:
+            if self._cancel(accepting, token):
+                raise
+            raise MagicError(error.code, f"{error.message}; the {self.server} did not say that its goal has ended") from error
         return future.result()
 
-    def _cancel(self, handle: Any, future: Any, token: Token) -> None:
-        handle.cancel_goal_async()  # also where this node closes: an arm must not go on without it
-        if token.closing:
-            return
-        try:
-            token.wait(future.done, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=self._still_there)
-        except MagicError:
-            pass  # whoever called gets the first reason, not this one
+    def _cancel(self, accepting: Any, token: Token) -> bool:
+        """Cancel a goal that nobody waits for any more, be it accepted only later; true where it is known to have ended."""
+        ended = threading.Event()
 
-    @staticmethod
-    def _cancel_when_accepted(accepting: Any) -> None:
-        """A goal that is accepted after nobody waits for it must not run on."""
+        def over(_: Any = None) -> None:
+            ended.set()
+            token.poke()
 
-        def done(future: Any) -> None:
-            handle = future.result()
-            if handle is not None and handle.accepted:
+        def stop(sent: Any) -> None:
+            handle = sent.result()
+            if handle is None or not handle.accepted:
+                over()
+            else:
                 handle.cancel_goal_async()
+                handle.get_result_async().add_done_callback(over)
 
-        accepting.add_done_callback(done)
+        if accepting.done():
+            stop(accepting)  # at once, even where no executor spins any more
+        else:
+            accepting.add_done_callback(stop)
+        try:
+            return token.wait(ended.is_set, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=self._still_there)
+        except MagicError:
+            return False

@@ -108,6 +108,7 @@ class StrategyServer(Node):
         self._joints: JointState | None = None
         self._complaints: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._waiting: list[str] | None = None
+        self._closing = False
 
         self._matcher = RemoteService(self, MatchContact, "match_contact", "matcher", group)
         self._planner = RemoteAction(self, PlanMotion, "plan_motion", "planner", group)
@@ -127,7 +128,7 @@ class StrategyServer(Node):
             RunStrategy,
             "run_strategy",
             execute_callback=self._execute,
-            goal_callback=lambda goal: GoalResponse.ACCEPT,
+            goal_callback=lambda goal: GoalResponse.REJECT if self._closing else GoalResponse.ACCEPT,
             cancel_callback=self._on_cancel,
             callback_group=group,
         )
@@ -208,14 +209,14 @@ class StrategyServer(Node):
         finally:
             if mine:
                 self._token = None
-            self._goals.pop(key, None)
         self._finish(handle, result)
+        self._goals.pop(key, None)
         return result
 
     def _finish(self, handle: Any, result: RunStrategy.Result) -> None:
         """Bring the goal into the state that belongs to the result's code."""
         try:
-            if result.code == Code.CANCELED and self._canceling(handle):
+            if result.code == Code.CANCELED and not self._closing and self._canceling(handle):
                 handle.canceled()
             elif result.code == Code.OK:
                 handle.succeed()
@@ -314,8 +315,21 @@ class StrategyServer(Node):
             self.get_logger().error(sentence)
         result.message = pipeline.with_metrics(sentence, list(metrics.items()))
 
+    def wind_down(self) -> bool:
+        """Take no more goals and cancel the run at work, with all that it has begun; true once its client has the answer.
+
+        An arm must not go on without this node: its goal is canceled too, and this waits until its controller says that it has ended.
+        """
+        if self._goals and not self._closing:
+            self.get_logger().warning("winding down: the run at work is being canceled")
+        self._closing = True
+        for token in list(self._goals.values()):
+            token.cancel()
+        return not self._goals
+
     def destroy_node(self) -> None:
         """Let a run in progress end, so that its thread does not hold up the process."""
+        self.wind_down()
         for token in list(self._goals.values()):
             token.cancel(closing=True)
         deadline = time.monotonic() + 1.0  # its goals are being canceled: the clients have to last until then
