@@ -10,8 +10,11 @@ from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh, concatenate
 from magic_core.rendering import Raycaster, shade
+from magic_core.robot import Description
 from magic_core.scene import SceneObject
+from magic_verifier.articulation import panda
 from magic_verifier.floating import TARGET, TOOL
+from magic_verifier.robot_pictures import RobotPictures
 from magic_verifier.verification import Recording
 
 TOOL_COLOR = (222, 150, 62)
@@ -46,6 +49,12 @@ def _table(plane: NDArray[np.float64], centre: NDArray[np.float64], size: float 
             faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
             colors += [TABLE_COLORS[(round(x / square) + round(y / square)) % 2]] * 4
     return Mesh(np.array(vertices), np.array(faces), np.array(colors, dtype=np.uint8))
+
+
+def _joint_places(robot: Description, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where the moving links of an arm have their origins, (N, 3) in the world."""
+    poses = robot.poses(robot.arm_positions(joints))
+    return np.array([poses[joint.child][:3, 3] for joint in (*robot.arm, *robot.fingers)])
 
 
 def frame_times(recording: Recording, count: int) -> NDArray[np.int64]:
@@ -107,11 +116,12 @@ def film_strip(
     size: tuple[int, int] = (360, 270),
     direction: tuple[float, float, float] = (0.62, 0.62, -0.55),
     caption: str = "",
+    robot: Description | None = None,
 ) -> NDArray[np.uint8]:
     """Frames of a run side by side in rows, (H, W, 3) uint8 RGB, each with its time and phase.
 
     size (width, height) of one frame; the camera stands still and sees the whole way of tool and target.
-    ``caption`` is written below the last row.
+    ``caption`` is written below the last row.  ``robot``: the arm, where the run has one; ``None`` for the Panda.
     """
     chosen = frame_times(recording, frames)
     items = {TOOL: (tool, TOOL_COLOR), TARGET: (target, TARGET_COLOR)}
@@ -123,10 +133,9 @@ def film_strip(
         way += [transforms.apply(pose, box) for pose in recording.poses[name][chosen]]
     with_arm = recording.joints.shape[1] > 0
     if with_arm:
-        from magic_verifier.panda import Panda
-
-        panda = Panda()
-        way.append(np.array([[0.0, -0.1, 0.15], [0.0, 0.1, 0.65], [0.5, 0.0, 0.6]]))
+        robot = robot or panda()
+        looks = RobotPictures(robot)
+        way += [_joint_places(robot, recording.joints[index]) for index in chosen]
     # What fell off and flew away would make everything else tiny.
     points = np.concatenate(way)
     points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < 1.5]
@@ -137,7 +146,7 @@ def film_strip(
     for index in chosen:
         meshes = still + [_painted(item, color, recording.poses[name][index]) for name, (item, color) in items.items()]
         if with_arm:
-            meshes += panda.visual(recording.joints[index])
+            meshes += looks.at(recording.joints[index])
         picture = cv2.resize(_picture(meshes, intrinsics, world_from_camera), size, interpolation=cv2.INTER_AREA)
         path = transforms.apply(transforms.inverse(world_from_camera), recording.poses[TARGET][: index + 1, :3, 3])
         pixels = intrinsics.project(path) / OVERSAMPLING

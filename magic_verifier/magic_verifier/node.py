@@ -14,9 +14,10 @@ from sensor_msgs.msg import Image
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
-from magic_core.node import OneGoalServer, describe, parameter, run
+from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
+from magic_core.robot import Description, RobotConfig
 from magic_interfaces.action import VerifyMotion
-from magic_verifier.arm_simulation import ArmOptions
+from magic_verifier.articulation import ArmOptions, Articulation
 from magic_verifier.floating import Perturbation
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
 from magic_verifier.verification import DEFAULTS, Limits, Verdict, verify
@@ -63,14 +64,29 @@ class VerifierNode(Node):
             slip=parameter(self, "limits.slip", 0.02, "Way in m that the tool may slip in the gripper.", low=0.0, high=0.5),
             slip_angle=parameter(self, "limits.slip_angle", 0.35, "Angle in rad that the tool may turn in the gripper.", low=0.0, high=3.2),
             tracking=parameter(self, "limits.tracking", 0.1, "Angle in rad that a joint may lag behind its command.", low=0.001, high=3.2),
+            tracking_slide=parameter(
+                self, "limits.tracking_slide", 0.01, "Way in m that a sliding joint may lag behind its command.", low=0.0001, high=1.0
+            ),
             required_rate=parameter(self, "required_rate", 0.5, "Share of perturbed runs that must pass.", low=0.0, high=1.0),
         )
         self._arm = ArmOptions(
-            stiffness=tuple(parameter(self, "arm.stiffness", list(ArmOptions.stiffness), "Stiffness of the seven joint drives in Nm/rad.")),
-            damping=tuple(parameter(self, "arm.damping", list(ArmOptions.damping), "Damping of the seven joint drives in Nms/rad.")),
-            grip_force=parameter(self, "arm.grip_force", 60.0, "Force in N with which each finger closes.", low=1.0, high=140.0),
+            stiffness=tuple(
+                parameter(
+                    self,
+                    "arm.stiffness",
+                    list(ArmOptions.stiffness),
+                    "Stiffness of the joint drives in Nm/rad, one a joint or one for all.",
+                )
+            ),
+            damping=tuple(
+                parameter(
+                    self, "arm.damping", list(ArmOptions.damping), "Damping of the joint drives in Nms/rad, one a joint or one for all."
+                )
+            ),
+            grip_force=parameter(self, "arm.grip_force", 60.0, "Force in N with which each finger closes.", low=0.1, high=1000.0),
             finger_friction=parameter(self, "arm.finger_friction", 1.5, "Friction coefficient of the finger pads.", low=0.0, high=10.0),
         )
+        self._robot = Description(RobotConfig(**robot_parameters(self)))
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
         self._last: tuple[VerifyMotion.Goal, Verdict] | None = None
         self._server = OneGoalServer(
@@ -91,7 +107,7 @@ class VerifierNode(Node):
         super().destroy_node()
 
     def _warm_up(self) -> None:
-        """Load SAPIEN and step a small world, so that the first goal does not pay for it."""
+        """Load SAPIEN and the arm and step small worlds, so that the first goal does not pay for it; raises BAD_REQUEST."""
         from magic_core.mesh import Mesh
 
         cube = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
@@ -99,6 +115,11 @@ class VerifierNode(Node):
         world.add_table(np.array([0, 0, 1.0, 0]), 0.5)
         world.add("cube", usable_pieces("cube", (Mesh(cube, np.zeros((0, 3))),)), np.eye(4), DYNAMIC, 500.0, 0.5)
         world.step()
+        started = time.monotonic()
+        world = World(self._settings["arm"])
+        Articulation(world, self._robot, self._arm).place(np.array(self._robot.config.home))
+        world.step()
+        self.get_logger().info(f"arm {self._robot.urdf.stem} ready after {time.monotonic() - started:.2f} s")
 
     def _answer(self, handle: Any, result: VerifyMotion.Result) -> None:
         verdict, film = self._verify(handle, time.monotonic())
@@ -148,6 +169,7 @@ class VerifierNode(Node):
             perturbation=self._perturbation,
             limits=self._limits,
             arm_options=self._arm,
+            robot=self._robot,
         )
         self.get_logger().info(
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
@@ -169,7 +191,7 @@ class VerifierNode(Node):
         from magic_verifier.film import film_strip
 
         caption = f"{verdict.code.name}: {verdict.message}"
-        strip = film_strip(verdict.recording, tool, target, obstacles, table, frames=self._film_frames, caption=caption)
+        strip = film_strip(verdict.recording, tool, target, obstacles, table, frames=self._film_frames, caption=caption, robot=self._robot)
         return convert.image_to_msg(strip, "rgb8")
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
+from magic_core.robot import Description
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals
@@ -43,8 +44,8 @@ class Limits:
     things after the contact phase has begun, where the tool may well slide along them; nudge
     (m): how far the target may be pushed before the contact phase; early_force (N): how hard a
     held tool may touch fixed things before it; slip (m) and slip_angle (rad): how far the tool
-    may move in the gripper between lift and release; tracking (rad): how far a joint may lag
-    behind; required_rate: share of perturbed runs that must pass.
+    may move in the gripper between lift and release; tracking (rad), tracking_slide (m): how far a
+    turning and a sliding joint may lag behind; required_rate: share of perturbed runs that must pass.
     """
 
     overlap: float = 0.0015
@@ -54,6 +55,7 @@ class Limits:
     slip: float = 0.02
     slip_angle: float = 0.35
     tracking: float = 0.1
+    tracking_slide: float = 0.01
     required_rate: float = 0.5
 
 
@@ -196,6 +198,7 @@ def _run_once(
     stop: _Stop,
     progress: Callable[[str, float], None] | None,
     arm_options: Any,
+    robot: Description | None,
 ) -> tuple[Judgement, Recording | None, float]:
     """One run: judgement, recording, simulated seconds.  Raises for cancel and deadline only."""
     recorder = None
@@ -206,7 +209,7 @@ def _run_once(
         if plan.variant == "arm":
             from magic_verifier.arm_simulation import ArmRun
 
-            run = ArmRun(setup, plan, arm_options, limits)
+            run = ArmRun(setup, plan, arm_options, limits, robot)
         else:
             run = FloatingRun(setup, plan)
         goal = goals.goal_test(strategy, run, rng)
@@ -270,6 +273,7 @@ def verify(
     perturbation: Perturbation | None = None,
     limits: Limits | None = None,
     arm_options: Any = None,
+    robot: Description | None = None,
 ) -> Verdict:
     """Simulate a plan and judge it.
 
@@ -277,6 +281,7 @@ def verify(
     repetitions > 1 the first run is as given and each further one is perturbed (:class:`Perturbation`); success
     then means that at least ``limits.required_rate`` of the runs passed.  ``deadline`` is a moment of
     ``time.monotonic()``; ``cancel`` is asked every few steps; ``progress`` hears phase and simulated time.
+    ``robot``: the arm of an arm plan, ``None`` for the Panda; ``arm_options``: its controller (:class:`ArmOptions`).
     The same seed gives the same verdict.
     """
     started = clock.monotonic()
@@ -300,7 +305,7 @@ def verify(
         for index in range(max(1, int(repetitions))):
             rng = np.random.default_rng([int(seed), index])
             setup = nominal if index == 0 else perturbed(nominal, perturbation, rng)
-            judgement, recording, length = _run_once(strategy, setup, plan, limits, rng, stop, progress, arm_options)
+            judgement, recording, length = _run_once(strategy, setup, plan, limits, rng, stop, progress, arm_options, robot)
             judgements.append(judgement)
             recordings.append(recording)
             simulated += length

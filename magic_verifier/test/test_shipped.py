@@ -20,7 +20,7 @@ from magic_planner.arm import ArmPlanner
 from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
 from magic_planner.robot import Robot
-from magic_verifier.arm_simulation import ArmOptions
+from magic_verifier.articulation import ArmOptions
 from magic_verifier.demonstration import distance_in_view, replay
 from magic_verifier.film import film_strip
 from magic_verifier.floating import settled

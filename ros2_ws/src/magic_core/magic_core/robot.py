@@ -12,8 +12,8 @@ import copy
 import math
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -124,9 +124,11 @@ def panda_folder() -> Path:
 class Description:
     """An arm with a parallel gripper as its URDF and SRDF give it; raises BAD_REQUEST with what is wrong with them.
 
-    arm: the moving joints from the root to the move group, in order.  fingers: two sliding joints beyond the last of these,
+    arm: the moving joints from the root to the move group, in order, their ranges no wider than half a turn either side of home:
+    a turn more is the same to the hand, and takes a planner round in circles.  fingers: two sliding joints beyond the last of these,
     closed (2,) and opened (2,) their positions in metres.  finger_links: what moves with the fingers; foot: what never moves.
-    Moving joints beside arm and fingers (a head, a second arm) are held at zero.  disabled: pairs of links that may touch.
+    moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
+    may touch.
     """
 
     def __init__(self, config: RobotConfig | None = None) -> None:
@@ -158,13 +160,15 @@ class Description:
         self.arm = self._chain()
         if len(config.home) != len(self.arm):
             raise MagicError(Code.BAD_REQUEST, "home configuration", list(config.home), f"{len(self.arm)} joint positions")
-        self.foot = frozenset(self._beyond(self.base, rigid=True))
+        self.arm = tuple(_within_a_turn(joint, float(home)) for joint, home in zip(self.arm, config.home, strict=True))
         self.fingers = self._fingers()
+        self.moving = frozenset((*self.names, *(joint.name for joint in self.fingers)))
+        self.foot = frozenset(self._beyond(self.base, self.moving))
         # Grippers count from closed: the limit further from zero is where they are open.
         far = [abs(joint.upper) >= abs(joint.lower) for joint in self.fingers]
         self.closed = np.array([joint.lower if up else joint.upper for joint, up in zip(self.fingers, far, strict=True)])
         self.opened = np.array([joint.upper if up else joint.lower for joint, up in zip(self.fingers, far, strict=True)])
-        self.finger_links = frozenset(link for joint in self.fingers for link in self._beyond(joint.child, rigid=True))
+        self.finger_links = frozenset(link for joint in self.fingers for link in self._beyond(joint.child))
         self.disabled = frozenset(
             frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in _parsed(self.srdf, "SRDF").findall("disable_collisions")
         )
@@ -199,15 +203,15 @@ class Description:
             raise MagicError(Code.BAD_REQUEST, "tip link (move_group)", self.config.move_group, "a link that at least one joint moves")
         return moving
 
-    def _beyond(self, link: str, rigid: bool = False) -> list[str]:
-        """A link and those beyond it, nearer ones first; ``rigid``: only those that fixed joints join to it."""
+    def _beyond(self, link: str, until: Collection[str] = ()) -> list[str]:
+        """A link and those beyond it, nearer ones first, but not those beyond the joints ``until``."""
         found = [link]
         for name in found:
-            found += [joint.child for joint in self._below[name] if not (rigid and joint.moves)]
+            found += [joint.child for joint in self._below[name] if joint.name not in until]
         return found
 
     def _fingers(self) -> tuple[Joint, ...]:
-        hand = self._beyond(self.arm[-1].child, rigid=True)
+        hand = self._beyond(self.arm[-1].child, {joint.name for joint in self.joints.values() if joint.moves})
         fingers = tuple(joint for joint in self.joints.values() if joint.moves and joint.parent in hand)
         if len(fingers) != 2 or not all(joint.sliding for joint in fingers):
             raise MagicError(
@@ -238,6 +242,12 @@ class Description:
             for joint in self._below[link]:
                 poses[joint.child] = poses[link] @ joint.parent_from_joint @ joint.motion(float(positions.get(joint.name, 0.0)))
         return poses
+
+    def finger_positions(self, width: float) -> NDArray[np.float64]:
+        """(2,): where the fingers are when they are ``width`` metres apart, as far as they can be."""
+        way = float(np.abs(self.opened - self.closed).sum())
+        share = np.clip(1 - (self.config.opening - width) / way, 0.0, 1.0)
+        return self.closed + share * (self.opened - self.closed)
 
     def arm_positions(self, joints: NDArray[np.float64]) -> dict[str, float]:
         """Positions by name out of (J + 2,): the arm's joints in rad (m), then the fingers in m."""
@@ -293,19 +303,31 @@ class Description:
             return None
         return path if path.is_file() else None
 
-    def tree(self, folder: Path) -> ET.Element:
-        """The URDF as a collision library or a physics engine needs it, to be written into ``folder``.
+    @property
+    def bodies(self) -> tuple[frozenset[str], ...]:
+        """The links sorted into what moves as one."""
+        return (self.foot, *(frozenset(self._beyond(joint.child, self.moving)) for joint in (*self.arm, *self.fingers)))
 
-        Links with their collision shapes and inertia, and joints; meshes named relative to the folder; the fingers' coupling and
-        whatever is not part of robot left out; joints beside arm and fingers fixed.  Raises BAD_REQUEST for a mesh that is missing.
+    def tree(self, folder: Path | None = None) -> ET.Element:
+        """The URDF as a collision library or a physics engine needs it.
+
+        Links with their collision shapes and inertia, and joints; meshes by their absolute paths, or relative to ``folder``; the
+        fingers' coupling and what is neither link nor joint left out; joints beside arm and fingers fixed.  Raises BAD_REQUEST
+        for a mesh that is missing.
         """
+        limited = {joint.name: joint for joint in self.arm if joint is not self.joints[joint.name]}
         tree = ET.Element("robot", {"name": self._root.get("name", "robot")})
-        moving = {*self.names, *(joint.name for joint in self.fingers)}
         for element in copy.deepcopy([*self._root.findall("link"), *self._root.findall("joint")]):
             for unused in [*element.findall("visual"), *element.findall("mimic")]:
                 element.remove(unused)
-            if element.tag == "joint" and element.get("name") not in moving:
+            if element.tag == "joint" and element.get("name") not in self.moving:
                 element.set("type", "fixed")
+            elif element.tag == "joint" and element.get("name") in limited:
+                joint = limited[element.get("name", "")]
+                limit = element.find("limit")
+                limit = limit if limit is not None else ET.SubElement(element, "limit")
+                limit.attrib.update(lower=repr(joint.lower), upper=repr(joint.upper))
+                element.set("type", joint.kind)
             for mesh in element.iterfind("collision/geometry/mesh"):
                 path = self._mesh_file(mesh.get("filename", ""))
                 if path is None:
@@ -315,7 +337,7 @@ class Description:
                         mesh.get("filename"),
                         "an existing file; parameter package_root: the folder that package:// stands for",
                     )
-                mesh.set("filename", os.path.relpath(path, folder.resolve()))
+                mesh.set("filename", str(path) if folder is None else os.path.relpath(path, folder.resolve()))
             tree.append(element)
         return tree
 
@@ -335,6 +357,14 @@ def _origin(element: ET.Element | None) -> NDArray[np.float64]:
     if element is None:
         return np.eye(4)
     return transforms.from_rpy(*_numbers(element.get("rpy"), "0 0 0"), translation=_numbers(element.get("xyz"), "0 0 0"))
+
+
+def _within_a_turn(joint: Joint, home: float) -> Joint:
+    """A turning joint of the arm with at most half a turn either side of home; others as they are."""
+    if joint.sliding or (joint.kind == "revolute" and joint.upper - joint.lower <= 2 * math.pi):
+        return joint
+    low, high = (joint.lower, joint.upper) if joint.kind == "revolute" else (-math.inf, math.inf)
+    return replace(joint, kind="revolute", lower=max(low, home - math.pi), upper=min(high, home + math.pi))
 
 
 def _joint(element: ET.Element) -> Joint:

@@ -1,0 +1,274 @@
+"""An arm with a parallel gripper as an articulation of the physics engine: from URDF and SRDF to driven joints."""
+
+from __future__ import annotations
+
+import tempfile
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.errors import Code, MagicError
+from magic_core.robot import Description
+from magic_verifier.robot_pictures import shape_mesh
+from magic_verifier.simulation import World, from_pose
+
+ARM = "arm"
+FINGERS = "fingers"
+#: What of the arm never moves and may well stand on the table.
+BASE = "base"
+#: PhysX's filter has so many bits for sets of links that may touch each other.
+GROUPS = 32
+#: What a link of unknown size is taken for where its inertia is not given: edge of a cube in metres.
+UNKNOWN_SIZE = 0.1
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Controller and gripper.
+
+    stiffness Nm/rad and damping Nms/rad (N/m and Ns/m where a joint slides) of the arm's joint drives, one for
+    each joint or one for all (the defaults are those of Franka's joint impedance controller, near critical
+    damping); armature kg m^2 is what the geared motors add to each joint's inertia; grip_force N of each
+    finger; finger_stiffness N/m couples the two fingers, which a belt does in the real hand; closing_speed m/s
+    of each free finger; quiet s for which the fingers must stand still before the arm goes on, closing_time s
+    after which it goes on anyway.
+    """
+
+    stiffness: tuple[float, ...] = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
+    damping: tuple[float, ...] = (120.0, 120.0, 100.0, 100.0, 60.0, 40.0, 30.0)
+    armature: float = 0.1
+    grip_force: float = 60.0
+    finger_stiffness: float = 1e4
+    closing_speed: float = 0.1
+    finger_friction: float = 1.5
+    quiet: float = 0.1
+    closing_time: float = 1.5
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping"):
+            values = tuple(float(v) for v in getattr(self, name))
+            if not values or not all(np.isfinite(v) and v > 0 for v in values):
+                raise MagicError(Code.BAD_REQUEST, f"arm {name}", values, "numbers above 0")
+            object.__setattr__(self, name, values)
+
+    def gains(self, robot: Description) -> list[tuple[float, float]]:
+        """Stiffness and damping of each joint of the arm; raises BAD_REQUEST where there are more or fewer than joints."""
+        count, found = len(robot.arm), []
+        for name in ("stiffness", "damping"):
+            values = getattr(self, name)
+            if len(values) not in (1, count):
+                raise MagicError(Code.BAD_REQUEST, f"arm {name}", values, f"1 number, or {count} for {', '.join(robot.names)}")
+            found.append(values * count if len(values) == 1 else values)
+        return list(zip(*found, strict=True))
+
+
+@lru_cache(maxsize=1)
+def panda() -> Description:
+    """The arm that is simulated where no other one is given."""
+    return Description()
+
+
+class Articulation:
+    """The arm in a world, its root fixed in the world's origin.  Contacts find its links as ``base``, ``arm`` and ``fingers``."""
+
+    def __init__(self, world: World, robot: Description, options: ArmOptions) -> None:
+        """Raises BAD_REQUEST for a description that the engine cannot load or gains that do not fit it."""
+        self._options = options
+        gains = options.gains(robot)
+        self._body = body = _load(world, robot)
+        self._name_links(world, robot)
+        active = [joint.name for joint in body.active_joints]
+        self._size = len(active)
+        self._arm = [active.index(name) for name in robot.names]
+        self._fingers = [active.index(joint.name) for joint in robot.fingers]
+        self._arm_joints = [body.find_joint_by_name(name) for name in robot.names]
+        self._finger_joints = [body.find_joint_by_name(joint.name) for joint in robot.fingers]
+        #: (J,): Nm, or N where a joint slides.
+        self.effort = np.array([joint.effort for joint in robot.arm])
+        for joint, effort, (stiffness, damping) in zip(self._arm_joints, self.effort, gains, strict=True):
+            joint.set_drive_properties(stiffness, damping, force_limit=float(effort), mode="force")
+            joint.set_armature(np.array([options.armature], dtype=np.float32))
+        for joint in self._finger_joints:
+            joint.set_drive_properties(
+                options.finger_stiffness,
+                options.grip_force / options.closing_speed,
+                force_limit=max(200.0, 3 * options.grip_force),
+                mode="force",
+            )
+            joint.set_armature(np.array([0.1], dtype=np.float32))
+        # Rows of the links that the arm's joints move, in the order in which the engine reports joint forces.
+        links = [link.name for link in body.links]
+        self._driven = [links.index(joint.child) for joint in robot.arm]
+        # What a joint transmits about its axis, or along it where it slides: the axis is x of the engine's joint frames.
+        self._component = [0 if joint.sliding else 3 for joint in robot.arm]
+        self._tcp = body.find_link_by_name(robot.config.move_group)
+        strokes = np.abs(robot.opened - robot.closed)
+        self._closed, self._opened = robot.closed.astype(np.float32), robot.opened.astype(np.float32)
+        #: Of each finger: which way it opens, and its share of the way.
+        self._outward = (np.sign(robot.opened - robot.closed) * strokes / strokes.mean()).astype(np.float32)
+        #: Metres between the fingers when they are closed.
+        self._rest = robot.config.opening - float(strokes.sum())
+
+    def _name_links(self, world: World, robot: Description) -> None:
+        pads = world.material(self._options.finger_friction)
+        for link in self._body.links:
+            part = FINGERS if link.name in robot.finger_links else BASE if link.name in robot.foot else ARM
+            world.name_component(link, part)
+            for shape in link.collision_shapes if part == FINGERS else ():
+                shape.physical_material = pads
+
+    # ------------------------------------------------------------ state
+
+    def place(self, q: NDArray[np.float64]) -> None:
+        """Put the arm at q (J,), the fingers open, at rest."""
+        positions = np.zeros(self._size)
+        positions[self._arm], positions[self._fingers] = q, self._opened
+        self._body.set_qpos(positions)
+
+    def arm_state(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and velocities of the arm's joints, (J,) each, rad or m, and per second."""
+        q, speed = np.asarray(self._body.qpos, dtype=float).ravel(), np.asarray(self._body.qvel, dtype=float).ravel()
+        return q[self._arm], speed[self._arm]
+
+    def joints(self) -> NDArray[np.float64]:
+        """(J + 2,): the arm's joints in rad (m), then the fingers in m."""
+        return np.asarray(self._body.qpos, dtype=float).ravel()[[*self._arm, *self._fingers]]
+
+    def _opened_by(self) -> NDArray[np.float32]:
+        """(2,): how far each finger is from closed, divided by its share of the way, m."""
+        return (np.asarray(self._body.qpos).ravel()[self._fingers] - self._closed) / self._outward
+
+    def width(self) -> float:
+        """Metres between the fingers."""
+        return float(self._opened_by().sum()) + self._rest
+
+    def finger_speed(self) -> float:
+        """Of the faster finger, m/s."""
+        return float(np.abs(np.asarray(self._body.qvel).ravel()[self._fingers]).max())
+
+    def tcp(self) -> NDArray[np.float64]:
+        """world_from_tcp (4, 4)."""
+        return from_pose(self._tcp.entity_pose)
+
+    def transmitted(self) -> NDArray[np.float64]:
+        """(J,): the torque about (the force along) the axis that each of the arm's joints carries, Nm (N)."""
+        return np.asarray(self._body.get_link_incoming_joint_forces(), dtype=float)[self._driven, self._component]
+
+    # ------------------------------------------------------------ drives
+
+    def command(self, q: NDArray[np.float64], speed: NDArray[np.float64]) -> None:
+        """Set the drives of the arm, and feed gravity and Coriolis torques forward."""
+        for joint, position, velocity in zip(self._arm_joints, q.tolist(), speed.tolist(), strict=True):
+            joint.set_drive_target(position)
+            joint.set_drive_velocity_target(velocity)
+        self._body.set_qf(self._body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
+
+    def open_fingers(self) -> None:
+        """Drive the fingers to where they are open."""
+        for joint, position in zip(self._finger_joints, self._opened.tolist(), strict=True):
+            joint.set_drive_target(position)
+
+    def close_fingers(self) -> None:
+        """Drive both fingers to their mean less the way that gives the grip force.
+
+        What moves them together is resisted by that force alone, what moves one against the other by the stiffness.
+        """
+        opened = self._opened_by()
+        target = 0.5 * float(opened[0] + opened[1]) - self._options.grip_force / self._options.finger_stiffness
+        for joint, closed, outward in zip(self._finger_joints, self._closed.tolist(), self._outward.tolist(), strict=True):
+            joint.set_drive_target(closed + outward * target)
+
+
+def _load(world: World, robot: Description) -> Any:
+    from sapien.wrapper.urdf_loader import URDFLoader
+
+    text, groups = _prepared(robot)
+    loader = URDFLoader()
+    loader.set_scene(world.scene)
+    loader.fix_root_link = True
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.urdf"
+        path.write_text(text)
+        try:
+            body = loader.load(str(path))
+        except Exception as error:  # the loader raises whatever a file brings up
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", reason, "a URDF that SAPIEN loads") from error
+    body.set_solver_position_iterations(world.settings.position_iterations)
+    body.set_solver_velocity_iterations(world.settings.velocity_iterations)
+    for link in body.links:
+        for shape in link.collision_shapes:
+            shape.set_collision_groups([1, 1, groups.get(link.name, 0), 0])
+    return body
+
+
+@lru_cache(maxsize=4)
+def _prepared(robot: Description) -> tuple[str, dict[str, int]]:
+    """The URDF as the engine takes it, and the bits of its filter for each link."""
+    tree = robot.tree()
+    for link in tree.iterfind("link"):
+        _complete_inertia(robot, link)
+    return ET.tostring(tree, encoding="unicode"), collision_groups(robot)
+
+
+def _complete_inertia(robot: Description, link: ET.Element) -> None:
+    """Give a link numbers that the engine can work with.
+
+    A link without a mass gets that of its collision shapes filled with water, which is what the engine does with a mass of 0; a
+    mass without a positive inertia gets that of a box as large as its shapes.
+    """
+    inertial = link.find("inertial")
+    if inertial is None:
+        inertial = ET.SubElement(link, "inertial")
+    mass_element, inertia_element = inertial.find("mass"), inertial.find("inertia")
+    mass = float(mass_element.get("value", 0)) if mass_element is not None else 0.0
+    given = inertia_element.attrib if inertia_element is not None else {}
+    xx, yy, zz, xy, xz, yz = (float(given.get(key, 0)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    if mass > 0 and np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] > 0:
+        return
+    for element in (mass_element, inertia_element):
+        if element is not None:
+            inertial.remove(element)
+    moments = np.zeros(3)
+    if mass > 0:
+        corners = [shape_mesh(shape).bounds for shape in robot.shapes(link.get("name", ""))]
+        size = np.ptp(np.concatenate(corners), axis=0) if corners else np.full(3, UNKNOWN_SIZE)
+        moments = mass * ((size**2).sum() - size**2) / 12
+    ET.SubElement(inertial, "mass", {"value": str(max(mass, 0.0))})
+    values = dict(zip(("ixx", "iyy", "izz"), map(str, moments.tolist()), strict=True))
+    ET.SubElement(inertial, "inertia", {**values, "ixy": "0", "ixz": "0", "iyz": "0"})
+
+
+def collision_groups(robot: Description) -> dict[str, int]:
+    """Bits for each link, such that two links share one exactly where they may touch: by the SRDF, or because they move as one.
+
+    Each bit stands for a set of links any two of which may touch; sets are grown greedily until every pair is in one.  Parent and
+    child of a joint are never tested by the engine and need none.  Raises BAD_REQUEST where the engine's bits do not suffice.
+    """
+    shaped = [link for link in robot.links if robot.shapes(link)]
+    together = {pair for body in robot.bodies for pair in map(frozenset, combinations(sorted(body), 2))} | robot.disabled
+    untested = {frozenset((joint.parent, joint.child)) for joint in robot.joints.values()}
+    wanted = [pair for pair in map(frozenset, combinations(shaped, 2)) if pair in together and pair not in untested]
+    together |= untested
+    groups = dict.fromkeys(shaped, 0)
+    open_pairs, bit = set(wanted), 0
+    for pair in wanted:
+        if pair not in open_pairs:
+            continue
+        members = sorted(pair)
+        for link in shaped:
+            if link not in members and all(frozenset((link, other)) in together for other in members):
+                members.append(link)
+        if bit == GROUPS:
+            raise MagicError(Code.BAD_REQUEST, f"disable_collisions of {robot.srdf}", f"more than {GROUPS} sets of links", "fewer")
+        for link in members:
+            groups[link] |= 1 << bit
+        open_pairs -= set(map(frozenset, combinations(members, 2)))
+        bit += 1
+    return groups
