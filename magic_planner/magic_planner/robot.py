@@ -10,7 +10,7 @@ from __future__ import annotations
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,8 @@ class Robot:
 
         self.description = Description(config)
         self.config, urdf = self.description.config, self.description.urdf
-        self.chain: Chain = load_chain(urdf, self.config.move_group)
+        limits = np.array([(joint.lower, joint.upper) for joint in self.description.arm])
+        self.chain: Chain = replace(load_chain(urdf, self.config.move_group), lower=limits[:, 0], upper=limits[:, 1])
         # MPlib writes a copy of a URDF that names package:// beside it; ours goes to a folder that can be written.
         with tempfile.TemporaryDirectory() as scratch:
             copy = Path(scratch) / urdf.name
@@ -98,10 +99,8 @@ class Robot:
         return np.eye(3)["xy".index(self.config.closing_axis)]
 
     def _finger_positions(self, width: float) -> NDArray[np.float64]:
-        share = np.clip(width / self.config.opening, 0.0, 1.0)
         robot = self.description
-        positions = robot.closed + share * (robot.opened - robot.closed)
-        by_name = {joint.name: position for joint, position in zip(robot.fingers, positions, strict=True)}
+        by_name = {joint.name: position for joint, position in zip(robot.fingers, robot.finger_positions(width), strict=True)}
         return np.array([by_name[name] for name in self.fingers])
 
     def open_to(self, width: float) -> None:
