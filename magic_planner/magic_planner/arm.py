@@ -9,8 +9,8 @@ is kept with its stage, and the failure that came furthest is the one reported.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,11 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_planner import timing
 from magic_planner.budget import Budget
+from magic_planner.choice import GraspChoice
 from magic_planner.cloud import CloudSettings, unexplained
-from magic_planner.collision import Body, mass_centre, shell, solid_pieces
+from magic_planner.collision import shell, solid_pieces
 from magic_planner.free_motion import FreeMotion
-from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
+from magic_planner.grasps import GraspSettings
 from magic_planner.hand_moves import HandMoves
 from magic_planner.object_motion import table_plane, tool_contact_frame, waypoint_times
 from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
@@ -36,6 +37,8 @@ from magic_planner.task_path import TaskPath, key_poses
 from magic_planner.workspace import Workspace
 
 Array = NDArray[np.float64]
+#: Ways to follow the task with one grasp that are tried.
+WAYS = 3
 
 
 class ArmPlanner:
@@ -169,26 +172,25 @@ class ArmPlanner:
 
         feedback("grasp", "looking for grasps that serve the whole motion")
         failures = Failures()
-        grasps = self._grasps(request, tool_contact_frame(candidate, reflection))
+        lots = GraspChoice(robot, self.grasping, self.settings, request, tool_contact_frame(candidate, reflection)).lots()
         chosen: list[Array] = []  # grasps of the attempts before, in order
-        spare: list[list[Branch]] = []  # those that close where one of these does, only from another side
+        spare: list[Branch] = []  # those that close where one of these does, only from another side
         tried = 0
-        for lot in [*range(0, len(grasps), self.settings.grasps), -1]:
-            if lot >= 0:
-                budget.check("task")
-                feedback("task", f"following the task with grasps {lot} to {min(lot + self.settings.grasps, len(grasps)) - 1}")
-                branches = self.task.branches(request, grasps[lot : lot + self.settings.grasps], failures)
-                groups = _by_grasp(self.task.clear(request, branches, failures))
+        for lot in itertools.chain(lots, [None]):
+            if lot is None:
+                branches = spare
             else:
-                groups = spare
-            for group in groups:
-                frame = group[0].grasp.tool_from_tcp
-                if groups is not spare and any(_same_place(frame, other, robot.closing) for other in chosen):
-                    spare.append(group)
+                budget.check("task")
+                feedback("task", f"following the task with {len(lot)} grasps")
+                branches = self.task.branches(request, lot, failures)
+            for grasp, ways in self.task.clear(request, branches, failures):
+                frame = grasp.tool_from_tcp
+                if lot is not None and any(_same_place(frame, other, robot.closing) for other in chosen):
+                    spare += [branch for branch in branches if branch.grasp is grasp]
                     continue
                 if any(_alike(frame, other) for other in chosen):
                     continue
-                for branch in group[:3]:
+                for branch in itertools.islice(ways, WAYS):
                     if tried >= self.settings.tries:
                         raise failures.error()
                     tried += 1
@@ -197,7 +199,7 @@ class ArmPlanner:
                     except StageError as failure:
                         failures.add(failure.stage, failure.error)
                         if failure.stage == "approach" and failure.error.code == Code.PATH_IN_COLLISION:
-                            break  # the same hand comes to the same grasp in the group's other branches
+                            break  # the same hand comes to the same grasp in its other ways
                         continue
                     chosen.append(frame)
                     if plan is not None:
@@ -209,82 +211,6 @@ class ArmPlanner:
                 Code.NO_GRASP, "stage grasp: attempt", attempt, f"0 to {len(chosen) - 1}: there are {len(chosen)} different grasps"
             )
         raise failures.error()
-
-    def _grasps(self, request: Request, tool_from_contact: Array) -> list[Grasp]:
-        keys = request.poses[request.keys]
-        some = keys[np.unique(np.linspace(0, len(keys) - 1, min(10, len(keys))).astype(int))]
-        poses = np.concatenate([request.tool.world_from_object[None], some])
-        fixed = request.strategy.physics.target_is_fixed
-        target = Body.from_object(request.target)
-        others = [Body.from_object(o) for o in request.obstacles]
-        met = int(np.searchsorted(request.times, request.met))
-        last = len(request.poses) - 1
-        # The force on the contact: what moves the target along the table, or holds the tool up where the target is fixed.
-        loaded, density = (
-            (request.tool, request.strategy.physics.tool_density)
-            if fixed
-            else (request.target, 2 * request.strategy.physics.target_density)
-        )
-        force = float(np.clip(mass_centre(solid_pieces(loaded))[0] * density * 9.81, 0.5, 30.0))
-        settings = replace(self.grasping, density=request.strategy.physics.tool_density, force=force, standoff=self.settings.standoff)
-        rng = np.random.default_rng(request.seed)
-        clouds = {
-            item.id: np.concatenate(
-                [
-                    transforms.apply(item.world_from_object, surface(solid_pieces(item), 200, rng)[0]),
-                    request.cloud.get(item.id, np.zeros((0, 3))),
-                ]
-            )
-            for item in (request.target, *request.obstacles)
-        }
-        static, swept = [], [transforms.apply(transforms.inverse(request.tool.world_from_object), np.concatenate(list(clouds.values())))]
-        for index in np.unique([*np.linspace(0, last, 7).astype(int), min(met, last)]):
-            # Once it is touched the target goes with the tool, unless it is fixed.
-            there = [cloud for name, cloud in clouds.items() if fixed or name != request.target.id or index <= met]
-            if there:
-                final = request.strategy.releases and index == last
-                (swept if final else static).append(transforms.apply(transforms.inverse(request.poses[index]), np.concatenate(there)))
-        swept_points, static_points = np.concatenate(swept), np.concatenate(static) if static else np.zeros((0, 3))
-        checks = [(request.tool.world_from_object, [target, *others])]
-        for index in sorted({0, min(met, last), last}):
-            checks.append((request.poses[index], [target, *others] if fixed or index <= met else others))
-        problem: MagicError | None = None
-        for finer in (1, 4):  # a tool that seems to have no grasp is looked at more closely before that is said
-            closer = replace(
-                settings, samples=settings.samples * finer, pairs=settings.pairs * finer, angles=settings.angles + 8 * (finer > 1)
-            )
-            request.budget.check("grasp")
-            try:
-                grasps = propose(
-                    self.robot,
-                    request.tool,
-                    tool_from_contact,
-                    request.plane,
-                    poses,
-                    closer,
-                    request.seed,
-                    static_points,
-                    swept_points,
-                    request.budget,
-                )
-            except MagicError as error:
-                if error.code != Code.NO_GRASP:
-                    raise
-                problem = error
-                continue
-            most = self.settings.grasps * self.settings.rounds
-            free, blocked = collision_free(self.robot, grasps, request.tool, checks, most, request.budget, way=self.settings.standoff / 2)
-            if free:
-                return free
-            name = max(blocked, key=lambda k: blocked[k])
-            problem = MagicError(
-                Code.NO_GRASP,
-                f"stage grasp: {len(grasps)} grasps of {request.tool.id}",
-                f"hand and {name} in collision for {blocked[name]} of them",
-                "an open hand clear of everything",
-            )
-        assert problem is not None
-        raise problem
 
     def _complete(self, request: Request, branch: Branch, only_check: bool) -> MotionPlan | None:
         """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError."""
@@ -311,11 +237,3 @@ def _same_place(a: Array, b: Array, closing: Array) -> bool:
     """Whether two grasps close at the same place along the same line, to 15 mm and 20 degrees, from whatever side the hand comes."""
     near = bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < 0.015)
     return near and abs(float((a[:3, :3] @ closing) @ (b[:3, :3] @ closing))) > np.cos(np.deg2rad(20))
-
-
-def _by_grasp(branches: Sequence[Branch]) -> list[list[Branch]]:
-    """Branches grouped by grasp, groups and members in the given order."""
-    groups: dict[int, list[Branch]] = {}
-    for branch in branches:
-        groups.setdefault(id(branch.grasp), []).append(branch)
-    return list(groups.values())

@@ -18,6 +18,8 @@ from magic_core.scene import SceneObject
 
 #: Hulls of arrays seen lately: the same pieces are asked for by every stage of every attempt.
 _HULLS: OrderedDict[int, tuple[Any, tuple[NDArray[np.float64], NDArray[np.int32]]]] = OrderedDict()
+#: The same by content, for the next request brings the same pieces in other arrays.
+_EQUAL_HULLS: OrderedDict[bytes, tuple[NDArray[np.float64], NDArray[np.int32]]] = OrderedDict()
 _KEPT_HULLS = 4000
 
 
@@ -29,11 +31,24 @@ def hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
     known = _HULLS.get(id(vertices))
     if known is not None and known[0] is vertices:
         return known[1]
-    result = _hull(vertices)
+    result = _equal_hull(vertices)
     _HULLS[id(vertices)] = (vertices, result)
     while len(_HULLS) > _KEPT_HULLS:
         _HULLS.popitem(last=False)
     return result
+
+
+def _equal_hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    points = np.asarray(vertices, dtype=float)
+    if points.size > 3 * MOST_VERTICES:
+        return _hull(points)
+    content = points.tobytes()
+    known = _EQUAL_HULLS.get(content)
+    if known is None:
+        known = _EQUAL_HULLS[content] = _hull(points)
+        while len(_EQUAL_HULLS) > _KEPT_HULLS:
+            _EQUAL_HULLS.popitem(last=False)
+    return known
 
 
 #: A piece with more vertices than this is represented by its outermost ones in this many directions.
@@ -110,21 +125,26 @@ def outer_points(item: SceneObject) -> NDArray[np.float64]:
     return hull(np.concatenate([p.vertices for p in solid_pieces(item)]))[0]
 
 
+#: What of the margin grown pieces have at least: an octahedron's faces are that much nearer than its corners.
+LEAST_GROWTH = 3**-0.5
+
+
 def grown(pieces: Iterable[Mesh], margin: float) -> tuple[Mesh, ...]:
-    """Convex pieces grown by about ``margin`` metres: by that along the axes, by 0.58 of it where they are least grown."""
+    """Convex pieces grown by about ``margin`` metres: by that along the axes, by LEAST_GROWTH of it where they are least grown."""
     steps = margin * np.concatenate([np.eye(3), -np.eye(3)])
     return tuple(Mesh(*hull((hull(p.vertices)[0][:, None] + steps).reshape(-1, 3))) for p in pieces)
 
 
 def mass_centre(pieces: Sequence[Mesh]) -> tuple[float, NDArray[np.float64]]:
     """Volume in m^3 of convex pieces taken together, and the centre (3,) of their mass."""
-    volumes, centres = np.zeros(len(pieces)), np.zeros((len(pieces), 3))
-    for n, piece in enumerate(pieces):
-        vertices, faces = hull(piece.vertices)
-        corners = vertices[faces] - vertices[0]
-        tetrahedra = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-        volumes[n] = max(float(tetrahedra.sum()), 1e-12)
-        centres[n] = vertices[0] + (tetrahedra[:, None] * corners.sum(axis=1) / 4).sum(axis=0) / volumes[n]
+    hulls = [hull(piece.vertices) for piece in pieces]
+    # Tetrahedra between each face and a corner of its piece.
+    corners = np.concatenate([vertices[faces] - vertices[0] for vertices, faces in hulls])
+    apexes = np.array([vertices[0] for vertices, _ in hulls])
+    first = np.cumsum([0] + [len(faces) for _, faces in hulls[:-1]])
+    tetrahedra = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    volumes = np.maximum(np.add.reduceat(tetrahedra, first), 1e-12)
+    centres = apexes + np.add.reduceat(tetrahedra[:, None] * corners.sum(axis=1) / 4, first) / volumes[:, None]
     return float(volumes.sum()), np.average(centres, axis=0, weights=volumes)
 
 
@@ -136,7 +156,7 @@ def fcl_pose(transform: NDArray[np.float64]) -> Any:
 
 
 def shell(pieces: Iterable[Mesh]) -> list[Any]:
-    """The surfaces of convex pieces as one FCL triangle tree, in a list of one.
+    """The surfaces of convex pieces as one FCL triangle tree, in a list of one; not to be written to.
 
     Not FCL's convex geometries: those of more than 32 vertices are searched along their edges, which goes astray on flat
     faces and reports bodies 3 cm apart as touching; and a tree is asked in about 10 us whatever the number of pieces, a
@@ -144,59 +164,113 @@ def shell(pieces: Iterable[Mesh]) -> list[Any]:
     looks for that.  In the arm's collision world it is left out, for whatever would hold an object of the table is in the
     table as well, and whatever holds a finger meets the hand.
     """
+    return [solid(pieces).tree]
+
+
+def roomy_shell(pieces: Iterable[Mesh], margin: float) -> list[Any]:
+    """A surface about each convex piece as one FCL triangle tree, in a list of one, that keeps ``margin`` metres from its faces.
+
+    At least LEAST_GROWTH of the margin where a piece is sharp.  Each corner of a piece goes out along the mean of the normals about
+    it; pieces with corners too sharp for that are :func:`grown`, which takes new convex hulls.
+    """
+    pieces = tuple(pieces)
+    vertices, faces, first = joined([hull(piece.vertices) for piece in pieces])
+    corners = vertices[faces]
+    sides = _units(np.roll(corners, -1, axis=1) - corners)
+    normals = _units(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    # Weighted by the angle at the corner a face counts the same however it is cut into triangles.
+    angles = np.arccos(np.clip(-np.einsum("fij,fij->fi", sides, np.roll(sides, 1, axis=1)), -1.0, 1.0))
+    out = np.zeros_like(vertices)
+    np.add.at(out, faces, angles[:, :, None] * normals[:, None])
+    out = _units(out)
+    # A corner that goes out by d takes the faces about it along by d times the cosine.
+    cosine = np.ones(len(vertices))
+    np.minimum.at(cosine, faces, np.einsum("fij,fj->fi", out[faces], normals))
+    farthest = 2.0
+    blunt = np.minimum.reduceat(cosine, first) > LEAST_GROWTH / farthest
+    piece_of_face = np.searchsorted(first, faces[:, 0], side="right") - 1
+    surfaces = [(vertices + margin * out / np.maximum(cosine, 1 / farthest)[:, None], faces[blunt[piece_of_face]])]
+    surfaces += [hull(piece.vertices) for piece in grown([p for p, b in zip(pieces, blunt, strict=True) if not b], margin)]
+    return [_tree(*joined(surfaces)[:2])]
+
+
+def joined(
+    surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]],
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
+    """Triangle surfaces as one: vertices (V, 3), faces (F, 3), and where the vertices of each begin (P,)."""
+    first = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces[:-1]])
+    faces = np.concatenate([faces + n for (_, faces), n in zip(surfaces, first, strict=True)])
+    return np.concatenate([vertices for vertices, _ in surfaces]), faces.astype(np.int32), first
+
+
+def _units(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors (..., 3) scaled to length one; those of no length stay zero."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-15))
+
+
+def _tree(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Any:
+    """Triangles as an FCL tree."""
     from mplib.collision_detection import fcl
 
     tree = fcl.BVHModel()
     tree.begin_model()
-    for piece in pieces:
-        tree.add_sub_model(*hull(piece.vertices))
+    tree.add_sub_model(vertices, faces)
     tree.end_model()
-    return [tree]
+    return tree
 
 
 @dataclass(frozen=True)
-class _Solid:
+class Solid:
     """What collision tests need to know of P convex pieces, in their frame.
 
-    tree: their surfaces; normals (P, F, 3), offsets (P, F): their planes, the shorter lists filled up; centres (P, 3), radii (P,):
-    balls about them; first (P, 3): a point of each.
+    tree: their surfaces; normals (P, F, 3), offsets (P, F): their planes, the shorter lists filled up, and how many (P,) there are
+    of each; centres (P, 3), radii (P,): balls about them; first (P, 3): a point of each.
     """
 
     tree: Any
     normals: NDArray[np.float64]
     offsets: NDArray[np.float64]
+    counts: NDArray[np.int64]
     centres: NDArray[np.float64]
     radii: NDArray[np.float64]
     first: NDArray[np.float64]
 
 
-#: Solids of pieces seen lately, as of :data:`_HULLS`.
-_SOLIDS: OrderedDict[tuple[int, ...], tuple[tuple[Mesh, ...], _Solid]] = OrderedDict()
+#: Solids of pieces seen lately, by their hulls, as of :data:`_HULLS`.
+_SOLIDS: OrderedDict[tuple[int, ...], tuple[list[tuple[NDArray[np.float64], NDArray[np.int32]]], Solid]] = OrderedDict()
 _KEPT_SOLIDS = 64
 
 
-def _solid(pieces: tuple[Mesh, ...]) -> _Solid:
-    key = tuple(id(piece) for piece in pieces)
+def solid(pieces: Iterable[Mesh]) -> Solid:
+    """What is needed of convex pieces; made once for pieces of the same shape.  Not to be written to."""
+    hulls = [hull(piece.vertices) for piece in pieces]
+    key = tuple(id(vertices) for vertices, _ in hulls)
     known = _SOLIDS.get(key)
     if known is not None:
         _SOLIDS.move_to_end(key)
         return known[1]
-    hulls = [hull(piece.vertices) for piece in pieces]
     planes = [_planes(vertices, faces) for vertices, faces in hulls]
     centres = np.array([(vertices.min(axis=0) + vertices.max(axis=0)) / 2 for vertices, _ in hulls])
-    solid = _Solid(
-        tree=shell(pieces)[0],
+    result = Solid(
+        tree=_tree(*joined(hulls)[:2]),
         normals=padded([n for n, _ in planes]),
         offsets=padded([o for _, o in planes]),
+        counts=np.array([len(o) for _, o in planes]),
         centres=centres,
         radii=np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, centres, strict=True)]),
         first=np.array([vertices[0] for vertices, _ in hulls]),
     )
-    # The pieces are kept with it: an id is theirs for as long as they live.
-    _SOLIDS[key] = (pieces, solid)
+    # The hulls are kept with it: an id is theirs for as long as they live.
+    _SOLIDS[key] = (hulls, result)
     while len(_SOLIDS) > _KEPT_SOLIDS:
         _SOLIDS.popitem(last=False)
-    return solid
+    return result
+
+
+def face_planes(pieces: Iterable[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Outward unit normals (P, F, 3) and offsets (P, F) of the faces of P convex pieces: inside is where normals @ x <= offsets."""
+    known = solid(pieces)
+    return known.normals, known.offsets
 
 
 class Body:
@@ -208,10 +282,10 @@ class Body:
         from mplib.collision_detection import fcl
 
         self.name = name
-        solid = _solid(tuple(pieces))
-        self.object = fcl.CollisionObject(solid.tree, mplib.Pose())
-        self._planes = solid.normals, solid.offsets
-        self.local, self.radii, self.first = solid.centres, solid.radii, solid.first
+        known = solid(pieces)
+        self.object = fcl.CollisionObject(known.tree, mplib.Pose())
+        self._planes = known.normals, known.offsets
+        self.local, self.radii, self.first = known.centres, known.radii, known.first
         self.pose = np.eye(4)
         self.centres = self.local
 
@@ -232,14 +306,14 @@ class Body:
         """Whether this body and the other have a point in common; without ``inside`` their surfaces only, which is quicker."""
         from mplib.collision_detection import fcl
 
+        if not inside:
+            return bool(fcl.collide(self.object, other.object).is_collision())
         reach = self.radii[:, None] + other.radii[None, :]
         near = np.argwhere(np.linalg.norm(self.centres[:, None] - other.centres[None, :], axis=2) < reach)
         if not len(near):
             return False
         if fcl.collide(self.object, other.object).is_collision():
             return True
-        if not inside:
-            return False
         # The surfaces are apart: a piece is wholly inside another one, with any of its points, or outside.
         return self._holds(other, near) or other._holds(self, near[:, ::-1])
 

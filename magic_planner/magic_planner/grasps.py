@@ -10,7 +10,7 @@ configuration) along the fingers' closing, the origin between the fingertips.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, hull, mass_centre, solid_pieces
+from magic_planner.collision import Body, hull, mass_centre, solid, solid_pieces
+from magic_planner.lines import crossings, through
 from magic_planner.robot import Robot
 
 
@@ -113,55 +114,14 @@ def antipodal(
     pieces: Sequence[Mesh], opening: float, settings: GraspSettings, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces."""
-    hulls = [hull(piece.vertices) for piece in pieces]
     points, normals = surface(pieces, settings.samples, rng)
     if not len(points):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-    width, exit_normal, inside = _through(hulls, points, -normals)
+    width, exit_normal, inside = through(solid(pieces), points, -normals)
     faces_back = np.einsum("ij,ij->i", -normals, exit_normal) >= settings.agreement
     fits = (width > 1e-3) & (width <= opening - 2 * settings.margin)
     keep = ~inside & faces_back & fits
     return points[keep] - normals[keep] * width[keep, None] / 2, -normals[keep], width[keep]
-
-
-def _through(
-    hulls: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]], points: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Follow lines (N, 3), (N, 3) from a surface into the union of convex hulls until they leave it.
-
-    Returns the length (N,) in the material, the outward normal (N, 3) of the face they leave by, and whether the start was
-    no surface at all: inside a hull, or where two abut.
-    """
-    enters, leaves, faced = [], [], []
-    for vertices, faces in hulls:
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        planes = np.cross(b - a, c - a)
-        norms = np.linalg.norm(planes, axis=1)
-        planes, a = planes[norms > 1e-14] / norms[norms > 1e-14][:, None], a[norms > 1e-14]
-        slope = directions @ planes.T
-        gap = np.einsum("ij,ij->i", a, planes)[None] - points @ planes.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = gap / slope
-        out = np.where(slope > 1e-9, along, np.inf)
-        into = np.where(slope < -1e-9, along, -np.inf)
-        beside = (np.abs(slope) <= 1e-9) & (gap < -1e-9)
-        enters.append(into.max(axis=1))
-        leaves.append(np.where(beside.any(axis=1), -np.inf, out.min(axis=1)))
-        faced.append(planes[out.argmin(axis=1)])
-    enter, leave, far = np.array(enters), np.array(leaves), np.array(faced)
-    real = leave > enter + 1e-9
-    inside = ((leave > enter + 1e-4) & (enter < -3e-4) & (leave > -2e-4)).any(axis=0)
-    # The union of the intervals from 0 on, up to its first gap: by where they begin, and how far those so far reach.
-    enter = np.where(real & (leave > 1e-9), enter, np.inf)
-    order = np.argsort(enter, axis=0, kind="stable")
-    starts, ends = np.take_along_axis(enter, order, axis=0), np.take_along_axis(np.where(real, leave, 0.0), order, axis=0)
-    reached = np.maximum.accumulate(np.concatenate([np.zeros((1, len(points))), ends]), axis=0)
-    count = np.where((apart := starts > reached[:-1] + 1e-4).any(axis=0), apart.argmax(axis=0), len(hulls))
-    row = np.arange(len(points))
-    length = reached[count, row]
-    last = np.where(np.arange(len(hulls))[:, None] < count, ends, -np.inf).argmax(axis=0)
-    normal = np.where((count > 0)[:, None], far[order[last, row], row], directions)
-    return length, normal, inside
 
 
 def propose(
@@ -299,27 +259,13 @@ def pad_profiles(
     closing, origin = frames[:, :3, index], frames[:, :3, 3]
     starts = origin[:, None] + flat[None, :, :1] * frames[:, None, :3, 1 - index] + flat[None, :, 1:] * frames[:, None, :3, 2]
     open_half = robot.config.opening / 2
-    heights = np.full((len(frames), len(flat), 2), -np.inf)
-    for piece in pieces:
-        vertices, faces = hull(piece.vertices)
-        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-        near = np.linalg.norm(origin - middle, axis=1) < np.linalg.norm(vertices - middle, axis=1).max() + open_half + half + reach
-        if not near.any():
-            continue
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        planes = np.cross(b - a, c - a)
-        norms = np.linalg.norm(planes, axis=1)
-        planes, a = planes[norms > 1e-14] / norms[norms > 1e-14][:, None], a[norms > 1e-14]
-        slope = (closing[near] @ planes.T)[:, None]
-        gap = np.einsum("ij,ij->i", a, planes) - starts[near] @ planes.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = gap / slope
-        leave = np.where(slope > 1e-9, along, np.inf).min(axis=2)
-        enter = np.where(slope < -1e-9, along, -np.inf).max(axis=2)
-        beside = ((np.abs(slope) <= 1e-9) & (gap < -1e-9)).any(axis=2)
-        met = (leave > enter + 1e-6) & ~beside & (leave < open_half + 0.002) & (enter > -open_half - 0.002)
-        sides = np.where(met[..., None], np.stack([leave, -enter], axis=2), -np.inf)
-        heights[near] = np.maximum(heights[near], sides)
+    heights = np.full((len(frames) * len(flat), 2), -np.inf)
+    shape = solid(pieces)
+    reached = np.linalg.norm(origin[:, None] - shape.centres, axis=2) < shape.radii + open_half + half + reach
+    for found in crossings(shape, starts, closing, reached):
+        met = (found.leave > found.enter + 1e-6) & (found.leave < open_half + 0.002) & (found.enter > -open_half - 0.002)
+        lines, ends = found.lines[met], np.stack([found.leave[met], -found.enter[met]], axis=1)
+        heights[lines] = np.maximum(heights[lines], ends)
     return heights.reshape(len(frames), across, deep, 2), grid
 
 
@@ -523,41 +469,38 @@ class _Terms:
 
 def collision_free(
     robot: Robot,
-    grasps: Sequence[Grasp],
+    grasps: Iterable[Grasp],
     tool: SceneObject,
     checks: Sequence[tuple[NDArray[np.float64], Sequence[Body]]],
-    limit: int,
+    blocked: dict[str, int],
     budget: Budget,
     way: float = 0.0,
-) -> tuple[list[Grasp], dict[str, int]]:
-    """The first ``limit`` grasps whose open hand is clear of the tool itself and, at each pose, of the bodies given with it.
+) -> Iterator[Grasp]:
+    """Those grasps whose open hand is clear of the tool itself and, at each pose, of the bodies given with it, as they are asked for.
 
-    checks: (world_from_tool, bodies already placed).  way: metres straight before the grasp on which it has to be clear of
-    the tool as well.  Also returns how often each body was in the way.
+    checks: (world_from_tool, bodies already placed).  blocked: is told how often each body was in the way.  way: metres straight
+    before the grasp on which the hand has to be clear of the tool as well.
     """
     back = np.linspace(0.0, way, 1 + int(np.ceil(way / 0.01)))
     hand = robot.hand_body()
     held = Body(tool.id, solid_pieces(tool))
-    free: list[Grasp] = []
-    blocked: dict[str, int] = {}
-    for n, grasp in enumerate(grasps):
-        if n % 32 == 0:
-            budget.check("grasp")
-        hit = ""
+
+    def met(frame: NDArray[np.float64]) -> str:
         for distance in back:
-            hand.move(grasp.tool_from_tcp @ transforms.make(translation=[0.0, 0.0, -distance]))
+            hand.move(frame @ transforms.make(translation=[0.0, 0.0, -distance]))
             if hand.touches(held):
-                hit = held.name
-                break
+                return held.name
         for world_from_tool, bodies in checks:
-            if hit:
-                break
-            hand.move(world_from_tool @ grasp.tool_from_tcp)
-            hit = next((body.name for body in bodies if hand.touches(body)), "")
-        if hit:
-            blocked[hit] = blocked.get(hit, 0) + 1
-            continue
-        free.append(grasp)
-        if len(free) >= limit:
-            break
-    return free, blocked
+            hand.move(world_from_tool @ frame)
+            for body in bodies:
+                if hand.touches(body):
+                    return body.name
+        return ""
+
+    for n, grasp in enumerate(grasps):
+        if n % 16 == 0:
+            budget.check("grasp")
+        if name := met(grasp.tool_from_tcp):
+            blocked[name] = blocked.get(name, 0) + 1
+        else:
+            yield grasp

@@ -15,7 +15,7 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_planner.budget import Budget
 from magic_planner.cloud import cloud_name
-from magic_planner.collision import grown, shell, solid_pieces
+from magic_planner.collision import roomy_shell, solid_pieces
 from magic_planner.grasps import Grasp
 
 Array = NDArray[np.float64]
@@ -25,16 +25,15 @@ STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", 
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """key_length, key_angle: spacing of the poses at which grasps are compared.  grasps: how many are compared at once, rounds:
-    how many such lots.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
+    """key_length, key_angle: spacing of the poses at which grasps are compared.  lots: how many are compared at once, the best ones
+    first.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
     lift, retreat: metres.  room: metres about a tool that is carried.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
     neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path
     (searches take some 20 ms; the limit is wide so that a loaded machine finds the same path)."""
 
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
-    grasps: int = 40
-    rounds: int = 3
+    lots: tuple[int, ...] = (12, 28, 40, 40)
     tries: int = 10
     standoff: float = 0.08
     lift: float = 0.06
@@ -83,7 +82,7 @@ class Request:
         if margin <= 0:
             return self.shapes
         if margin not in self._grown:
-            self._grown[margin] = shell(grown(solid_pieces(self.tool), margin))
+            self._grown[margin] = roomy_shell(solid_pieces(self.tool), margin)
         return self._grown[margin]
 
     def surroundings(self, target: bool = True) -> list[str]:
@@ -115,12 +114,12 @@ class Failures:
         self._best: tuple[int, MagicError] | None = None
         self.count = 0
 
-    def add(self, stage: str, error: MagicError) -> None:
-        """Note that a try ended at a stage."""
+    def add(self, stage: str, error: MagicError | Callable[[], MagicError]) -> None:
+        """Note that a try ended at a stage; what is to be said about it may be found out only if it is the one that counts."""
         self.count += 1
         rank = STAGES.index(stage)
         if self._best is None or rank > self._best[0]:
-            self._best = (rank, error)
+            self._best = (rank, error() if callable(error) else error)
 
     def error(self) -> MagicError:
         """The failure to report."""

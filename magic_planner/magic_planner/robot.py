@@ -303,6 +303,13 @@ class Robot:
         return np.array(keep_index, dtype=int), np.array(keep_q).reshape(-1, self.count)
 
 
+def coarse_to_fine(indices: Iterable[int]) -> list[int]:
+    """The same indices, spread over their whole range from the first on: what fails somewhere is found soon."""
+    found = list(indices)
+    bits = max(1, len(found).bit_length())
+    return [found[n] for n in sorted(range(len(found)), key=lambda n: int(f"{n:0{bits}b}"[::-1], 2))]
+
+
 def _shape_points(geometry: Any) -> NDArray[np.float64]:
     """Points (N, 3) whose convex hull holds an FCL shape."""
     kind = type(geometry).__name__

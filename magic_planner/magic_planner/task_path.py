@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from magic_core.errors import Code, MagicError
 from magic_planner.grasps import Grasp
 from magic_planner.object_motion import turning
 from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
+from magic_planner.robot import Collision, coarse_to_fine
 from magic_planner.workspace import Workspace
 
 Array = NDArray[np.float64]
@@ -89,44 +91,53 @@ class TaskPath:
             branches.append(Branch(grasps[index[n]], path, float(cost)))
         return sorted(branches, key=lambda b: b.cost)
 
-    def clear(self, request: Request, branches: Sequence[Branch], failures: Failures) -> list[Branch]:
-        """The branches whose arm, seen without the tool, is clear of everything at every key pose; best first, no more than are tried."""
-        robot = self.robot
-        robot.detach()
-        if robot.world.has_object(request.tool.id):
-            robot.world.remove_object(request.tool.id)
-        robot.open_to(robot.config.opening)
-        times = request.times[request.keys]
-        fixed = request.strategy.physics.target_is_fixed
-        clear: list[Branch] = []
-        # Where one branch fails others fail too: the places of the last failures are looked at first.
-        order = list(range(len(request.keys)))
+    def clear(self, request: Request, branches: Sequence[Branch], failures: Failures) -> Iterator[tuple[Grasp, Iterator[Branch]]]:
+        """The grasps of branches whose arm, seen without the tool, is clear of everything at every key pose, and for each its branches.
+
+        Both come in the order of the branches, and are looked at only when they are asked for.
+        """
+        orders = self._orders(request)
+
+        def free(branch: Branch) -> bool:
+            key = self._met_key(request, branch, orders)
+            if key is not None:
+                failures.add("task", lambda: self._collision(request, key, self.robot.collision(branch.path[key])))
+            return key is None
+
+        seen: set[int] = set()
         for n, branch in enumerate(branches):
             if n % 8 == 0:
                 request.budget.check("task")
-            hit = None
-            for place, k in enumerate(order):
-                self.space.ignore_target(request, not fixed and bool(times[k] > request.met + 1e-9))
-                if robot.collides(branch.path[k]):
-                    hit = (k, robot.collision(branch.path[k]))
+            if id(branch.grasp) in seen or not free(branch):
+                continue
+            seen.add(id(branch.grasp))
+            others = (other for other in branches[n + 1 :] if other.grasp is branch.grasp and free(other))
+            yield branch.grasp, itertools.chain([branch], others)
+
+    def _orders(self, request: Request) -> list[tuple[bool, list[int]]]:
+        """The key poses before the tool meets a target that goes along with it, and those after (True), each from coarse to fine."""
+        after = request.times[request.keys] > request.met + 1e-9
+        if request.strategy.physics.target_is_fixed:
+            after[:] = False
+        return [(moved, coarse_to_fine(np.flatnonzero(after == moved))) for moved in (False, True)]
+
+    def _met_key(self, request: Request, branch: Branch, orders: list[tuple[bool, list[int]]]) -> int | None:
+        """A key pose at which the arm without the tool meets something; it goes to the front of its order, for where one branch
+        fails others fail too."""
+        self.space.empty(request)
+        for moved, order in orders:
+            self.space.ignore_target(request, moved)
+            for place, key in enumerate(order):
+                if self.robot.collides(branch.path[key]):
                     order.insert(0, order.pop(place))
-                    break
-            if hit is None:
-                clear.append(branch)
-                if len(clear) >= 4 * self.settings.tries:
-                    break
-            else:
-                failures.add(
-                    "task",
-                    MagicError(
-                        Code.PATH_IN_COLLISION,
-                        f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}",
-                        "in collision",
-                        "a task path clear of the arm",
-                    ),
-                )
+                    return key
         self.space.ignore_target(request, False)
-        return clear
+        return None
+
+    def _collision(self, request: Request, key: int, pair: Collision | None) -> MagicError:
+        return MagicError(
+            Code.PATH_IN_COLLISION, f"{request.place(int(request.keys[key]))}: {pair}", "in collision", "a task path clear of the arm"
+        )
 
     def check(self, request: Request, branch: Branch) -> None:
         """Raise StageError where the arm, or what it holds, meets something at a key pose or between them."""
@@ -143,15 +154,7 @@ class TaskPath:
             hit = robot.first_collision(branch.path[before - 1 :], budget=request.budget, stage="task")
             hit = None if hit is None else (hit[0] + before - 1, hit[1])
         if hit is not None:
-            raise StageError(
-                "task",
-                MagicError(
-                    Code.PATH_IN_COLLISION,
-                    f"{request.place(int(request.keys[hit[0]]))}: {hit[1]}",
-                    "in collision",
-                    "a task path clear of the arm",
-                ),
-            )
+            raise StageError("task", self._collision(request, *hit))
 
     def follow(self, request: Request, branch: Branch) -> Array:
         """Joint positions (T, J) at every sample of the task: between the key poses by interpolation, then onto the path, all at once."""

@@ -35,6 +35,14 @@ class Workspace:
                 robot.add_cloud(cloud_name(item), request.cloud[item.id], self.cloud.resolution)
         robot.add(request.tool.id, request.shapes, request.tool.world_from_object)
 
+    def empty(self, request: Request) -> None:
+        """The world without the tool, the hand open."""
+        robot, name = self.robot, request.tool.id
+        robot.detach()
+        if robot.world.has_object(name):
+            robot.world.remove_object(name)
+        robot.open_to(robot.config.opening)
+
     def hold(self, request: Request, grasp: Grasp, shapes: list[Any] | None = None) -> None:
         """The world with the tool (or other shapes in its frame) in the closed hand; it may touch nothing else yet."""
         robot, name = self.robot, request.tool.id
