@@ -147,12 +147,12 @@ def give_way(
         box = np.concatenate([transforms.apply(item.world_from_object, piece.vertices) for piece in solid_pieces(item)])
         if np.all(box.min(axis=0) <= high + gap) and np.all(box.max(axis=0) >= low - gap):
             met.append(item)
-    hits = _hits(world_from_tool, Body(tool.id, grown(pieces, gap) if gap > GAP else pieces), [Body.from_object(item) for item in met])
-    if not hits.any():
+    touching = hits(world_from_tool, Body(tool.id, grown(pieces, gap) if gap > GAP else pieces), [Body.from_object(item) for item in met])
+    if not touching.any():
         return world_from_tool
     walls = Pieces.of([piece.transformed(item.world_from_object) for item in met for piece in solid_pieces(item)])
     walk = _Walk(world_from_tool, Pieces.of(pieces), walls, _basis(direction), plane, clearance, gap)
-    first, last = int(hits.argmax()), len(hits) - int(hits[::-1].argmax())
+    first, last = int(touching.argmax()), len(touching) - int(touching[::-1].argmax())
     found = _both_walks(walk, first, last)
     if not _allowed(found).all():
         # Stopped before something that it might step round: then the side from which it came does not bind it.
@@ -189,21 +189,21 @@ def _allowed(shifts: Array) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(shifts, axis=1) <= MOST)
 
 
-def _hits(poses: Array, tool: Body, walls: Sequence[Body]) -> NDArray[np.bool_]:
-    """(T,) whether the tool touches any of the walls."""
-    hits = np.zeros(len(poses), dtype=bool)
+def hits(poses: Array, tool: Body, walls: Sequence[Body]) -> NDArray[np.bool_]:
+    """(T,) whether the tool touches any of the walls at poses (T, 4, 4)."""
+    found = np.zeros(len(poses), dtype=bool)
     if not walls:
-        return hits
+        return found
     low, high = (tool.local - tool.radii[:, None]).min(axis=0), (tool.local + tool.radii[:, None]).max(axis=0)
     centres = poses[:, :3, :3] @ ((low + high) / 2) + poses[:, :3, 3]
     halves = np.abs(poses[:, :3, :3]) @ ((high - low) / 2)
     for wall in walls:
         # Between a clear pose and one wholly inside there is one that touches: the surfaces are enough.
         low, high = (wall.centres - wall.radii[:, None]).min(axis=0), (wall.centres + wall.radii[:, None]).max(axis=0)
-        for index in np.flatnonzero(~hits & np.all((centres - halves <= high) & (centres + halves >= low), axis=1)):
+        for index in np.flatnonzero(~found & np.all((centres - halves <= high) & (centres + halves >= low), axis=1)):
             tool.move(poses[index])
-            hits[index] = tool.touches(wall, inside=False)
-    return hits
+            found[index] = tool.touches(wall, inside=False)
+    return found
 
 
 def _swept_box(poses: Array, points: Array) -> tuple[Array, Array]:

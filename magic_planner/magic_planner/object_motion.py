@@ -27,6 +27,7 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy
 from magic_planner.collision import Body, grown, outer_points, solid_pieces
 from magic_planner.giving_way import GAP, give_way
+from magic_planner.sliding import lowest, slid_contacts
 
 #: Largest step between two samples: metres, radians.
 STEP_LENGTH = 0.005
@@ -82,16 +83,19 @@ def plan_tool_motion(
     world_from_target = _rigid(target.world_from_object, f"pose of {target.id}")
     target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
     tool_from_contact = tool_contact_frame(candidate, reflection)
+    world_from_contact = world_from_target @ target_from_contact
 
     if strategy.mode == "plan":
         waypoint_motion(strategy)  # what is wrong with the waypoints is said before they are changed
-        strategy = drawn_in(strategy, tool, target, (world_from_target @ target_from_contact), transforms.inverse(tool_from_contact))
+        strategy = drawn_in(strategy, tool, target, world_from_contact, transforms.inverse(tool_from_contact))
         times, contacts, phases = waypoint_motion(strategy)
     elif strategy.mode == "retarget":
         times, contacts, phases = demonstrated_motion(strategy)
     else:
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
-    world_from_tool = (world_from_target @ target_from_contact) @ contacts @ transforms.inverse(tool_from_contact)
+    world_from_meeting = world_from_contact @ contacts
+    frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, TABLE_CLEARANCE, gap)
+    world_from_tool = world_from_meeting @ transforms.inverse(frames)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool))
     start = Body(tool.id, solid_pieces(tool))
     start.move(world_from_tool[0])
@@ -103,7 +107,7 @@ def plan_tool_motion(
                 "in collision",
                 "a first waypoint at which the tool is clear of the target and the obstacles",
             )
-    direction = (world_from_target @ target_from_contact)[:3, 2]
+    direction = world_from_contact[:3, 2]
     marks = waypoint_times(strategy)
 
     def name(index: int) -> str:
@@ -344,10 +348,7 @@ def lift_above(
     plane: NDArray[np.float64], world_from_tool: NDArray[np.float64], points: NDArray[np.float64], clearance: float = TABLE_CLEARANCE
 ) -> float:
     """Least rise along world up, metres, that keeps points (N, 3) of the tool frame above the plane at all poses (T, 4, 4)."""
-    normal = plane[:3]
-    in_tool = np.einsum("tji,j->ti", world_from_tool[:, :3, :3], normal)
-    height = (in_tool @ points.T).min(axis=1) + world_from_tool[:, :3, 3] @ normal + plane[3]
-    return max(0.0, (clearance - float(height.min())) / float(normal[2]))
+    return max(0.0, (clearance - float(lowest(plane, world_from_tool, points).min())) / float(plane[2]))
 
 
 def table_plane(table: NDArray[np.float64] | Sequence[float]) -> NDArray[np.float64]:
