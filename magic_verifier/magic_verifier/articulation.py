@@ -81,7 +81,8 @@ class Articulation:
         """Raises BAD_REQUEST for a description that the engine cannot load or gains that do not fit it."""
         self._options = options
         gains = options.gains(robot)
-        self._body = body = _load(world, robot)
+        self._world = world  # the engine's bodies live no longer than their world
+        self.body = body = _load(world, robot)
         self._name_links(world, robot)
         active = [joint.name for joint in body.active_joints]
         self._size = len(active)
@@ -117,7 +118,7 @@ class Articulation:
 
     def _name_links(self, world: World, robot: Description) -> None:
         pads = world.material(self._options.finger_friction)
-        for link in self._body.links:
+        for link in self.body.links:
             part = FINGERS if link.name in robot.finger_links else BASE if link.name in robot.foot else ARM
             world.name_component(link, part)
             for shape in link.collision_shapes if part == FINGERS else ():
@@ -129,20 +130,20 @@ class Articulation:
         """Put the arm at q (J,), the fingers open, at rest."""
         positions = np.zeros(self._size)
         positions[self._arm], positions[self._fingers] = q, self._opened
-        self._body.set_qpos(positions)
+        self.body.set_qpos(positions)
 
     def arm_state(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions and velocities of the arm's joints, (J,) each, rad or m, and per second."""
-        q, speed = np.asarray(self._body.qpos, dtype=float).ravel(), np.asarray(self._body.qvel, dtype=float).ravel()
+        q, speed = np.asarray(self.body.qpos, dtype=float).ravel(), np.asarray(self.body.qvel, dtype=float).ravel()
         return q[self._arm], speed[self._arm]
 
     def joints(self) -> NDArray[np.float64]:
         """(J + 2,): the arm's joints in rad (m), then the fingers in m."""
-        return np.asarray(self._body.qpos, dtype=float).ravel()[[*self._arm, *self._fingers]]
+        return np.asarray(self.body.qpos, dtype=float).ravel()[[*self._arm, *self._fingers]]
 
     def _opened_by(self) -> NDArray[np.float32]:
         """(2,): how far each finger is from closed, divided by its share of the way, m."""
-        return (np.asarray(self._body.qpos).ravel()[self._fingers] - self._closed) / self._outward
+        return (np.asarray(self.body.qpos).ravel()[self._fingers] - self._closed) / self._outward
 
     def width(self) -> float:
         """Metres between the fingers."""
@@ -150,7 +151,7 @@ class Articulation:
 
     def finger_speed(self) -> float:
         """Of the faster finger, m/s."""
-        return float(np.abs(np.asarray(self._body.qvel).ravel()[self._fingers]).max())
+        return float(np.abs(np.asarray(self.body.qvel).ravel()[self._fingers]).max())
 
     def tcp(self) -> NDArray[np.float64]:
         """world_from_tcp (4, 4)."""
@@ -158,7 +159,7 @@ class Articulation:
 
     def transmitted(self) -> NDArray[np.float64]:
         """(J,): the torque about (the force along) the axis that each of the arm's joints carries, Nm (N)."""
-        return np.asarray(self._body.get_link_incoming_joint_forces(), dtype=float)[self._driven, self._component]
+        return np.asarray(self.body.get_link_incoming_joint_forces(), dtype=float)[self._driven, self._component]
 
     # ------------------------------------------------------------ drives
 
@@ -167,7 +168,7 @@ class Articulation:
         for joint, position, velocity in zip(self._arm_joints, q.tolist(), speed.tolist(), strict=True):
             joint.set_drive_target(position)
             joint.set_drive_velocity_target(velocity)
-        self._body.set_qf(self._body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
+        self.body.set_qf(self.body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
 
     def open_fingers(self) -> None:
         """Drive the fingers to where they are open."""

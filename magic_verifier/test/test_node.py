@@ -17,8 +17,6 @@ from magic_core.errors import Code
 from magic_interfaces.msg import SceneObject as SceneObjectMsg
 from magic_verifier import node as verifier_node
 
-#: Of this file's nodes alone.
-DOMAIN = 76
 SIMULATED: list[int] = []
 
 
@@ -27,7 +25,7 @@ def graph(tmp_path_factory):
     """A client of a verifier that counts its simulations."""
     simulate = verifier_node.verify
     verifier_node.verify = lambda *a, **k: SIMULATED.append(1) or simulate(*a, **k)
-    with verifier(tmp_path_factory.mktemp("strategies"), DOMAIN) as client:
+    with verifier(tmp_path_factory.mktemp("strategies")) as client:
         yield client
     verifier_node.verify = simulate
 

@@ -21,15 +21,13 @@ from magic_core.errors import Code
 from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, Phase, ToolMotion
 
-#: Of this file's nodes alone.
-DOMAIN = 92
 #: Seconds that a goal here may take.
 ALLOWED = 10.0
 
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory):
-    with verifier(tmp_path_factory.mktemp("strategies"), DOMAIN) as client:
+    with verifier(tmp_path_factory.mktemp("strategies")) as client:
         yield client
 
 

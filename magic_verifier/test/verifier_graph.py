@@ -27,20 +27,26 @@ def _save(folder, name, goal):
 
 
 @contextmanager
-def verifier(folder, domain: int) -> Iterator:
-    """An action client of a verifier node that has the strategies ``hooking`` and ``juggling``; folder: where these may be written."""
+def verifier(folder, **parameters) -> Iterator:
+    """An action client of a verifier node, in a ROS domain of its own, that has the strategies ``hooking``, ``pulling`` and ``juggling``.
+
+    folder: where these may be written; parameters: of the node, ``{"arm.grip_force": 40.0}``.
+    """
     import rclpy
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
+    from magic_bringup.domain import free_domain
     from magic_core.actions import ActionClient
     from magic_interfaces.action import VerifyMotion
     from magic_verifier.node import VerifierNode
 
     _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
+    _save(folder, "pulling", strategies.Goal("hook", {"noise": 0.0}))
     _save(folder, "juggling", strategies.Goal("juggle"))
-    rclpy.init(domain_id=domain)
-    node = VerifierNode(parameter_overrides=[Parameter("strategies", value=str(folder))])
+    rclpy.init(domain_id=free_domain())
+    given = {"strategies": str(folder), **parameters}
+    node = VerifierNode(parameter_overrides=[Parameter(name, value=value) for name, value in given.items()])
     peer = rclpy.create_node("peer")
     client = ActionClient(peer, VerifyMotion, "verify_motion")
     executor = MultiThreadedExecutor(4)
@@ -48,14 +54,16 @@ def verifier(folder, domain: int) -> Iterator:
     executor.add_node(peer)
     thread = threading.Thread(target=executor.spin, daemon=True)
     thread.start()
-    assert client.wait_for_server(timeout_sec=20)
-    yield client
-    executor.shutdown(timeout_sec=5)
-    thread.join(timeout=5)
-    client.destroy()
-    node.destroy_node()
-    peer.destroy_node()
-    rclpy.try_shutdown()
+    try:
+        assert client.wait_for_server(timeout_sec=20)
+        yield client
+    finally:
+        executor.shutdown(timeout_sec=5)
+        thread.join(timeout=5)
+        client.destroy()
+        node.destroy_node()
+        peer.destroy_node()
+        rclpy.try_shutdown()
 
 
 def goal_message(name="hooking", kind="L", tool=None, target=None, plan=None, **fields):
