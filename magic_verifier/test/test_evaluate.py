@@ -19,11 +19,12 @@ from magic_core.rendering import Raycaster
 from magic_core.shapes import make
 from magic_verifier import evaluate as ev
 from magic_verifier import posing
+from magic_verifier.cases import METHODS, Options, all_cases, load_object, tool_names, tool_object
 from magic_verifier.decomposition import convex_pieces
 from magic_verifier.simulation import sphere_of, usable_pieces
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
-OPTIONS = ev.Options("scooping", "fg", "magic", "embedded", "", "", "", 0, 3, None, STRATEGIES)
+OPTIONS = Options("scooping", strategies=STRATEGIES)
 
 
 @pytest.mark.parametrize(
@@ -35,13 +36,13 @@ def test_wilson_interval(good, count, low, high):
 
 
 def test_the_sets_have_the_sizes_that_the_tasks_ask_for():
-    assert len(ev.cases(OPTIONS)) == 18
-    assert len(ev.cases(replace(OPTIONS, task="hanging"))) == 134
-    assert len(ev.cases(replace(OPTIONS, task="hooking", variant="fg_no_selection"))) == 20
-    selecting = ev.cases(replace(OPTIONS, task="hooking"))
+    assert len(all_cases(OPTIONS)) == 18
+    assert len(all_cases(replace(OPTIONS, task="hanging"))) == 134
+    assert len(all_cases(replace(OPTIONS, task="hooking", variant="fg_no_selection"))) == 20
+    selecting = all_cases(replace(OPTIONS, task="hooking"))
     assert len(selecting) == 5
     assert all(len(case.tools) == 4 for case in selecting)
-    names = [case.name for case in ev.cases(replace(OPTIONS, task="hanging"))]
+    names = [case.name for case in all_cases(replace(OPTIONS, task="hanging"))]
     assert len(set(names)) == len(names)
 
 
@@ -67,7 +68,7 @@ def test_an_evaluation_is_written_and_goes_on_where_it_stopped(tmp_path):
 
 def test_a_folder_without_meshes_is_refused(tmp_path):
     with pytest.raises(MagicError) as error:
-        ev.cases(replace(OPTIONS, objects=str(tmp_path)))
+        all_cases(replace(OPTIONS, objects=str(tmp_path)))
     assert error.value.code == Code.BAD_REQUEST
 
 
@@ -124,10 +125,10 @@ def test_hooking_is_judged_by_the_released_codes_own_test():
     assert "unlike" in ev.summarise(replace(hooking, noise=0.5), [])["test"]
 
 
-@pytest.mark.parametrize("method", ev.METHODS)
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_runs_a_case(method):
     options = replace(OPTIONS, task="hooking", variant="fg_no_selection", method=method)
-    answer = ev.run_case(options, ev.cases(options)[1])
+    answer = ev.run_case(options, all_cases(options)[1])
     assert answer["reason"] in Code.__members__, answer
     assert answer["candidates"]
     if method == "no_verification":
@@ -136,8 +137,8 @@ def test_every_method_runs_a_case(method):
 
 def test_a_mug_is_hung_on_a_mug_tree():
     options = replace(OPTIONS, task="hanging", targets="mug_tree")
-    assert len(ev.cases(options)) == 3 * 134
-    answer = ev.run_case(options, ev.cases(options)[0])
+    assert len(all_cases(options)) == 3 * 134
+    answer = ev.run_case(options, all_cases(options)[0])
     assert answer["success"], answer
 
 
@@ -158,9 +159,9 @@ def test_a_mug_from_a_file_is_set_upright_and_hung(tmp_path):
     turn = transforms.from_rpy(np.pi / 2, 0, 0)
     _folder(tmp_path, turn=turn)
     options = replace(OPTIONS, task="hanging", objects=str(tmp_path))
-    (case,) = ev.cases(options)
+    (case,) = all_cases(options)
     assert case.name == "mugs/mine"
-    tool = ev.tool_object(case.tools[0], 0, "side")
+    tool = tool_object(case.tools[0], 0, "side")
     assert tool.mesh.extents == pytest.approx(make("mug", 1).mesh.extents, abs=1e-3)
     answer = ev.run_case(options, case)
     assert answer["success"], answer
@@ -171,8 +172,8 @@ def test_poses_yaml_says_how_a_mesh_stands_and_how_large_it_is(tmp_path):
     contact = {"point": [0.0, 0.0, 0.02], "normal": [0, 0, 1], "direction": [1, 0, 0]}
     entry = {"orientation": transforms.quaternion_xyzw(turn).tolist(), "scale": 0.5, "contact": contact}
     mug = _folder(tmp_path, {"mugs/mine.obj": entry})
-    (name,) = ev.tool_names(replace(OPTIONS, task="hanging", objects=str(tmp_path), scale=2.0))
-    mesh, pieces, _, meeting = ev._load(name, "side")
+    (name,) = tool_names(replace(OPTIONS, task="hanging", objects=str(tmp_path), scale=2.0))
+    mesh, pieces, _, meeting = load_object(name, "side")
     assert mesh.extents == pytest.approx(np.abs(turn[:3, :3]) @ mug.extents, abs=1e-4)
     assert np.abs(mesh.bounds.sum(axis=0)).max() < 1e-9
     assert pieces
@@ -193,7 +194,7 @@ def test_poses_yaml_says_how_a_mesh_stands_and_how_large_it_is(tmp_path):
 def test_a_wrong_poses_yaml_is_refused_by_name(tmp_path, poses):
     _folder(tmp_path, poses)
     with pytest.raises(MagicError) as error:
-        ev.cases(replace(OPTIONS, task="hanging", objects=str(tmp_path)))
+        all_cases(replace(OPTIONS, task="hanging", objects=str(tmp_path)))
     assert error.value.code == Code.BAD_REQUEST
     assert "poses.yaml" in error.value.message
 

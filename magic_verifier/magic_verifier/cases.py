@@ -1,0 +1,228 @@
+"""The cases of an evaluation: which tools and targets there are, how they stand, and where the target is to be met."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.scene import SceneObject
+from magic_core.strategy import Strategy
+from magic_verifier.posing import PoseEntry, posed, read_poses
+
+TASKS = ("scooping", "hanging", "hooking")
+VARIANTS = ("fg", "arm", "fg_no_selection")
+#: ``magic``: all of it.  ``no_verification``: the best-scored candidate is carried out, unseen by the verifier (which then only
+#: judges it).  ``no_two_step``: without the second curvature estimate and the convexity search.  ``global_only``: the best places
+#: of the global stage, neither refined nor ranked by curvature.
+METHODS = ("magic", "no_verification", "no_two_step", "global_only")
+#: Tools of each task: family and seeds; none of them is the tool of a demonstration.
+SPOONS = (("spoon", 11), ("spoon", 12), ("ladle", 11), ("ladle", 12), ("measuring_cup", 11), ("measuring_cup", 12))
+HOOKS = (("scissors", 1), ("hanger", 1), ("caliper", 1), ("watch", 1))
+BALLS = (0.015, 0.035, 0.045)
+CYLINDERS = (0.015, 0.020, 0.025, 0.030, 0.035)
+MUGS = 134
+#: Sets of targets that ``--targets`` takes by name instead of a folder: seeds of the family.
+TARGET_SETS = {"mug_tree": tuple(range(3))}
+#: How far (m) from the post of a mug tree things are hung on its first peg, at least.
+PEG_REACH = 0.05
+#: Where tools lie when the arm takes them (m).
+TOOL_PLACE = (0.45, -0.32)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One problem: names of tools (several: the tool is to be chosen) and of the target."""
+
+    name: str
+    tools: tuple[str, ...]
+    target: str
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an evaluation is run with; see the command's ``--help``."""
+
+    task: str
+    variant: str = "fg"
+    method: str = "magic"
+    features: str = "embedded"
+    weights: str = ""
+    objects: str = ""
+    targets: str = ""
+    seed: int = 0
+    top_k: int = 3
+    noise: float | None = None
+    strategies: str = ""
+    scale: float = 1.0
+
+
+def tool_names(options: Options) -> list[str]:
+    """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``."""
+    if options.objects:
+        return _meshes(options.objects, options.scale)
+    if options.task == "scooping":
+        return [f"{family}:{seed}" for family, seed in SPOONS]
+    if options.task == "hanging":
+        return [f"mug:{index}" for index in range(MUGS)]
+    return [f"{family}:{seed}" for family, seed in HOOKS]
+
+
+def target_names(options: Options) -> list[str]:
+    """Names of the targets: ``family:number``, ``demonstration``, or the paths of meshes under ``targets``."""
+    if options.targets in TARGET_SETS:
+        return [f"{options.targets}:{seed}" for seed in TARGET_SETS[options.targets]]
+    if options.targets:
+        return _meshes(options.targets)
+    if options.task == "scooping":
+        return [f"sphere:{radius:g}" for radius in BALLS]
+    return ["demonstration"] if options.task == "hanging" else [f"cylinder:{radius:g}" for radius in CYLINDERS]
+
+
+def _meshes(folder: str, scale: float = 1.0) -> list[str]:
+    """Names ``folder//path@scale`` of the meshes under a folder."""
+    root = Path(folder)
+    found = sorted(p.relative_to(root).as_posix() for p in root.rglob("*") if p.suffix.lower() in (".obj", ".ply", ".stl", ".off"))
+    if not found:
+        raise MagicError(
+            Code.BAD_REQUEST, "folder of meshes", folder, f"a folder with obj, ply, stl or off files, or a set: {', '.join(TARGET_SETS)}"
+        )
+    poses = read_poses(root)
+    unknown = sorted(set(poses) - set(found) - {"default"})
+    if unknown:
+        raise MagicError(Code.BAD_REQUEST, f"{root / 'poses.yaml'}: mesh", unknown[0], found[:20])
+    return [f"{root}//{name}@{scale!r}" for name in found]
+
+
+def all_cases(options: Options) -> list[Case]:
+    """All cases of an evaluation, in their order."""
+    tools, targets = tool_names(options), target_names(options)
+    if options.task == "hooking" and options.variant == "fg":
+        return [Case(short_name(target), tuple(tools), target) for target in targets]
+    return [
+        Case(short_name(tool) + ("" if len(targets) == 1 else " " + short_name(target)), (tool,), target)
+        for tool in tools
+        for target in targets
+    ]
+
+
+def short_name(name: str) -> str:
+    return name.rpartition("//")[2].rpartition("@")[0].rpartition(".")[0] if "//" in name else name
+
+
+def tool_object(name: str, index: int, kind: str) -> SceneObject:
+    """The tool as an object that lies or stands on the table."""
+    mesh, pieces, shape, _ = load_object(name, kind)
+    low, _ = mesh.bounds
+    pose = transforms.make(translation=[*TOOL_PLACE, 0.0005 - float(low[2])])
+    object_id = f"tool_{index + 1}"
+    if shape is not None:
+        return shape.as_object(object_id, pose, kind)
+    from magic_core.views import find_view
+
+    return SceneObject(object_id, mesh, pieces, pose, find_view(mesh, pieces, kind), source="known")
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Where on a target tools are to act: point, outward normal and view direction, each (3,), and the radius of curvature (m)."""
+
+    point: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    radius: float
+
+
+def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneObject, ...], Meeting | None]:
+    """The target at the place of the demonstration's, on the table, the fixtures around it, and where tools are to act
+    on it (object frame) where that is given rather than found in the target's silhouette."""
+    from magic_core.shapes import make
+    from magic_core.shapes.fixtures import demonstrated_pose, fixtures
+
+    environment = strategy.environment
+    pose = demonstrated_pose(environment)
+    meeting = None
+    if name == "demonstration":
+        entry = environment["target"]
+        target = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("target", pose)
+    else:
+        mesh, pieces, shape, meeting = load_object(name, None)
+        pose = transforms.make(translation=[*pose[:2, 3], -float(mesh.bounds[0][2])])
+        if shape is not None:
+            target = shape.as_object("target", pose)
+        else:
+            from magic_core.views import find_view
+
+            target = SceneObject("target", mesh, pieces, pose, find_view(mesh, pieces, "top"), source="known")
+    corners = transforms.apply(pose, target.mesh.vertices)
+    # The contact point is where the silhouette reaches farthest along the target's normal.
+    reach = corners @ strategy.target_normal
+    contact = corners[reach > reach.max() - 1e-4].mean(axis=0)
+    return target, tuple(fixtures(environment, contact)), meeting
+
+
+def met_at(meeting: Meeting, target: SceneObject, kind: str) -> Any:
+    """The matcher's Target for a given place: seen along the meeting's direction, the contact frame at its point."""
+    from magic_core.contact import Contact
+    from magic_core.rendering import canonical_view
+    from magic_matcher.matching import Target
+
+    along = transforms.unit(meeting.direction)
+    normal = transforms.unit(meeting.normal - (meeting.normal @ along) * along)
+    view = canonical_view(target.mesh, along, [0, 0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0, 0], kind)
+    frame = transforms.frame(meeting.point, normal, along)
+    picture = transforms.unit(normal @ view.object_from_view[:3, :2])
+    contact = Contact(view.pixels(meeting.point), picture, meeting.radius, False, 3.5 * meeting.radius, frame)
+    return Target(target.id, view, contact)
+
+
+def _peg(shape: Any) -> Meeting:
+    """The first peg of a mug tree, approached along it from its free end."""
+    region = shape.region("peg_1")
+    along = transforms.unit(region.points[0] - region.points[-1])
+    distance = np.linalg.norm(region.points[:, :2], axis=1)
+    fits = np.flatnonzero(distance >= PEG_REACH)
+    index = int(fits[0]) if len(fits) else len(region.points) - 1
+    return Meeting(region.points[index], region.normals[index], along, float(shape.parameters["peg_radius"]))
+
+
+@lru_cache(maxsize=256)
+def load_object(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | None]:
+    """Mesh and pieces in the object frame, the Shape they came from (None: a file), and where to act on it if that is given."""
+    from magic_core import shapes
+
+    if "//" in name:
+        from magic_core.mesh import load
+        from magic_verifier.decomposition import convex_pieces
+
+        folder, _, rest = name.partition("//")
+        path, _, scale = rest.rpartition("@")
+        poses = read_poses(Path(folder))
+        entry = poses.get(path, poses.get("default", PoseEntry()))
+        entry = replace(entry, scale=entry.scale * float(scale))
+        mesh, object_from_mesh = posed(load(Path(folder) / path), kind, entry)
+        meeting = None
+        if entry.contact is not None:
+            point, normal, direction = entry.contact
+            turn = object_from_mesh[:3, :3]
+            meeting = Meeting(transforms.apply(object_from_mesh, entry.scale * point), turn @ normal, turn @ direction, 0.006)
+        return mesh, convex_pieces(mesh), None, meeting
+    family, number = name.split(":")
+    meeting = None
+    if family == "mug":
+        shape = shapes.mug_of_set(int(number))
+    elif family in ("sphere", "cylinder"):
+        size = {"radius": float(number)}
+        if family == "cylinder":
+            size["half_height"] = float(number)
+        shape = shapes.make(family, 0, **size)
+    else:
+        shape = shapes.make(family, int(number))
+        meeting = _peg(shape) if family == "mug_tree" else None
+    return shape.mesh, shape.pieces, shape, meeting
