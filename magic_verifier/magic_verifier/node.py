@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -88,7 +88,7 @@ class VerifierNode(Node):
         )
         self._robot = Description(RobotConfig(**robot_parameters(self)))
         self._film_frames = parameter(self, "film_frames", 8, "Frames of the film strip.", low=1, high=64)
-        self._last: tuple[VerifyMotion.Goal, Verdict] | None = None
+        self._last: tuple[bytes, Verdict] | None = None
         self._server = OneGoalServer(
             self,
             VerifyMotion,
@@ -150,7 +150,8 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
-        if goal.want_film and self._last is not None and _key(goal) == _key(self._last[0]):
+        asked = digest((goal.strategy, tool, target, obstacles, table, candidate, plan, goal.repetitions, goal.seed))
+        if goal.want_film and self._last is not None and asked == self._last[0]:
             return self._with_film(self._last[1], tool, target, obstacles, table)
         verdict = verify(
             strategy,
@@ -175,7 +176,7 @@ class VerifierNode(Node):
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
         )
         if verdict.code not in (Code.CANCELED, Code.SIMULATION_TIMEOUT):  # these depend on more than the goal
-            self._last = goal, verdict
+            self._last = asked, verdict
         return self._with_film(verdict, tool, target, obstacles, table) if goal.want_film else (verdict, Image())
 
     def _with_film(self, verdict: Verdict, tool: Any, target: Any, obstacles: Any, table: Any) -> tuple[Verdict, Image]:
@@ -195,31 +196,28 @@ class VerifierNode(Node):
         return convert.image_to_msg(strip, "rgb8")
 
 
-def _key(goal: VerifyMotion.Goal) -> bytes:
-    """What of a goal its verdict depends on: all but the film and the time it may take.
+def digest(value: Any) -> bytes:
+    """Equal for equal values: of numbers, text, arrays, and tuples and dataclasses of such.
 
-    Neither serialised messages (their padding is undefined) nor ``==`` (not a number is
-    not itself, and stands for times that there are not) tell whether two goals are alike.
+    Not ``==``: not a number is not itself, and stands for times that there are not.
     """
-    digest = hashlib.sha256()
+    found = hashlib.sha256()
 
-    def take(value: Any) -> None:
-        if hasattr(value, "get_fields_and_field_types"):
-            for name in value.get_fields_and_field_types():
-                if value is not goal or name not in ("want_film", "timeout"):
-                    take(getattr(value, name))
-        elif hasattr(value, "tobytes"):  # array.array and numpy.ndarray
-            data = value.tobytes()
-            digest.update(b"%d:" % len(data) + data)
-        elif isinstance(value, (list, tuple)):
-            digest.update(b"%d[" % len(value))
-            for item in value:
-                take(item)
+    def take(item: Any) -> None:
+        if isinstance(item, np.ndarray):
+            found.update(f"{item.dtype}{item.shape}".encode() + np.ascontiguousarray(item).tobytes())
+        elif is_dataclass(item):
+            for part in fields(item):
+                take(getattr(item, part.name))
+        elif isinstance(item, (list, tuple)):
+            found.update(b"%d[" % len(item))
+            for part in item:
+                take(part)
         else:
-            digest.update(repr(value).encode() + b";")
+            found.update(repr(item).encode() + b";")
 
-    take(goal)
-    return digest.digest()
+    take(value)
+    return found.digest()
 
 
 def main() -> None:

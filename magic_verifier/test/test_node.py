@@ -3,10 +3,13 @@
 import os
 import threading
 import time
+from dataclasses import replace
 
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
+import numpy as np
 import pytest
+import scenes
 
 pytest.importorskip("rclpy")
 
@@ -133,3 +136,13 @@ def test_a_second_goal_is_refused_and_a_cancel_ends_the_first(graph):
     result = wait(first.get_result_async(), 10).result
     assert result.code == Code.CANCELED
     assert ask(graph, goal_message()).code == Code.OK
+
+
+def test_digests_are_equal_for_equal_values_only():
+    scene = scenes.hooking("L")
+    same = verifier_node.digest((scenes.hooking("L"), float("nan")))
+    assert verifier_node.digest((scene, float("nan"))) == same
+    moved = replace(scene[2], world_from_object=scene[2].world_from_object + 1e-12)
+    assert verifier_node.digest(((*scene[:2], moved, scene[3]), float("nan"))) != same
+    assert verifier_node.digest((("a",), "b")) != verifier_node.digest(("a", ("b",)))
+    assert verifier_node.digest(np.zeros(2)) != verifier_node.digest(np.zeros((2, 1)))

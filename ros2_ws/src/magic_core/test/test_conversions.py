@@ -220,6 +220,19 @@ def test_mesh_colours_of_the_wrong_length():
     assert error.value.code == Code.BAD_MESH
 
 
+@pytest.mark.parametrize("most", [11, 12])
+def test_more_triangles_than_are_taken(monkeypatch, most):
+    """Mesh and pieces of an object count together: three tetrahedra here."""
+    monkeypatch.setattr(cv, "MOST_TRIANGLES", most)
+    scene = Scene((SceneObject("a", tetrahedron(), (tetrahedron(),) * 2, np.eye(4), view()),), np.array([0, 0, 1.0, 0]))
+    if most == 12:
+        assert len(cv.scene_from_msg(cv.scene_to_msg(scene)).objects) == 1
+        return
+    with pytest.raises(MagicError, match=r"triangles of a: 12 .*up to 11") as error:
+        cv.scene_from_msg(cv.scene_to_msg(scene))
+    assert error.value.code == Code.BAD_MESH
+
+
 @pytest.mark.parametrize("with_target", [True, False])
 def test_candidates(with_target):
     before = ContactCandidate(
