@@ -15,18 +15,20 @@ DEADLINE = 20.0
 
 
 @contextmanager
-def planner(folder, domain: int, **parameters) -> Iterator:
-    """An action client of a planner node that has the strategy ``pulling``; folder: where that may be written."""
+def planner(folder, **parameters) -> Iterator:
+    """An action client of a planner node, both in a domain of their own, that has the strategy ``pulling``; folder: where that may
+    be written."""
     import rclpy
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
+    from magic_bringup.domain import free_domain
     from magic_core.actions import ActionClient
     from magic_interfaces.action import PlanMotion
     from magic_planner.node import PlannerNode
 
     strategies.save(scenes.pulling(), folder / "pulling")
-    rclpy.init(domain_id=domain)
+    rclpy.init(domain_id=free_domain())
     given = {"strategies": str(folder), **parameters}
     node = PlannerNode(parameter_overrides=[Parameter(name, value=value) for name, value in given.items()])
     user = rclpy.create_node("user")

@@ -16,13 +16,10 @@ from magic_core.errors import Code
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("magic_interfaces.action")
 
-#: Of this file's nodes alone.
-DOMAIN = 74
-
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory):
-    with planner(tmp_path_factory.mktemp("strategies"), DOMAIN) as client:
+    with planner(tmp_path_factory.mktemp("strategies")) as client:
         yield client
 
 

@@ -22,15 +22,13 @@ from magic_core.mesh import Mesh
 pytest.importorskip("rclpy")
 pytest.importorskip("magic_interfaces.action")
 
-#: Of this file's nodes alone.
-DOMAIN = 91
 #: Seconds of planning that the goals here allow.
 ALLOWED = 5.0
 
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory):
-    with planner(tmp_path_factory.mktemp("strategies"), DOMAIN) as client:
+    with planner(tmp_path_factory.mktemp("strategies")) as client:
         yield client
 
 

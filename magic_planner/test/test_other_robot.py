@@ -19,8 +19,6 @@ from magic_planner.arm import ArmPlanner
 from magic_planner.object_motion import plan_tool_motion
 from magic_planner.robot import Robot
 
-DOMAIN = 93
-
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
@@ -97,7 +95,7 @@ def test_the_node_takes_it_by_its_parameters(config, tmp_path):
         for name, value in vars(config).items()
         if name in ("urdf", "srdf", "move_group", "closing_axis", "opening", "home", "acceleration")
     }
-    with node(tmp_path, DOMAIN, **given) as client:
+    with node(tmp_path, **given) as client:
         result = ask(client, goal(target=scenes.standing_cylinder(at=(0.72, 0.0))[0]))
         assert result.code == Code.OK, result.message
         assert list(result.plan.arm_trajectory.joint_names) == [f"joint_{name}" for name, *_ in six_axis.JOINTS]
