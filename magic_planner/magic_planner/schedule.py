@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ class Schedule:
         velocity, acceleration, step = robot.velocity_limits, robot.acceleration_limits, settings.time_step
         track = timing.Track(robot.count)
         names: list[tuple[str, float]] = []
-        try:
+        with _feasible("time parameterisation"):
             track.append(timing.parameterise(come, velocity, acceleration, step, corners=True))
             track.append(timing.parameterise(pick[0], velocity * 0.6, acceleration, step))
             grasp_time = track.now
@@ -53,13 +54,6 @@ class Schedule:
             names.append(("transfer", track.now))
             began = track.now
             clock = track.follow(request.times, task, self._rests(request), velocity, acceleration, step)
-        except timing.Infeasible as error:
-            raise StageError(
-                "timing",
-                MagicError(
-                    Code.TIME_PARAMETERISATION, "time parameterisation", str(error), "a path that velocity and acceleration limits allow"
-                ),
-            ) from error
         for phase in request.motion.phases:
             if phase.start < request.times[-1] - 1e-9:
                 names.append((phase.name, began + float(clock(min(phase.end, float(request.times[-1]))))))
@@ -68,15 +62,8 @@ class Schedule:
             release_time = track.now
             track.hold(settings.dwell, step)
             names.append(("release", track.now))
-            try:
+            with _feasible("time parameterisation of the retreat"):
                 track.append(timing.parameterise(retreat, velocity * 0.6, acceleration, step))
-            except timing.Infeasible as error:
-                raise StageError(
-                    "timing",
-                    MagicError(
-                        Code.TIME_PARAMETERISATION, "time parameterisation of the retreat", str(error), "a path that the limits allow"
-                    ),
-                ) from error
             names.append(("retreat", track.now))
         times, q, qd, qdd = track.arrays()
         self._check_limits(request, branch, times, q, qd, qdd, grasp_time, release_time)
@@ -159,6 +146,16 @@ class Schedule:
                         f"up to {robot.chain.effort[j]} N m",
                     ),
                 )
+
+
+@contextmanager
+def _feasible(what: str) -> Iterator[None]:
+    """A path that no timing serves is a failure of the stage ``timing``."""
+    try:
+        yield
+    except timing.Infeasible as error:
+        allowed = "a path that velocity and acceleration limits allow"
+        raise StageError("timing", MagicError(Code.TIME_PARAMETERISATION, what, str(error), allowed)) from error
 
 
 def _phases(ends: Sequence[tuple[str, float]]) -> tuple[Phase, ...]:
