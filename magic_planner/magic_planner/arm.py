@@ -163,6 +163,7 @@ class ArmPlanner:
             shapes=shell(solid_pieces(tool)),
             marks=motion.marks or waypoint_times(strategy),
             cloud=unexplained((target, *obstacles), tool, plane, self.cloud),
+            searches=self.settings.searches,
         )
         self.space.build(request)
         robot.open_to(robot.config.opening)

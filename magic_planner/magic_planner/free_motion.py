@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +17,9 @@ from magic_planner.workspace import Workspace
 
 Array = NDArray[np.float64]
 #: Searches for one free path, each with its own random numbers.
-SEARCHES = 3
+SEARCHES = 2
+#: Joint step, rad, at which a path is looked at that will be moved along, and one that is only tried.
+FINE, COARSE = 0.03, 0.08
 
 
 class FreeMotion:
@@ -54,56 +59,86 @@ class FreeMotion:
                 continue
             # What was left out: the table, above which the task may begin by a hair.
             self.space.hold(request, branch.grasp)
-            if robot.first_collision(timing.swept(path, 0.03), budget=request.budget, stage="transfer") is None:
+            if robot.free(timing.swept(path, FINE), request.budget, "transfer"):
                 return path
         self.space.hold(request, branch.grasp)
         return self._free(request, start, goal, "transfer")
 
     def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
-        """A collision-free joint path (n, J): straight where that is free, else by RRT-Connect and shortened."""
-        import mplib
-
+        """A collision-free joint path (n, J): straight where that is free, else around things and shortened."""
         robot = self.robot
         line = np.stack([start, goal])
-        if robot.first_collision(line, step=0.03, budget=request.budget, stage=stage) is None:
+        if robot.free(straight(start, goal, FINE), request.budget, stage):
             return line
         pair = robot.collision(start) or robot.collision(goal)
         if pair is not None:
             raise StageError(stage, MagicError(Code.PATH_IN_COLLISION, f"an end of the free motion: {pair}", "in collision", "free ends"))
         rng = np.random.default_rng([request.seed, STAGES.index(stage)])
-        for n in range(SEARCHES):
-            request.budget.check(stage)
-            mplib.set_global_seed(int(request.seed) % 100_000 * 10 + n + 1)
-            seconds = min(self.settings.free_time, max(0.05, request.budget.left))
-            status, path = robot.planner.planner.plan(start, [goal], time=seconds, range=0.3, simplify=False)
-            if not str(status).startswith("Exact"):
-                continue
-            path = np.asarray(path, dtype=float)
+        for path in self._candidates(request, start, goal, stage):
             # OMPL checks edges coarsely, and a spline swings out at corners; what that meets is found here.
             for shorter in (_shorten(robot, path, rng, request.budget, stage), path):
-                if robot.first_collision(timing.swept(shorter, 0.03), budget=request.budget, stage=stage) is None:
+                if robot.free(timing.swept(shorter, FINE), request.budget, stage):
                     return shorter
         raise StageError(
             stage,
             MagicError(
                 Code.NO_PATH,
                 f"free motion of stage {stage}",
-                f"none found in {SEARCHES * self.settings.free_time:.1f} s",
+                f"none found in {SEARCHES} searches of {self.settings.free_time} s",
                 "a way around the obstacles",
             ),
         )
 
+    def _candidates(self, request: Request, start: Array, goal: Array, stage: str) -> Iterator[Array]:
+        """Paths (n, J) that may be free: by way of home, where the arm is out of the way of most things, then by RRT-Connect."""
+        import mplib
 
-def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str, rounds: int = 25) -> Array:
-    """Replace stretches of a path (n, J) by straight lines wherever those are free."""
+        robot = self.robot
+        by_home = np.stack([start, robot.home, goal])
+        if all(robot.free(straight(a, b, FINE), request.budget, stage) for a, b in itertools.pairwise(by_home)):
+            yield by_home
+        for n in range(SEARCHES):
+            request.budget.check(stage)
+            if request.searches < 1:
+                return
+            mplib.set_global_seed(int(request.seed) % 100_000 * 10 + n + 1)
+            seconds = min(self.settings.free_time, max(0.05, request.budget.left))
+            status, path = robot.planner.planner.plan(start, [goal], time=seconds, range=0.3, simplify=False)
+            if str(status).startswith("Exact"):
+                yield np.asarray(path, dtype=float)
+            else:
+                request.searches -= 1
+
+
+def straight(start: Array, goal: Array, step: float) -> Array:
+    """Joint positions (n, J) on the straight line between two, at most ``step`` rad apart."""
+    parts = max(1, int(np.ceil(np.abs(goal - start).max() / step)))
+    return start + (goal - start) * (np.arange(parts + 1) / parts)[:, None]
+
+
+def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str, rounds: int = 15) -> Array:
+    """Replace stretches of a path (n, J) by straight lines wherever those are free: from corner to corner, then at random places."""
+    path = _pulled(robot, path, budget, stage)
     for _ in range(rounds):
         if len(path) < 3:
             break
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         a, b = np.sort(rng.uniform(0, lengths[-1], 2))
-        if b - a < 1e-3:
-            continue
+        if np.searchsorted(lengths, a) == np.searchsorted(lengths, b):
+            continue  # on one straight piece
         ends = np.stack([np.array([np.interp(s, lengths, path[:, j]) for j in range(path.shape[1])]) for s in (a, b)])
-        if robot.first_collision(ends, step=0.08, budget=budget, stage=stage) is None:
+        if robot.free(straight(*ends, COARSE), budget, stage):
             path = np.concatenate([path[lengths < a - 1e-9], ends, path[lengths > b + 1e-9]])
     return path
+
+
+def _pulled(robot: Robot, path: Array, budget: Budget, stage: str) -> Array:
+    """The corners of a path (n, J) that are left when each is joined with one as far on as is found free by halving."""
+    kept = [0]
+    while kept[-1] < len(path) - 1:
+        at = kept[-1]
+        ahead = len(path) - 1 - at
+        while ahead > 1 and not robot.free(straight(path[at], path[at + ahead], COARSE), budget, stage):
+            ahead //= 2
+        kept.append(at + ahead)
+    return path[kept]

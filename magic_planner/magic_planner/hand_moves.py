@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,10 +47,14 @@ class HandMoves:
         ways: list[tuple[Array, Array]] = []
         self.space.lay(request, request.tool.world_from_object)
         solutions = solutions[np.argsort(far, kind="stable")][:8]
-        backs = [self.straight(tip, -share * settings.standoff * tip[:3, 2], solutions) for share in (1.0, 0.5)]
+
+        @cache
+        def backs(share: float) -> list[Array | None]:
+            return self.straight(tip, -share * settings.standoff * tip[:3, 2], solutions)
+
         for n, q in enumerate(solutions):
             request.budget.check("approach")
-            for back in (backs[0][n], backs[1][n]):
+            for back in (backs(share)[n] for share in (1.0, 0.5)):
                 if back is None:
                     problem = problem or StageError(
                         "approach",

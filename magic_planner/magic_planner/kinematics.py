@@ -186,8 +186,8 @@ class Chain:
             for n in range(iterations):
                 frames, tip = self.frames(now)
                 error = pose_error(goal, tip)
-                good = (np.linalg.norm(error[:, :3], axis=1) < 2e-5) & (np.linalg.norm(error[:, 3:], axis=1) < 1e-4)
-                if good.all() and n:
+                good = (np.linalg.norm(error[:, :3], axis=1) < 1e-4) & (np.linalg.norm(error[:, 3:], axis=1) < 5e-4)
+                if n and good.all():
                     break
                 move = self._step(now, self.jacobian(frames, tip), error, pull if n == 0 else 0.0)
                 now = np.clip(now + move, self.lower, self.upper)

@@ -24,10 +24,13 @@ class Crossings:
     out: Array
 
 
-def crossings(pieces: Solid, points: Array, directions: Array, near: NDArray[np.bool_] | None = None) -> Iterator[Crossings]:
+def crossings(
+    pieces: Solid, points: Array, directions: Array, near: NDArray[np.bool_] | None = None, within: float = np.inf
+) -> Iterator[Crossings]:
     """For each piece the lines through points (G, C, 3) along unit directions (G, 3) that come near it; pieces without any left out.
 
-    Lines are counted through both axes.  near (G, P): which pieces each group of C lines is to be cut with.
+    Lines are counted through both axes.  near (G, P): which pieces each group of C lines is to be cut with.  within: metres from
+    their points to both sides in which crossings are wanted; of those farther away not all are left out.
     """
     count = points.shape[1]
     for piece in range(len(pieces.radii)):
@@ -37,7 +40,8 @@ def crossings(pieces: Solid, points: Array, directions: Array, near: NDArray[np.
         # Only lines that pass through a piece's ball are cut with its planes.
         arm = pieces.centres[piece] - points[groups]
         along = np.einsum("gcj,gj->gc", arm, directions[groups])
-        group, cell = np.nonzero(np.einsum("gcj,gcj->gc", arm, arm) - along**2 < (pieces.radii[piece] + 1e-6) ** 2)
+        passes = np.einsum("gcj,gcj->gc", arm, arm) - along**2 < (pieces.radii[piece] + 1e-6) ** 2
+        group, cell = np.nonzero(passes & (np.abs(along) < pieces.radii[piece] + within))
         if len(group):
             lines = groups[group] * count + cell
             yield _cut(pieces, piece, lines, points[groups[group], cell], directions[groups[group]])

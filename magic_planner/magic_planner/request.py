@@ -28,8 +28,8 @@ class ArmSettings:
     """key_length, key_angle: spacing of the poses at which grasps are compared.  lots: how many are compared at once, the best ones
     first.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
     lift, retreat: metres.  room: metres about a tool that is carried.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
-    neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path
-    (searches take some 20 ms; the limit is wide so that a loaded machine finds the same path)."""
+    neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path (it
+    takes some 30 ms; the limit is wide so that a loaded machine finds the same path).  searches: how many of a request may fail."""
 
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
@@ -42,7 +42,8 @@ class ArmSettings:
     dwell: float = 0.5
     jump: float = 0.5
     time_step: float = 0.02
-    free_time: float = 1.0
+    free_time: float = 0.25
+    searches: int = 3
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Request:
     shapes: list[Any]  # the tool's surface
     marks: tuple[tuple[str, float], ...]  # names of the places the tool's motion passes, and when
     cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
+    searches: int  # that may still fail
     _grown: dict[float, list[Any]] = field(default_factory=dict)
 
     def roomy(self, margin: float) -> list[Any]:

@@ -224,6 +224,15 @@ class Robot:
             return Collision("the arm", "something")
         return Collision(found[0].link_name1 or found[0].object_name1, found[0].link_name2 or found[0].object_name2)
 
+    def free(self, rows: NDArray[np.float64], budget: Budget, stage: str) -> bool:
+        """Whether the arm touches nothing at any of the rows (N, J)."""
+        for n, index in enumerate(coarse_to_fine(range(len(rows)))):
+            if n % 16 == 0:
+                budget.check(stage)
+            if self.collides(rows[index]):
+                return False
+        return True
+
     def first_collision(
         self, path: NDArray[np.float64], step: float = 0.04, budget: Budget | None = None, stage: str = ""
     ) -> tuple[int, Collision] | None:
