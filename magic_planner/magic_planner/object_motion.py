@@ -6,8 +6,10 @@ pose of the tool's contact frame in the target's:
     world_from_tool(t) = world_from_target  target_from_contact  C(t)  tool_from_contact^-1
 
 ``retarget`` takes C(t) from the demonstration, ``plan`` leads the squarely opposed
-frames through the strategy's waypoints.  Either way the motion is then raised by
-the least amount that keeps the tool above the table.
+frames through the strategy's waypoints.  Where the tool has no room to meet the target
+at the contact itself, the contact slides along it (:mod:`magic_planner.sliding`); what
+the table still lacks raises the whole motion; what is still in the way is given way to
+(:mod:`magic_planner.giving_way`).
 """
 
 from __future__ import annotations
