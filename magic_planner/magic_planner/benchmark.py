@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,6 +122,28 @@ def make_case(
     )
 
 
+@dataclass(frozen=True)
+class Result:
+    """How one case went: whether it was planned, seconds by the clock and of the processor."""
+
+    name: str
+    planned: bool
+    wall: float
+    busy: float
+
+
+def summary(rows: Sequence[Result]) -> str:
+    """A line about the cases of a task: how many were planned, their times, the longest with its name."""
+    parts = [f"{sum(row.planned for row in rows)} of {len(rows)} planned"]
+    for title, key in (("by the clock", "wall"), ("of the processor", "busy")):
+        seconds = np.array([getattr(row, key) for row in rows])
+        longest = rows[int(seconds.argmax())]
+        parts.append(
+            f"{title} mean {seconds.mean():.3f} s, median {np.median(seconds):.3f} s, longest {seconds.max():.3f} s ({longest.name})"
+        )
+    return "; ".join(parts)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description="Measure the planner on procedural objects.")
@@ -143,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"arm ready after {time.perf_counter() - started:.2f} s")
     for task in options.task:
         strategy = find(task, options.strategies)
-        results: dict[str, list[tuple[bool, float, float]]] = {v: [] for v in options.variant}
+        results: dict[str, list[Result]] = {v: [] for v in options.variant}
         for family, region in TASKS[task][0]:
             if options.family and family not in options.family:
                 continue
@@ -157,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
                     text = str(error)
                 fg, fg_busy = time.perf_counter() - started, time.process_time() - busy
                 if "fg" in options.variant:
-                    results["fg"].append((motion is not None, fg, fg_busy))
+                    results["fg"].append(Result(case.name, motion is not None, fg, fg_busy))
                     print(f"{task:9} fg  {case.name:28} {1e3 * fg:7.1f} ms  {text}")
                 if planner is None:
                     continue
@@ -179,16 +202,11 @@ def main(arguments: list[str] | None = None) -> int:
                     except MagicError as error:
                         motion, text = None, str(error)
                 arm, arm_busy = time.perf_counter() - started, time.process_time() - busy
-                results["arm"].append((motion is not None, arm, arm_busy))
+                results["arm"].append(Result(case.name, motion is not None, arm, arm_busy))
                 print(f"{task:9} arm {case.name:28} {1e3 * arm:7.1f} ms  {text}")
         for variant, rows in results.items():
-            seconds, busy_seconds = np.array([s for _, s, _ in rows]), np.array([s for _, _, s in rows])
-            if len(rows):
-                print(
-                    f"{task:9} {variant:3} {sum(ok for ok, _, _ in rows)} of {len(rows)} planned; "
-                    f"mean {seconds.mean():.3f} s, median {np.median(seconds):.3f} s, longest {seconds.max():.3f} s; "
-                    f"of the processor mean {busy_seconds.mean():.3f} s, longest {busy_seconds.max():.3f} s"
-                )
+            if rows:
+                print(f"{task:9} {variant:3} {summary(rows)}")
     return 0
 
 
