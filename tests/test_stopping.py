@@ -19,6 +19,7 @@ from magic_core.errors import Code
 SERVER = {
     "execute": True,
     "state_age": 10.0,
+    "objects_age": 60.0,
     "trajectory_action": "arm/follow_joint_trajectory",
     "gripper_action": "gripper/gripper_action",
 }

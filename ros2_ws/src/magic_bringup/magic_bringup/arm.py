@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +11,11 @@ from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory, GripperCommand
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from magic_bringup import execution
+from magic_bringup.joints import JointStates, check_start
 from magic_bringup.remote import RemoteAction, Token
 from magic_core.conversions import duration_to_msg, time_from_msg
 from magic_core.errors import Code, MagicError
@@ -58,17 +57,14 @@ class Arm:
     they are: what to do with a tool in the hand is for a person to decide.
     """
 
-    def __init__(self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, group: CallbackGroup) -> None:
+    def __init__(
+        self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, joints: JointStates, group: CallbackGroup
+    ) -> None:
         self._node = node
+        self._joints = joints
         self.settings = settings
         self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group, Code.EXECUTION_FAILED)
         self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group, Code.EXECUTION_FAILED)
-        self._state: JointState | None = None
-        self._came = -math.inf
-
-    def on_state(self, message: JointState) -> None:
-        """The newest joint state."""
-        self._state, self._came = message, time.monotonic()
 
     def ready(self) -> list[str]:
         """The servers that are missing."""
@@ -87,6 +83,7 @@ class Arm:
         )
         for remote in (self._mover, self._gripper):
             remote.require(settings.presence, token)
+            remote.check_alone()
         self._check_start(trajectory, 0)
         for number, action in enumerate(actions, 1):
             where = f"step {number} of {len(actions)}"
@@ -99,14 +96,15 @@ class Arm:
                 self._fingers(action, token)
 
     def _check_start(self, trajectory: JointTrajectory, index: int) -> None:
-        state = self._state
-        age = math.inf
-        if state is not None:
-            by_stamp = self._node.get_clock().now().nanoseconds * 1e-9 - time_from_msg(state.header.stamp)
-            age = max(time.monotonic() - self._came, by_stamp, key=abs)
-        names, positions = (state.name, state.position) if state is not None else ((), ())
-        point = trajectory.points[index].positions
-        execution.check_start(trajectory.joint_names, point, names, positions, age, self.settings.start_tolerance, self.settings.state_age)
+        check_start(
+            trajectory.joint_names,
+            trajectory.points[index].positions,
+            self._joints.all(),
+            self._node.get_clock().now().nanoseconds * 1e-9,
+            time.monotonic(),
+            self.settings.start_tolerance,
+            self.settings.state_age,
+        )
 
     def _move(self, trajectory: JointTrajectory, times: list[float], move: execution.Move, token: Token) -> None:
         speed = self.settings.speed

@@ -211,9 +211,10 @@ class Watcher:
                     self.complained_at = (self.complained_at or time.monotonic()) if wrong else None
 
     def _on_trajectory(self, message: Any) -> None:
-        self._say(f"verified trajectory with {len(message.points)} points published")
+        if message.points:  # an empty one takes the last run's back
+            self._say(f"verified trajectory with {len(message.points)} points published")
         with self.changed:
-            self.trajectory = message
+            self.trajectory = message if message.points else None
             self.changed.notify_all()
 
     def perceive_seconds(self) -> float:

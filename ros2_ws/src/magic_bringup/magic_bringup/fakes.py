@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -138,8 +139,9 @@ class FakeServers(Node):
             self._servers.append(self._action(VerifyMotion, "verify_motion", lambda g, c: self.on_verify(g, c), group))
 
     def publish(self, of: Scene) -> None:
-        """Publish a scene as perception would."""
-        self._objects.publish(conversions.scene_to_msg(of))
+        """Publish a scene as perception would, as seen just now."""
+        stamp = self.get_clock().now().nanoseconds * 1e-9
+        self._objects.publish(conversions.scene_to_msg(replace(of, stamp=stamp)))
 
     def clear(self) -> None:
         """Go back to the answers and lists of the start."""
@@ -205,8 +207,8 @@ class FakeArm(Node):
     ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort).  ``thickness`` is what is
     between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code, error_string).
     ``asked`` is set by the first trajectory, which is accepted once ``admits`` is set; ``moving`` by the first accepted one.
-    ``positions`` of the joints, rad, are told at 50 Hz while ``tells`` is set, ``late`` seconds late.  With ``squeezes`` the
-    fingers close as far as they can, whatever they are told.
+    ``positions`` of the joints, rad, and ``velocity``, rad/s, are told at 50 Hz while ``tells`` is set, ``late`` seconds late,
+    with ``apart`` in two messages.  With ``squeezes`` the fingers close as far as they can, whatever they are told.
     """
 
     def __init__(self, name: str = "fake_arm", thickness: float = 0.03, **kwargs: Any) -> None:
@@ -216,7 +218,8 @@ class FakeArm(Node):
         self.opening = 0.08
         self.positions = [0.0] * len(JOINTS)
         self.tells, self.squeezes = True, False
-        self.late = 0.0
+        self.late = self.velocity = 0.0
+        self.apart = False
         self.moving, self.admits = threading.Event(), threading.Event()
         self.admits.set()
         self.asked = threading.Event()
@@ -238,9 +241,13 @@ class FakeArm(Node):
         self.create_timer(0.02, self._tell, callback_group=group)
 
     def _tell(self) -> None:
-        if self.tells:
-            message = JointState(name=[*FINGERS, *JOINTS], position=[self.opening / 2] * 2 + list(self.positions))
-            stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
+        if not self.tells:
+            return
+        fingers, arm = [self.opening / 2] * len(FINGERS), list(self.positions)
+        parts = [(FINGERS, fingers), (JOINTS, arm)] if self.apart else [((*FINGERS, *JOINTS), fingers + arm)]
+        stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
+        for names, positions in parts:
+            message = JointState(name=names, position=positions, velocity=[self.velocity] * len(names))
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
             self._states.publish(message)
 

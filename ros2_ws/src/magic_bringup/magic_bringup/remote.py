@@ -135,11 +135,16 @@ class RemoteAction(_Remote):
 
     def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup, refusal: Code = Code.BUSY) -> None:
         super().__init__(node, name, server)
+        self._node = node
         self._refusal = refusal
         self._client = ActionClient(node, kind, name, callback_group=group)
 
     def ready(self) -> bool:
         return self._client.server_is_ready()
+
+    def check_alone(self) -> None:
+        """As the function of that name, for this action."""
+        check_alone(self._node, self.name)
 
     def call(
         self,
@@ -213,3 +218,10 @@ class RemoteAction(_Remote):
             return token.wait(ended.is_set, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=self._still_there)
         except MagicError:
             return False
+
+
+def check_alone(node: Node, action: str) -> None:
+    """Refuse an action (its full name) that several nodes serve: each of them would carry every goal out.  Raises EXECUTION_FAILED."""
+    count = node.count_services(f"{action}/_action/send_goal")
+    if count > 1:
+        raise MagicError(Code.EXECUTION_FAILED, f"servers of {action}", count, 1)

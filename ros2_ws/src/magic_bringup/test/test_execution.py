@@ -1,56 +1,24 @@
 """Arm and gripper move only where that is wanted, for a verified plan, and while the arm is where the plan believes it."""
 
 import math
+import threading
 import time
+from dataclasses import replace
+from functools import partial
 
 import pytest
 from action_msgs.msg import GoalStatus
+from control_msgs.action import FollowJointTrajectory
+from rclpy.action import ActionServer, GoalResponse
+from rclpy.node import Node
 from test_strategy_server import Bench
 
 from magic_bringup import fakes
-from magic_bringup.execution import Fingers, Move, check_grasp, check_start, steps
+from magic_bringup.execution import Fingers, Move, check_grasp, steps
 from magic_core import conversions
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
-from magic_interfaces.action import PlanMotion, VerifyMotion
-
-NAMES, FINGERS = fakes.JOINTS, fakes.FINGERS
-HERE = {
-    "names": NAMES,
-    "first": [0.1] * 7,
-    "state_names": FINGERS + NAMES,
-    "state_positions": [0.04] * 2 + [0.1] * 7,
-    "age": 0.01,
-    "tolerance": 0.02,
-    "max_age": 0.5,
-}
-
-
-def test_an_arm_at_the_start_is_accepted():
-    check_start(**HERE)
-    check_start(**{**HERE, "age": -0.01, "first": [0.119] * 7})
-
-
-@pytest.mark.parametrize(
-    "change, code, says",
-    [
-        ({"age": math.inf}, Code.NO_FRAMES, "none received"),
-        ({"age": 0.6}, Code.STALE_DATA, "0.6"),
-        ({"age": -0.6}, Code.STALE_DATA, "-0.6"),
-        ({"age": math.nan}, Code.STALE_DATA, "nan"),
-        ({"state_names": FINGERS + NAMES[:-1], "state_positions": [0.1] * 8}, Code.BAD_MOTION, "panda_joint7"),
-        ({"first": [0.1] * 6 + [0.13]}, Code.BAD_MOTION, "0.0300 at panda_joint7"),
-        ({"state_positions": [0.04] * 2 + [math.nan] + [0.1] * 6}, Code.BAD_MOTION, "panda_joint1"),
-        ({"first": []}, Code.BAD_MOTION, "0 positions"),
-    ],
-    ids=["absent", "old", "of the future", "no age", "joint missing", "far", "not a number", "empty"],
-)
-def test_any_other_arm_is_refused(change, code, says):
-    with pytest.raises(MagicError) as caught:
-        check_start(**{**HERE, **change})
-    assert caught.value.code == code
-    assert says in caught.value.message
-
+from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 
 TIMES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 SPEEDS = ((0.0,), (0.1,), (0.0,), (0.0,), (0.1,), (0.0,), (0.0,))
@@ -119,8 +87,7 @@ ACTIONS = {"trajectory_action": "arm/follow_joint_trajectory", "gripper_action":
 @pytest.fixture(scope="module")
 def shared(folder):
     """A server that may move an arm, and the arm."""
-    bench = Bench(folder, execute=True, state_age=10.0, speed=0.5, **ACTIONS)
-    bench.fakes.publish(fakes.scene())
+    bench = Bench(folder, execute=True, state_age=10.0, objects_age=2.0, objects_timeout=0.5, speed=0.5, **ACTIONS)
     bench.arm = fakes.FakeArm(context=bench.context)
     bench.executor.add_node(bench.arm)
     bench.until(lambda: not bench.server._arm.ready())
@@ -138,17 +105,32 @@ def bench(shared):
     arm.log.clear()
     arm.moving.clear()
     arm.positions, arm.thickness, arm.opening, arm.tells, arm.squeezes, arm.late = [0.0] * 7, 0.03, 0.08, True, False, 0.0
+    arm.velocity, arm.apart = 0.0, False
     arm.on_move = lambda trajectory, canceled: (0, "")
+    sees(shared, fakes.scene())
     believes(shared, [0.0] * 7)
     return shared
+
+
+def sees(bench, scene):
+    """Wait until the server has heard what is on the table, just now."""
+    begin = time.monotonic()
+    bench.fakes.publish(scene)
+    bench.until(lambda: bench.server.scene_came > begin)
 
 
 def believes(bench, positions):
     """Wait until the server has heard where the arm is, just now."""
     begin = time.monotonic()
-    bench.until(
-        lambda: bench.server._arm._came > begin and list(bench.server._arm._state.position[2:]) == pytest.approx(positions, nan_ok=True)
-    )
+
+    def heard():
+        joints = bench.server.joints.all()
+        return all(
+            name in joints and joints[name].came > begin and joints[name].position == pytest.approx(position, nan_ok=True)
+            for name, position in zip(fakes.JOINTS, positions)
+        )
+
+    bench.until(heard)
 
 
 def told(bench):
@@ -209,10 +191,85 @@ def test_an_arm_that_is_not_known_to_stand_at_the_start_is_not_moved(bench, chan
 
 def test_an_arm_that_has_fallen_silent_is_not_moved(bench):
     bench.arm.tells = False
-    bench.until(lambda: bench.server._arm._came < time.monotonic() - 0.1)  # what was on its way has come
-    bench.server._arm._came -= 15.0
+    joints = bench.server.joints
+    bench.until(lambda: joints.all()["panda_joint1"].came < time.monotonic() - 0.1)  # what was on its way has come
+    joints._joints = {name: replace(joint, came=joint.came - 15.0) for name, joint in joints.all().items()}
     assert "age of joint_states" in refused(bench, Code.STALE_DATA)
     assert not bench.arm.log
+
+
+def test_an_arm_that_moves_is_not_given_a_trajectory(bench):
+    bench.arm.velocity = 0.3
+    bench.until(lambda: bench.server.joints.all()["panda_joint7"].velocity == 0.3)
+    assert "speed of the arm in rad/s where a move begins: '0.300 at panda_joint1'" in refused(bench, Code.BAD_MOTION)
+    assert not bench.arm.log
+
+
+def test_arm_and_gripper_may_speak_of_their_joints_apart(bench):
+    bench.arm.apart = True
+    result, _ = bench.run(variant="arm")
+    assert result.executed, result.message
+
+
+def moved(by):
+    first, second = fakes.scene().objects
+    pose = first.world_from_object.copy()
+    pose[0, 3] += by
+    return replace(fakes.scene(), objects=(replace(first, world_from_object=pose), second))
+
+
+@pytest.mark.parametrize(
+    "now, says",
+    [
+        (moved(0.03), "object_1 has moved since the plan, in mm: 29.9"),
+        (fakes.scene(("object_1",)), "objects gone since the plan: 'object_2'"),
+        (fakes.scene(("object_1", "object_2", "object_3")), "objects come since the plan: 'object_3'"),
+    ],
+    ids=["moved", "gone", "come"],
+)
+def test_the_arm_is_not_moved_among_other_objects_than_planned_for(bench, now, says):
+    def verify(goal, canceled):
+        sees(bench, now)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    assert says in refused(bench, Code.STALE_DATA)
+    assert not bench.arm.log
+
+
+def test_objects_that_stay_within_the_tolerance_are_the_same(bench):
+    def verify(goal, canceled):
+        sees(bench, moved(0.005))
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    result, _ = bench.run(variant="arm")
+    assert result.executed, result.message
+
+
+@pytest.mark.parametrize("how", ["came", "stamp"])
+def test_the_arm_is_not_moved_among_objects_that_nobody_has_seen_lately(bench, how):
+    def verify(goal, canceled):
+        if how == "came":
+            bench.server.scene_came -= 10.0
+        else:
+            bench.server.scene.header.stamp.sec -= 10
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    assert "age of the objects in s: 10." in refused(bench, Code.STALE_DATA)
+    assert not bench.arm.log
+
+
+def test_objects_that_are_seen_again_are_waited_for(bench):
+    def verify(goal, canceled):
+        bench.server.scene_came -= 10.0
+        threading.Timer(0.2, bench.fakes.publish, [fakes.scene()]).start()
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    result, _ = bench.run(variant="arm")
+    assert result.executed, result.message
 
 
 def test_fingers_that_close_on_nothing_end_it(bench):
@@ -261,6 +318,80 @@ def test_a_cancel_stops_the_arm(bench):
     assert (response.result.verified, response.result.executed) == (True, False)
     assert stopped == [True]
     assert told(bench) == [("open", 0.04, 20.0), "move"]
+
+
+def test_a_cancel_between_two_moves_sends_nothing_more(bench):
+    sent = []
+    begun = threading.Event()
+
+    def verify(goal, canceled):
+        begun.set()
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    grip = bench.arm._grip
+
+    def canceling(handle):
+        result = grip(handle)
+        for token in bench.server._goals.values():
+            token.cancel()
+        return result
+
+    bench.arm._servers[1].register_execute_callback(canceling)
+    bench.arm._servers[0].register_goal_callback(lambda goal: sent.append(goal) or GoalResponse.ACCEPT)
+    try:
+        result, _ = bench.run(variant="arm")
+    finally:
+        bench.arm._servers[1].register_execute_callback(grip)
+        bench.arm._servers[0].register_goal_callback(bench.arm._admit)
+    assert (result.code, result.executed) == (Code.CANCELED, False), result.message
+    assert not sent
+    assert told(bench) == [("open", 0.04, 20.0)]
+
+
+def test_a_controller_that_does_not_stop_is_named(bench):
+    over = threading.Event()
+
+    def move(trajectory, canceled):
+        over.wait(10.0)
+        return 0, ""
+
+    bench.arm.on_move = move
+    try:
+        handle = bench.send(variant="arm")
+        assert bench.arm.moving.wait(10.0)
+        bench.result(handle.cancel_goal_async())
+        message = bench.result(handle.get_result_async()).result.message
+    finally:
+        over.set()
+    assert "the arm's controller did not say that its goal has ended" in message
+
+
+def test_a_controller_that_refuses_a_trajectory_has_failed(bench):
+    bench.arm._servers[0].register_goal_callback(lambda goal: GoalResponse.REJECT)
+    try:
+        assert "refused the goal" in refused(bench, Code.EXECUTION_FAILED)
+    finally:
+        bench.arm._servers[0].register_goal_callback(bench.arm._admit)
+
+
+@pytest.mark.parametrize(
+    "kind, name",
+    [(FollowJointTrajectory, "arm/follow_joint_trajectory"), (RunStrategy, "run_strategy")],
+    ids=["controller", "strategy server"],
+)
+def test_two_that_would_move_one_arm_do_not(bench, kind, name):
+    other = Node("other", context=bench.context)  # nobody spins it, so that it answers nothing
+    second = ActionServer(other, kind, name, lambda handle: kind.Result())
+    count = partial(bench.server.count_services, f"/{name}/_action/send_goal")
+    try:
+        bench.until(lambda: count() == 2)
+        assert f"servers of /{name}: 2" in refused(bench, Code.EXECUTION_FAILED)
+        assert not bench.arm.log
+    finally:
+        second.destroy()
+        other.destroy_node()
+        bench.until(lambda: count() == 1)
 
 
 def test_what_is_not_verified_or_not_for_the_arm_moves_nothing(bench):

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from magic_bringup import fakes
 from magic_bringup.domain import free_domain
 from magic_bringup.remote import Token
 from magic_bringup.strategy_server import StrategyServer, complaint_code
-from magic_core import conversions, qos
+from magic_core import conversions, qos, transforms
 from magic_core import strategy as strategies
 from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
@@ -53,6 +54,7 @@ class Bench:
         self.feedback = []
         self.heard = threading.Condition()
         self.messages = {"arm": [], "tool": [], "markers": []}
+        self.valid = dict.fromkeys(("arm", "tool"))  # the trajectories that have not been taken back
         for key, kind, topic in (
             ("arm", JointTrajectory, "verified_trajectory"),
             ("tool", MultiDOFJointTrajectory, "verified_tool_trajectory"),
@@ -69,7 +71,10 @@ class Bench:
 
     def _hear(self, key, message):
         with self.heard:
-            self.messages[key].append(message)
+            if key in self.valid:
+                self.valid[key] = message if message.points else None
+            if key == "markers" or message.points:
+                self.messages[key].append(message)
             self.heard.notify_all()
 
     def wait(self, condition, timeout=DEADLINE):
@@ -173,6 +178,114 @@ def test_nothing_unverified_is_published(bench):
     assert all("DRIFT" in t for t in texts)
     assert not bench.messages["tool"]
     assert not bench.messages["arm"]
+
+
+@pytest.mark.parametrize(
+    "second", [{"variant": "fg"}, {"variant": "arm"}, {"strategy": "juggling"}], ids=["verified", "not verified", "bad goal"]
+)
+def test_the_next_run_takes_the_last_trajectory_back(bench, second):
+    """Somebody who subscribes only now must not get the trajectory of a scene that is no more."""
+    bench.run(variant="arm")
+    bench.wait(lambda: bench.valid["arm"])
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(
+        code=int(Code.OK if goal.plan.variant == "fg" else Code.DRIFT), success=True
+    )
+    bench.run(**second)
+    bench.wait(lambda: not bench.valid["arm"])
+    late = []
+    subscription = bench.node.create_subscription(JointTrajectory, "verified_trajectory", late.append, qos.LATCHED)
+    try:
+        bench.until(lambda: late)
+        assert not late[0].points
+    finally:
+        bench.node.destroy_subscription(subscription)
+
+
+def test_a_plan_in_another_frame_is_not_published(bench):
+    def plan(goal, canceled):
+        result = fakes.FakeServers.plan(goal, canceled)
+        result.plan.tool_trajectory.header.frame_id = "world"
+        return result
+
+    bench.fakes.on_plan = plan
+    result, _ = bench.run()
+    assert result.code == Code.BAD_REQUEST
+    assert "panda_link0" in result.message
+    assert "world" in result.message
+    assert not bench.messages["tool"]
+
+
+def test_a_plan_of_another_variant_is_not_published(bench):
+    bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(plan=conversions.plan_to_msg(fakes.plan("arm"), goal.tool.id))
+    result, _ = bench.run(variant="fg")
+    assert (result.code, result.verified) == (Code.UNKNOWN_VARIANT, False)
+    assert not bench.messages["arm"]
+
+
+def test_what_is_canceled_when_it_has_just_been_verified_is_not_published(bench):
+    def verify(goal, canceled):
+        for token in bench.server._goals.values():
+            token._canceled = True  # silently: the server notices only when it looks
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    result, _ = bench.run()
+    assert result.code == Code.CANCELED, result.message
+    assert not bench.messages["tool"]
+
+
+def test_markers_that_cannot_be_drawn_change_nothing_else(bench, monkeypatch):
+    def broken(*_):
+        raise ValueError("a defect of the markers")
+
+    monkeypatch.setattr("magic_bringup.markers.run_markers", broken)
+    result, status = bench.run()
+    assert (result.code, result.verified, status) == (0, True, GoalStatus.STATUS_SUCCEEDED), result.message
+
+
+def test_the_contacts_belong_to_the_objects_that_are_planned_with(bench):
+    """Perception may have sent a new scene, in which an object's own frame is another one, when the matcher answers."""
+    first = fakes.scene().objects[0]
+    turned = transforms.from_rpy(0.0, 0.0, np.pi)
+    newer = replace(first, world_from_object=first.world_from_object @ turned)
+    scenes = {"older": fakes.scene(), "newer": replace(fakes.scene(), objects=(newer, fakes.scene().objects[1]))}
+    asked = []
+
+    def match(request):
+        # The matcher has not seen the newer scene yet when it is asked first; then it has.
+        seen = scenes["older" if not asked else "newer"]
+        if not asked:
+            came = bench.server.scene_came
+            bench.fakes.publish(scenes["newer"])
+            bench.until(lambda: bench.server.scene_came > came)
+        asked.append(request)
+        candidates = [conversions.candidate_to_msg(fakes.candidate(), seen.objects[0].world_from_object)]
+        return MatchContact.Response(candidates=candidates, target_id="object_2", features="fake")
+
+    bench.fakes.on_match = match
+    planned = []
+    bench.fakes.on_plan = lambda goal, canceled: planned.append(goal) or fakes.FakeServers.plan(goal, canceled)
+    try:
+        result, _ = bench.run()
+        assert result.code == 0, result.message
+        assert len(asked) == 1  # the older scene is this run's own
+        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), first.world_from_object, atol=1e-9)
+        # The matcher's objects are newer than those with which the run began: these are taken.
+        bench.fakes.publish(scenes["older"])
+        bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] > 0)
+
+        def ahead(request):
+            bench.fakes.publish(scenes["newer"])
+            bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] < 0)
+            return match(request)
+
+        bench.fakes.on_match = ahead
+        planned.clear()
+        result, _ = bench.run()
+        assert result.code == 0, result.message
+        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), newer.world_from_object, atol=1e-9)
+    finally:
+        bench.fakes.publish(fakes.scene())
 
 
 def test_goals_carry_what_the_servers_need(bench):

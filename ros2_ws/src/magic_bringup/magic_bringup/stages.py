@@ -1,0 +1,264 @@
+"""The stages of a run as the strategy server has them done: by the graph's other nodes."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import Image, JointState
+
+from magic_bringup import pipeline
+from magic_bringup.remote import Token
+from magic_core import conversions
+from magic_core.errors import Code, MagicError
+from magic_interfaces.action import PlanMotion, VerifyMotion
+from magic_interfaces.msg import ContactCandidate, MotionPlan, SceneObject, SceneObjectArray
+from magic_interfaces.srv import MatchContact
+
+if TYPE_CHECKING:
+    from magic_bringup.strategy_server import StrategyServer
+
+#: How much later than here the same objects may arrive at the matcher, s.
+OBJECTS_LAG = 5.0
+#: Points of a contact that are nearer than this are the same, m: it went through messages, but nobody measured it anew.
+SAME_POINT = 1e-6
+
+
+class Stages:
+    """The stages of :mod:`magic_bringup.pipeline`, done by the other nodes; messages pass through as they came."""
+
+    def __init__(self, server: StrategyServer, token: Token, needs_verifier: bool, heatmap: bool) -> None:
+        self._server = server
+        self._heatmap = heatmap
+        self._token = token
+        self._needs_verifier = needs_verifier
+        self.scene: SceneObjectArray | None = None
+        self.matches: pipeline.Matches | None = None
+        self._last_goal: VerifyMotion.Goal | None = None
+        self._last_code = 0
+
+    def perceive(self, request: pipeline.Request, timeout: float) -> None:
+        """Take the objects there are, or wait for them; see that every server is there."""
+        server = self._server
+        # First the servers: a run that cannot be verified is not begun.
+        deadline = time.monotonic() + min(timeout, server.settings.presence)
+        for remote in (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else [])):
+            remote.require(max(0.0, deadline - time.monotonic()), self._token)
+        wait = min(timeout, server.settings.objects)
+
+        def enough() -> bool:
+            scene = server.scene
+            if scene is None:
+                return False
+            # A wrong id is answered at once; too few objects may still become enough: a tool that was seen, and a target.
+            return bool(self._unknown(scene, request)) or (
+                len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
+            )
+
+        came = self._token.wait(enough, time.monotonic() + wait)
+        scene = server.scene
+        if not came:
+            raise self._no_objects(scene, wait)
+        self.scene = scene
+        unknown = self._unknown(scene, request)
+        if unknown:
+            raise MagicError(Code.UNKNOWN_OBJECT, unknown[0], unknown[1], [o.id for o in scene.objects])
+
+    @staticmethod
+    def _unknown(scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
+        ids = [o.id for o in scene.objects]
+        for what, value in (("tool_id", request.tool_id), ("target_id", request.target_id)):
+            if value and ids and value not in ids:
+                return what, value
+        return None
+
+    def _no_objects(self, scene: SceneObjectArray | None, wait: float) -> MagicError:
+        """Why there is nothing to work on: in perception's own words where it has spoken."""
+        server = self._server
+        topic = server.objects_topic
+        if scene is not None:
+            ids = [o.id for o in scene.objects]
+            code, what = (
+                Code.NO_OBJECTS,
+                f"{topic} holds {len(ids)} objects {ids} (allowed: a tool that a camera sees, and a target), waited {wait:.1f} s",
+            )
+        else:
+            publishers = server.count_publishers(topic)
+            code = Code.NO_OBJECTS if publishers else Code.NO_FRAMES
+            what = f"nothing came on {topic} within {wait:.1f} s; it has {publishers} publishers"
+        complaint = server.complaint()
+        if complaint is not None:
+            code = complaint_code(complaint) or code
+            what = f"{complaint.message} ({what})"
+        return MagicError(code, what)
+
+    def match(self, request: pipeline.Request, timeout: float) -> pipeline.Matches:
+        """Ask the matcher, until its objects and ours are the same."""
+        server = self._server
+        message = MatchContact.Request(
+            strategy=request.strategy,
+            tool_ids=[request.tool_id] if request.tool_id else [],
+            target_id=request.target_id,
+            top_k=request.top_k,
+            want_heatmap=self._heatmap,
+        )
+        deadline = time.monotonic() + min(timeout, server.settings.match)
+        patience = min(time.monotonic() + OBJECTS_LAG, deadline)
+        while True:
+            answer = server.matcher.call(message, max(0.0, deadline - time.monotonic()), self._token, server.settings.presence)
+            # The ids were found in the objects that came here; the matcher may just be about to read the same message.
+            if answer.code not in (Code.UNKNOWN_OBJECT, Code.NO_OBJECTS) and self._same_objects(answer):
+                break
+            if time.monotonic() > patience:
+                raise self._other_objects(answer)
+            self._token.wait(lambda: False, time.monotonic() + 0.05)
+        if answer.code != Code.OK or not answer.candidates:
+            raise MagicError(code_of(answer.code or Code.NO_MATCH), answer.message or "no contact was found")
+        heatmap = answer.heatmap if len(answer.heatmap.data) else None
+        target_id = answer.target_id or request.target_id
+        scores = ", ".join(f"{c.tool_id} {c.score:.3f}" for c in answer.candidates)
+        sentence = f"{len(answer.candidates)} candidates for {target_id} ({scores}), {answer.features} features, {answer.seconds:.2f} s"
+        self.matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, sentence)
+        return self.matches
+
+    def _same_objects(self, answer: MatchContact.Response) -> bool:
+        """Whether the answer is about this run's objects, or about newer ones, which are this run's from here on.
+
+        Perception goes on meanwhile, and an object's own frame, in which contacts are given, may be another one in the next
+        scene: its axis may point the other way.  The contacts' points in the world tell.
+        """
+        for scene in (self.scene, self._server.scene):
+            if all(_stands_in(scene, c, answer.target_id) for c in answer.candidates):
+                self.scene = scene
+                return True
+        return False
+
+    def _other_objects(self, answer: MatchContact.Response) -> MagicError:
+        if answer.code != Code.OK:
+            return MagicError(code_of(answer.code), answer.message or "the matcher knows no such objects")
+        ids = [o.id for o in self.scene.objects]
+        named = [answer.target_id, *(c.tool_id for c in answer.candidates)]
+        return MagicError(
+            Code.UNKNOWN_OBJECT, "objects that the matcher chose", ", ".join(dict.fromkeys(named)), [*ids, "where they stand now"]
+        )
+
+    def _find(self, object_id: str) -> SceneObject:
+        return next(o for o in self.scene.objects if o.id == object_id)
+
+    def plan(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> pipeline.Planned:
+        """Ask the planner for one trial."""
+        server = self._server
+        timeout = min(timeout, server.settings.plan)
+        goal = PlanMotion.Goal(
+            strategy=request.strategy,
+            variant=request.variant,
+            tool=self._find(trial.candidate.tool_id),
+            target=self._find(matches.target_id),
+            obstacles=self._obstacles(trial, matches),
+            table=self.scene.table,
+            candidate=trial.candidate,
+            reflection=trial.reflection,
+            attempt=trial.attempt,
+            seed=request.seed,
+            timeout=timeout,
+        )
+        joints = server.joints.all()
+        goal.start = JointState(name=list(joints), position=[j.position for j in joints.values()])
+        result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+        if result.code == Code.OK:
+            self._check_plan(result.plan, request.variant)
+        return pipeline.Planned(code_of(result.code), result.message, result.plan)
+
+    def _check_plan(self, plan: MotionPlan, variant: str) -> None:
+        """A plan must be what was asked for, and in the frame in which the objects are."""
+        if plan.variant != variant:
+            raise MagicError(Code.UNKNOWN_VARIANT, "variant of the plan", plan.variant, variant)
+        trajectories = (plan.tool_trajectory, plan.arm_trajectory) if variant == MotionPlan.ARM else (plan.tool_trajectory,)
+        for frame in {t.header.frame_id for t in trajectories}:
+            if frame != self.scene.header.frame_id:
+                raise MagicError(
+                    Code.BAD_REQUEST, "frame of the objects", self.scene.header.frame_id, f"{frame}, in which the planner works"
+                )
+
+    def verify(
+        self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, plan: MotionPlan, timeout: float
+    ) -> pipeline.Verdict:
+        """Ask the verifier for one planned motion."""
+        server = self._server
+        timeout = min(timeout, server.settings.verify)
+        goal = VerifyMotion.Goal(
+            strategy=request.strategy,
+            tool=self._find(trial.candidate.tool_id),
+            target=self._find(matches.target_id),
+            obstacles=self._obstacles(trial, matches),
+            table=self.scene.table,
+            candidate=trial.candidate,
+            plan=plan,
+            repetitions=server.settings.repetitions,
+            seed=request.seed,
+            timeout=timeout,
+        )
+        result = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+        self._last_goal, self._last_code = goal, result.code
+        code = code_of(result.code)
+        if code == Code.OK and not result.success:
+            code = Code.GOAL_NOT_REACHED
+        message = pipeline.with_metrics(result.message, list(zip(result.metric_names, result.metric_values)))
+        return pipeline.Verdict(code, message, max(1, server.settings.repetitions))
+
+    def film(self, outcome_code: Code) -> Image | None:
+        """The film strip of the last simulation: the verifier draws it from what it recorded when it gets the same goal again.
+
+        Drawing may cost more than simulating, and only one of a run's simulations is looked at.
+        """
+        server, goal = self._server, self._last_goal
+        if goal is None or outcome_code in pipeline.FATAL:
+            return None
+        goal.want_film = True
+        try:
+            result = server.verifier.call(goal, server.settings.verify, self._token, server.settings.presence, server.settings.grace)
+        except MagicError as error:
+            server.get_logger().warning(f"no film: {error.message}")
+            return None
+        if result.code != self._last_code:  # another client came in between, and the repetition took too long, for one
+            server.get_logger().warning(
+                f"no film: asked for it, the verifier answered {result.code} instead of {self._last_code}: {result.message}"
+            )
+            return None
+        return result.film if len(result.film.data) else None
+
+    def _obstacles(self, trial: pipeline.Trial, matches: pipeline.Matches) -> list[SceneObject]:
+        return [o for o in self.scene.objects if o.id not in (trial.candidate.tool_id, matches.target_id)]
+
+
+def _stands_in(scene: SceneObjectArray, candidate: ContactCandidate, target_id: str) -> bool:
+    """Whether a candidate's tool and target are in a scene, the tool such that its contact is where the matcher has it."""
+    tools = {o.id: o for o in scene.objects}
+    if candidate.tool_id not in tools or (target_id and target_id not in tools):
+        return False
+    point = np.array([candidate.point.x, candidate.point.y, candidate.point.z])
+    if np.isnan(point).any():  # not told
+        return True
+    world_from_tool = conversions.pose_from_msg(tools[candidate.tool_id].pose)
+    contact = conversions.pose_from_msg(candidate.tool.object_from_contact)
+    return bool(np.allclose((world_from_tool @ contact)[:3, 3], point, rtol=0.0, atol=SAME_POINT))
+
+
+def code_of(number: int) -> Code:
+    """A number from another node as a Code; what is not one is INTERNAL."""
+    try:
+        return Code(number)
+    except ValueError:
+        return Code.INTERNAL
+
+
+def complaint_code(status: DiagnosticStatus) -> Code | None:
+    """The result code that a diagnostic names under the key ``code``, as a number or a name."""
+    for item in status.values:
+        if item.key == "code":
+            text = item.value.strip()
+            code = Code.__members__.get(text) or (Code(int(text)) if text.isdigit() and int(text) in list(Code) else None)
+            return code if code != Code.OK else None
+    return None
