@@ -32,6 +32,20 @@ def default_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / PACKAGE
 
 
+def _packed(value: Any) -> bytes:
+    """A value's pickle behind its digest."""
+    data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+    return hashlib.sha256(data).digest() + data
+
+
+def _unpacked(entry: bytes) -> Any:
+    """What :func:`_packed` made; raises ValueError for a damaged entry, of which a pickle may crash the process."""
+    digest, data = entry[:32], entry[32:]
+    if hashlib.sha256(data).digest() != digest:
+        raise ValueError("the entry is damaged")
+    return pickle.loads(data)
+
+
 class Cache:
     """Pickled results by key in a folder; a damaged or unreadable entry is computed anew.
 
@@ -50,16 +64,15 @@ class Cache:
         path = self._path(key)
         with self._lock:
             try:
-                with open(path, "rb") as file:
-                    return pickle.load(file)
-            except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, ValueError):
+                return _unpacked(path.read_bytes())
+            except (OSError, ValueError):
                 pass
             value = make()
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
                 with os.fdopen(handle, "wb") as file:
-                    pickle.dump(value, file, protocol=pickle.HIGHEST_PROTOCOL)
+                    file.write(_packed(value))
                 os.replace(name, path)
                 self._prune()
             except OSError:

@@ -184,9 +184,15 @@ def test_cache_keeps_and_survives_damage(tmp_path):
     calls = []
     assert cache.get("a", lambda: calls.append(1) or {"x": 1}) == {"x": 1}
     assert cache.get("a", lambda: calls.append(1) or {"x": 2}) == {"x": 1} and len(calls) == 1
-    for path in tmp_path.iterdir():
-        path.write_bytes(b"not a pickle")
-    assert cache.get("a", lambda: calls.append(1) or {"x": 3}) == {"x": 3} and len(calls) == 2
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    # A damaged pickle may yield another value, or crash the process: it must not be read at all.
+    for count, damaged in enumerate(
+        (b"not a pickle", b"", whole[:-5], whole.replace(b"x", b"y", 1) + b".", whole[:-4] + b"\x07" + whole[-3:]), 2
+    ):
+        path.write_bytes(damaged)
+        assert cache.get("a", lambda: calls.append(1) or {"x": 1}) == {"x": 1} and len(calls) == count
+        assert path.read_bytes() == whole
 
 
 def test_the_cache_keeps_no_more_than_it_may_and_nothing_of_other_code(tmp_path, monkeypatch):
