@@ -35,6 +35,12 @@ def test_what_launch_files_name_exists(path):
             assert content["/**"]["ros__parameters"]
 
 
+def test_a_folder_of_strategies_is_given_to_all_who_read_strategies():
+    root = ElementTree.parse(LAUNCH / "magic.launch.xml").getroot()
+    given = {node.get("exec") for node in root.iter("node") for p in node.iter("param") if p.get("name") == "strategies"}
+    assert given == set(NODES) - {"perception"}
+
+
 def test_the_graph_comes_up_and_ends_through_ros2_launch(tmp_path):
     program = shutil.which("ros2")
     assert program, "there is no ros2 command"
