@@ -280,12 +280,17 @@ class Pending:
         future.add_done_callback(self._accepted)
 
     def _accepted(self, future: Any) -> None:
-        self.handle = future.result()
-        self.handle.get_result_async().add_done_callback(self._done)
+        from magic_interfaces.action import RunStrategy
 
-    def _done(self, future: Any) -> None:
+        self.handle = future.result()
+        if self.handle.accepted:
+            self.handle.get_result_async().add_done_callback(lambda answer: self._end(answer.result().result))
+        else:
+            self._end(RunStrategy.Result(code=int(Code.SERVER_UNAVAILABLE), message="the strategy server takes no goals any more"))
+
+    def _end(self, result: Any) -> None:
         with self._watcher.changed:
-            self.result = future.result().result
+            self.result = result
             self._watcher.changed.notify_all()
 
 
