@@ -23,6 +23,10 @@ from magic_planner.giving_way import GAP, GAP_IN_HAND
 from magic_planner.object_motion import plan_tool_motion
 
 
+#: The frame of objects that do not name theirs: the Panda's base.
+WORLD = "panda_link0"
+
+
 class PlannerNode(Node):
     """Turns a contact into a motion of the tool and, for the arm variant, of the arm.
 
@@ -100,7 +104,8 @@ class PlannerNode(Node):
         goal, started = handle.request, time.monotonic()
         try:
             plan = self._plan(handle)
-            result.plan = convert.plan_to_msg(plan, goal.tool.id)
+            # In the frame of the objects, of which the cloud says what it is.
+            result.plan = convert.plan_to_msg(plan, goal.tool.id, goal.tool.cloud.header.frame_id or WORLD)
             end = (plan.arm_motion or plan.tool_motion).times[-1]
             result.code, result.message = int(Code.OK), f"a motion of {end:.1f} s in {len(plan.tool_motion.phases)} phases"
         except Exception as error:  # into the answer, and into the log with the goal's name
