@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
@@ -274,6 +275,7 @@ class FloatingRun:
                 worst[(name, early)] = Intrusion(name, depth, time, early)
 
         corners = setup.tool.corners
+        corners = corners[ConvexHull(corners).vertices]  # the others reach nowhere that these do not
         heights = (setup.table[:3] @ poses[:, :3, :3]) @ corners.T  # (T, N): along the table's normal
         below = -(heights.min(axis=1) + poses[:, :3, 3] @ setup.table[:3] + setup.table[3])
         for time, depth in zip(times, below, strict=True):

@@ -10,6 +10,7 @@ fills the gap: it asks, in a world of its own, how deep a posed body is in other
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -116,6 +117,9 @@ def sphere_of(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]
     A ball rolls as it should only as a sphere; as a polyhedron it rocks over its facets.
     """
     if len(corners) < 30:
+        return None
+    extents = np.ptp(corners, axis=0)
+    if extents.max() > 1.1 * extents.min():
         return None
     system = np.column_stack([2 * corners, np.ones(len(corners))])
     solution, *_ = np.linalg.lstsq(system, np.sum(corners**2, axis=1), rcond=None)
@@ -366,10 +370,9 @@ class World:
     def check(self, names: tuple[str, ...]) -> None:
         """Raise ``SIMULATION_EXPLODED`` where a body is nowhere, too far or too fast."""
         for name in names:
-            position = self.position(name)
-            speed = float(np.linalg.norm(self.velocity(name)))
-            distance = float(np.linalg.norm(position))
-            if not (np.isfinite(distance) and np.isfinite(speed)):
+            speed = math.hypot(*self._bodies[name].linear_velocity.tolist())
+            distance = math.hypot(*self._bodies[name].entity_pose.p.tolist())
+            if not (math.isfinite(distance) and math.isfinite(speed)):
                 raise MagicError(
                     Code.SIMULATION_EXPLODED, f"state of {name} at {self.time:.2f} s", "not a number", "finite positions and velocities"
                 )
