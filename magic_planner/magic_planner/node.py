@@ -22,7 +22,6 @@ from magic_planner.budget import Budget
 from magic_planner.giving_way import GAP, GAP_IN_HAND
 from magic_planner.object_motion import plan_tool_motion
 
-
 #: The frame of objects that do not name theirs: the Panda's base.
 WORLD = "panda_link0"
 

@@ -162,6 +162,29 @@ def test_flat_tiny_and_sunken_things_are_bad_scenes():
         assert verdict.seconds < 1.0
 
 
+@pytest.mark.parametrize(
+    ("task", "values", "code", "words"),
+    [
+        ("hook", {"distance": 0.5}, Code.GOAL_NOT_REACHED, "needed: 500 mm"),
+        ("hook", {"drift": 1e-4}, Code.DRIFT, "sideways"),
+        ("hook", {"max_speed": 0.001}, Code.UNSTABLE, "0.001 m/s"),
+        ("hang", {"height": 0.5}, Code.GOAL_NOT_REACHED, "needed: above 500 mm"),
+        ("hang", {"max_speed": 1e-6}, Code.UNSTABLE, "come to rest"),
+        ("scoop", {"height": 0.9}, Code.GOAL_NOT_REACHED, "needed: above 900 mm"),
+        ("scoop", {"max_speed": 1e-6}, Code.UNSTABLE, "not at rest"),
+    ],
+)
+def test_every_goal_says_by_which_of_its_numbers_a_motion_fails(task, values, code, words):
+    if task == "scoop":
+        strategy, tool, target, *obstacles, motion = scenes.scooping()
+    else:
+        (strategy, tool, target, motion), obstacles = scenes.hooking("L", noise=0.0) if task == "hook" else scenes.hanging(), ()
+    strict = replace(strategy, goal=replace(strategy.goal, values={**strategy.goal.values, **values}))
+    verdict = judge(strict, tool, target, motion, obstacles)
+    assert (verdict.success, verdict.code) == (False, code), verdict.message
+    assert words in verdict.message
+
+
 def test_an_exploding_simulation_is_reported():
     strategy, tool, target, motion = scenes.hooking("L", noise=1e6)
     verdict = judge(strategy, tool, target, motion)
