@@ -134,6 +134,45 @@ def _contact(view: CanonicalView, data: dict[str, Any]) -> Contact:
     return Contact(pixel, normal, float(data["radius"]), bool(data["concave"]), float(data["scale"]), contact_frame(view, pixel, normal))
 
 
+def _check(strategy: Strategy) -> None:
+    """Refuse numbers with which nothing can be matched, planned or simulated; raises ValueError that names them."""
+    times, physics, goal = strategy.times, strategy.physics, strategy.goal
+    numbers = {
+        "friction": physics.friction,
+        "tool_density": physics.tool_density,
+        "target_density": physics.target_density,
+        **{f"goal {name}": value for name, value in goal.values.items()},
+        **{f"speed of waypoint {w.name}": w.speed for w in strategy.waypoints},
+    }
+    positive = [name for name in numbers if not name.startswith(("goal", "friction"))]
+    rules = {
+        f"reflections {strategy.reflections}: of {REFLECTIONS}, at least one": bool(strategy.reflections)
+        and set(strategy.reflections) <= set(REFLECTIONS),
+        "times of trajectory.csv: finite, strictly increasing": bool(np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)),
+        "poses of trajectory.csv: finite": bool(np.all(np.isfinite(strategy.target_from_tool))),
+        **{
+            f"offset of waypoint {w.name}: 3 finite metres": w.offset.shape == (3,) and np.all(np.isfinite(w.offset))
+            for w in strategy.waypoints
+        },
+        **{f"{name}: a finite number": np.isfinite(value) for name, value in numbers.items()},
+        **{f"{name}: above 0": numbers[name] > 0 for name in positive},
+        "friction: 0 or more": physics.friction >= 0,
+    }
+    for name, contact, view in (
+        ("tool", strategy.tool_contact, strategy.tool_view),
+        ("target", strategy.target_contact, strategy.target_view),
+    ):
+        height, width = view.mask.shape
+        rules[f"pixel of the {name}'s contact: within {width} x {height}"] = bool(
+            np.all((contact.pixel >= -0.5) & (contact.pixel < [width, height]))
+        )
+        rules[f"radius of the {name}'s contact: above 0"] = contact.radius > 0
+        rules[f"scale of the {name}'s contact: above 0, finite"] = 0 < contact.scale < np.inf
+    broken = [rule for rule, kept in rules.items() if not kept]
+    if broken:
+        raise ValueError("; ".join(broken))
+
+
 def load(folder: str | Path) -> Strategy:
     """Read a strategy folder; ``BAD_STRATEGY`` says which key or file is wrong."""
     folder = Path(folder)
@@ -149,7 +188,7 @@ def load(folder: str | Path) -> Strategy:
         with open(folder / "trajectory.csv", newline="") as file:
             rows = np.array([[float(x) for x in row] for row in list(csv.reader(file))[1:]])
         physics = data["physics"]
-        return Strategy(
+        strategy = Strategy(
             name=data["name"],
             description=data["description"],
             view=data["view"],
@@ -175,6 +214,8 @@ def load(folder: str | Path) -> Strategy:
             simulatable=bool(data.get("simulatable", True)),
             environment=dict(data.get("environment", {})),
         )
+        _check(strategy)
+        return strategy
     except MagicError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OSError, yaml.YAMLError) as error:
@@ -197,7 +238,12 @@ def find(name: str, root: str | Path | None = None) -> Strategy:
     """
     if name and "/" in name:
         return load(name)
-    root = Path(root) if root else installed_folder()
+    try:
+        root = Path(root) if root else installed_folder()
+    except LookupError:
+        raise MagicError(
+            Code.UNKNOWN_STRATEGY, "strategy", name, "the path of a strategy folder (magic_bringup is not installed)"
+        ) from None
     names = sorted(p.parent.name for p in root.glob("*/strategy.yaml"))
     if name not in names:
         raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, [*names, "or the path of a strategy folder"])

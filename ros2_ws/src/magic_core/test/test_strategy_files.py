@@ -109,6 +109,19 @@ def edit(folder, change):
         (lambda d: d["tool"].pop("contact"), "contact"),
         (lambda d: d["physics"].update(colour=1), "colour"),
         (lambda d: d["target"].update(normal_in_world=[0, 0, 0]), "direction"),
+        (lambda d: d.update(reflections=["keep", "flip"]), "flip"),
+        (lambda d: d.update(reflections=[]), "at least one"),
+        (lambda d: d["waypoints"][0].update(offset=[0.1, 0.2]), "offset of waypoint behind"),
+        (lambda d: d["waypoints"][0].update(offset=[0.1, 0.2, float("nan")]), "offset of waypoint behind"),
+        (lambda d: d["waypoints"][0].update(speed=0.0), "speed of waypoint behind: above 0"),
+        (lambda d: d["waypoints"][0].update(speed=float("inf")), "speed of waypoint behind: a finite"),
+        (lambda d: d["goal"]["values"].update(distance=float("nan")), "goal distance"),
+        (lambda d: d["physics"].update(friction=-0.1), "friction"),
+        (lambda d: d["physics"].update(tool_density=0.0), "tool_density"),
+        (lambda d: d["tool"]["contact"].update(pixel=[32.0, 3.0]), "pixel of the tool's contact"),
+        (lambda d: d["target"]["contact"].update(pixel=[float("nan"), 3.0]), "pixel of the target's contact"),
+        (lambda d: d["tool"]["contact"].update(radius=-0.02), "radius of the tool's contact"),
+        (lambda d: d["target"]["contact"].update(scale=0.0), "scale of the target's contact"),
     ],
 )
 def test_wrong_keys_are_named(folder, change, says):
@@ -125,6 +138,28 @@ def test_missing_files_are_named(folder, name):
         strategies.load(folder)
     assert error.value.code in (Code.BAD_STRATEGY, Code.BAD_MESH)
     assert name in error.value.message
+
+
+@pytest.mark.parametrize("row, column, value, says", [(2, 0, 0.1, "increasing"), (1, 0, np.nan, "finite"), (1, 3, np.inf, "poses")])
+def test_a_trajectory_that_is_none(folder, row, column, value, says):
+    path = folder / "trajectory.csv"
+    head, *lines = path.read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    rows[row][column] = str(value)
+    path.write_text("\n".join([head, *(",".join(r) for r in rows)]))
+    with pytest.raises(MagicError, match=says) as error:
+        strategies.load(folder)
+    assert error.value.code == Code.BAD_STRATEGY
+
+
+def test_without_the_installed_ones_a_path_is_asked_for(monkeypatch):
+    def nowhere():
+        raise LookupError("package 'magic_bringup' not found")
+
+    monkeypatch.setattr(strategies, "installed_folder", nowhere)
+    with pytest.raises(MagicError, match="path of a strategy folder") as error:
+        strategies.find("hooking")
+    assert error.value.code == Code.UNKNOWN_STRATEGY
 
 
 def test_what_is_no_yaml(folder):
