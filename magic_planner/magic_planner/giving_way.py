@@ -46,6 +46,8 @@ LOOK_AHEAD = 0.04
 CLEAR = 3e-4
 #: Least way, metres, over which a displacement is smoothed.
 SMOOTHING = 0.03
+#: So many samples of a path are smoothed at a time: all of a long demonstration against all would not fit into memory.
+BLOCK = 256
 #: A piece with more corners is represented by the outermost ones in so many directions: what is cut off its curves is below
 #: 4 % of its extent, which is less than GAP for pieces of a few centimetres.
 CORNERS = 40
@@ -223,13 +225,25 @@ def _basis(direction: Array) -> Array:
 
 def _smoothed(shifts: Array, poses: Array) -> Array:
     """Displacements (T, 2) averaged along the path, bell-shaped, over twice the largest of them to either side."""
-    moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) + 1e-6
-    way = np.concatenate([[0.0], np.cumsum(moved)])
+    way = way_along(poses)
     width = max(SMOOTHING, 2.0 * float(np.linalg.norm(shifts, axis=1).max()))
-    weight = np.exp(-0.5 * ((way[:, None] - way[None]) / (width / 2)) ** 2)
-    # Each sample counts by the stretch of path that it stands for.
-    weight *= np.gradient(way)[None]
-    return np.asarray((weight @ shifts) / weight.sum(axis=1, keepdims=True))
+    return averaged(shifts, way, lambda apart: np.exp(-0.5 * (apart / (width / 2)) ** 2))
+
+
+def way_along(poses: Array) -> Array:
+    """(T,) how far the origin of poses (T, 4, 4) has come, metres; it never stands quite still."""
+    moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) + 1e-6
+    return np.concatenate([[0.0], np.cumsum(moved)])
+
+
+def averaged(values: Array, way: Array, bell: Callable[[Array], Array]) -> Array:
+    """values (T, D) averaged along a way (T,) with the weights ``bell`` of distances, each counted by the stretch it stands for."""
+    stretch = np.gradient(way)
+    rows = []
+    for first in range(0, len(way), BLOCK):
+        weight = bell(way[first : first + BLOCK, None] - way[None]) * stretch
+        rows.append(weight @ values / weight.sum(axis=1, keepdims=True))
+    return np.concatenate(rows)
 
 
 class _Walk:

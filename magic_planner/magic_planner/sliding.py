@@ -17,7 +17,7 @@ from magic_core import transforms
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 from magic_planner.collision import Body, grown, hull, outer_points, solid_pieces
-from magic_planner.giving_way import GAP, hits
+from magic_planner.giving_way import GAP, averaged, hits, way_along
 
 Array = NDArray[np.float64]
 #: Step along the outline and the furthest that a contact slides, metres.
@@ -54,7 +54,7 @@ def slid_contacts(
     search = _Search(tool, tool_from_contact, world_from_contact, obstacles, plane, clearance, gap)
     if search.clear.all():
         return frames
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(world_from_contact[:, :3, 3], axis=0), axis=1))])
+    way = way_along(world_from_contact)
     sides = outline(tool, tool_from_contact)
     first = [search.outwards(int(search.clear.argmin()), side) for side in sides]
     # To the side on which there is room after the shorter way; the path keeps to it.
@@ -127,11 +127,10 @@ class _Search:
 def _smoothed(steps: NDArray[np.int64], way: Array) -> Array:
     """Steps (T,), nowhere fewer than the given ones, that change over SMOOTHING metres of the way (T,) at least."""
     width = max(SMOOTHING, 0.5 * STEP * float(steps.max()))
-    apart = np.abs(way[:, None] - way[None])
-    most = np.where(apart <= width, steps[None], 0).max(axis=1)
-    # A bell no wider than the maximum was taken over; each sample counts by the stretch of the way that it stands for.
-    weight = np.where(apart <= width, 1.0 + np.cos(np.pi * apart / width), 0.0) * (np.gradient(way) + 1e-9)
-    return np.asarray((weight @ most) / weight.sum(axis=1))
+    around = zip(np.searchsorted(way, way - width), np.searchsorted(way, way + width, side="right"), strict=True)
+    most = np.array([steps[first:end].max() for first, end in around])
+    # A bell no wider than what the maximum was taken over: the average is nowhere below the steps.
+    return averaged(most[:, None], way, lambda apart: np.where(np.abs(apart) <= width, 1.0 + np.cos(np.pi * apart / width), 0.0))[:, 0]
 
 
 def outline(item: SceneObject, tool_from_contact: Array) -> tuple[Array, Array]:
