@@ -48,75 +48,40 @@ class Perception(Node):
 
     def __init__(self) -> None:
         super().__init__("perception")
-        p = partial(parameter, self)
-        self.cameras = list(p("cameras", ["left", "right"], "names of the cameras, used in their topics", read_only=True))
-        self.frame = p("frame", "panda_link0", "frame of the results, z up", read_only=True)
-        low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box in `frame`, m", read_only=True)
-        high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box in `frame`, m", read_only=True)
-        count = p("average", 3, "frames of a camera at rest that are averaged", low=1, high=30, read_only=True)
-        tolerance = p(
-            "pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0, read_only=True
-        )
+        p = partial(parameter, self, read_only=True)
+        self.cameras = list(p("cameras", ["left", "right"], "names of the cameras, used in their topics"))
+        if not self.cameras or len(set(self.cameras)) != len(self.cameras):
+            raise MagicError(Code.BAD_REQUEST, "parameter cameras", self.cameras, "at least one name, none twice")
+        self.frame = p("frame", "panda_link0", "frame of the results, z up")
         self.skew = p(
             "camera_tolerance",
             0.5,
             "a camera whose newest frame is older than the newest of all by more than this is left out, s",
             low=0.0,
             high=60.0,
-            read_only=True,
         )
-        self.patience = p(
-            "camera_timeout", 2.0, "a camera silent for this long is no longer waited for, s", low=0.1, high=60.0, read_only=True
-        )
-        self.max_age = p(
-            "max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0, read_only=True
-        )
-        rate = p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0, read_only=True)
-        self.aligned = p("aligned", True, "depth is registered to colour by the driver", read_only=True)
-        name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS, read_only=True)
-        weights = p("weights", "", "weights of the segmenter: a hub name or a local folder; empty: its default", read_only=True)
-        device = p("device", "cpu", "torch device of the segmenter", read_only=True)
-        method = p("method", "completed", "reconstruction", choices=METHODS, read_only=True)
-        use_color = p("use_color", True, "refine masks by the colour difference to the table", read_only=True)
-        split = p("split", True, "part touching objects at concave seams where their forms say that they are two", read_only=True)
-        margin = p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1, read_only=True)
-        min_height = p(
-            "min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1, read_only=True
-        )
-        seed = p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1, read_only=True)
-        if not self.cameras or len(set(self.cameras)) != len(self.cameras):
-            raise MagicError(Code.BAD_REQUEST, "parameter cameras", self.cameras, "at least one name, none twice")
-        if len(low) != 3 or len(high) != 3:
-            raise MagicError(Code.BAD_REQUEST, "parameters region_low, region_high", f"{list(low)}, {list(high)}", "three numbers each")
-        self.parameters = Parameters(
-            region_low=tuple(low), region_high=tuple(high), method=method, use_color=use_color, split=split,
-            known_margin=margin, min_height=min_height, seed=seed,
-        )  # fmt: skip
-        self.given: dict[str, np.ndarray] = {}
-        for camera in self.cameras:
-            numbers = list(
-                p(
-                    f"extrinsics.{camera}",
-                    [0.0] * 7,
-                    f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF",
-                    read_only=True,
-                )
-            )
-            if any(numbers):
-                if len(numbers) != 7 or not 0.9 < np.linalg.norm(numbers[3:]) < 1.1:
-                    raise MagicError(Code.BAD_REQUEST, f"parameter extrinsics.{camera}", numbers, "x y z and a unit quaternion x y z w")
-                self.given[camera] = transforms.from_quaternion(numbers[:3], numbers[3:])
+        self.patience = p("camera_timeout", 2.0, "a camera silent for this long is no longer waited for, s", low=0.1, high=60.0)
+        self.max_age = p("max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0)
+        self.aligned = p("aligned", True, "depth is registered to colour by the driver")
+        self.count = p("average", 3, "frames of a camera at rest that are averaged", low=1, high=30)
+        tolerance = p("pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0)
+        self.period = 1.0 / p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0)
+        name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS)
+        weights = p("weights", "", "weights of the segmenter: a hub name or a local folder; empty: its default")
+        device = p("device", "cpu", "torch device of the segmenter")
+        self.parameters = self._algorithm()
+        self.given = {camera: pose for camera in self.cameras if (pose := self._extrinsics(camera)) is not None}
         self.segmenter = make_segmenter(name, weights, device)
         self.warm_up()
-        self.streams = {camera: Stream(camera, tolerance, count) for camera in self.cameras}
-        self.count = count
+
+        self.streams = {camera: Stream(camera, tolerance, self.count) for camera in self.cameras}
         self.buffer = TransformBuffer()
         self.tracker = Tracker()
         self.known: tuple[SceneObject, ...] = ()
         self.known_problem: tuple[Code, str] | None = None
         self.unheard: dict[str, str] = {}
         self.distortion: dict[str, float] = {}
-        self.done_stamp = -math.inf
+        self.done_stamp = self.last_run = -math.inf
         self.done = 0
         self.outcome: tuple[bytes, Code, str, dict[str, object]] = (DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
         self.lock = threading.Lock()
@@ -124,37 +89,69 @@ class Perception(Node):
         # When images began to come after nobody had sent any for a while: from then on a camera that says nothing is waited for.
         self.resumed = self.heard = -math.inf
 
-        inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
-        self.topics: dict[str, dict[str, str]] = {}
-        for camera in self.cameras:
-            base = f"camera/{camera}"
-            depth = "aligned_depth_to_color/image_raw" if self.aligned else "depth/image_rect_raw"
-            topics = {"color": f"{base}/color/image_raw", "camera_info": f"{base}/color/camera_info", "depth": f"{base}/{depth}"}
-            self.create_subscription(Image, topics["color"], partial(self.on_image, camera, "color"), SENSOR, callback_group=inputs)
-            self.create_subscription(Image, topics["depth"], partial(self.on_image, camera, "depth"), SENSOR, callback_group=inputs)
-            self.create_subscription(CameraInfo, topics["camera_info"], partial(self.on_info, camera, False), SENSOR, callback_group=inputs)
-            if not self.aligned:
-                topics["depth_camera_info"] = f"{base}/depth/camera_info"
-                self.create_subscription(
-                    CameraInfo, topics["depth_camera_info"], partial(self.on_info, camera, True), SENSOR, callback_group=inputs
-                )
-            self.topics[camera] = topics
-        try:
-            from tf2_msgs.msg import TFMessage
-
-            self.listen(TFMessage, "/tf", partial(self.on_tf, False), RELIABLE, inputs)
-            self.listen(TFMessage, "/tf_static", partial(self.on_tf, True), STATIC_TF, inputs)
-        except ImportError:
-            self.get_logger().error("tf2_msgs is not installed: poses of cameras must be given as parameters extrinsics.NAME")
-        self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
         self.objects_out = self.create_publisher(SceneObjectArray, "objects", LATCHED)
         self.markers_out = self.create_publisher(MarkerArray, "perception/markers", LATCHED)
         self.diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
-        self.last_run = -math.inf
-        self.period = 1.0 / rate
+        inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
+        self.topics = {camera: self._subscribe(camera, inputs) for camera in self.cameras}
+        self._subscribe_to_transforms(inputs)
+        self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
         self.create_timer(min(0.05, self.period / 4), self.on_work, callback_group=work)
         self.create_timer(1.0, self.on_report, callback_group=report)
         self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
+
+    def _algorithm(self) -> Parameters:
+        """The parameters that :func:`magic_perception.pipeline.perceive` is told."""
+        p = partial(parameter, self, read_only=True)
+        low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box in `frame`, m")
+        high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box in `frame`, m")
+        if len(low) != 3 or len(high) != 3:
+            raise MagicError(Code.BAD_REQUEST, "parameters region_low, region_high", f"{list(low)}, {list(high)}", "three numbers each")
+        return Parameters(
+            region_low=tuple(low),
+            region_high=tuple(high),
+            method=p("method", "completed", "reconstruction", choices=METHODS),
+            use_color=p("use_color", True, "refine masks by the colour difference to the table"),
+            split=p("split", True, "part touching objects at concave seams where their forms say that they are two"),
+            known_margin=p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1),
+            min_height=p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1),
+            seed=p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1),
+        )
+
+    def _extrinsics(self, camera: str) -> np.ndarray | None:
+        """world_from_camera (4, 4) of a camera as parameters give it; None: it comes from TF."""
+        name = f"extrinsics.{camera}"
+        text = f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF"
+        numbers = list(parameter(self, name, [0.0] * 7, text, read_only=True))
+        if not any(numbers):
+            return None
+        if len(numbers) != 7 or not 0.9 < np.linalg.norm(numbers[3:]) < 1.1:
+            raise MagicError(Code.BAD_REQUEST, f"parameter {name}", numbers, "x y z and a unit quaternion x y z w")
+        return transforms.from_quaternion(numbers[:3], numbers[3:])
+
+    def _subscribe(self, camera: str, group: MutuallyExclusiveCallbackGroup) -> dict[str, str]:
+        """Subscribe to one camera; what of it comes on which topic."""
+        base = f"camera/{camera}"
+        depth = "aligned_depth_to_color/image_raw" if self.aligned else "depth/image_rect_raw"
+        topics = {"color": f"{base}/color/image_raw", "camera_info": f"{base}/color/camera_info", "depth": f"{base}/{depth}"}
+        if not self.aligned:
+            topics["depth_camera_info"] = f"{base}/depth/camera_info"
+        for what, topic in topics.items():
+            if what.endswith("camera_info"):
+                callback = partial(self.on_info, camera, what == "depth_camera_info")
+                self.create_subscription(CameraInfo, topic, callback, SENSOR, callback_group=group)
+            else:
+                self.create_subscription(Image, topic, partial(self.on_image, camera, what), SENSOR, callback_group=group)
+        return topics
+
+    def _subscribe_to_transforms(self, group: MutuallyExclusiveCallbackGroup) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            self.get_logger().error("tf2_msgs is not installed: poses of cameras must be given as parameters extrinsics.NAME")
+            return
+        self.listen(TFMessage, "/tf", partial(self.on_tf, False), RELIABLE, group)
+        self.listen(TFMessage, "/tf_static", partial(self.on_tf, True), STATIC_TF, group)
 
     def warm_up(self) -> None:
         """Look at a small made-up scene, so that the first real one does not pay for loading the libraries."""
