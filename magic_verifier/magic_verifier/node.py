@@ -16,6 +16,7 @@ from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
+from magic_core.threads import one_thread
 from magic_interfaces.action import VerifyMotion
 from magic_verifier.articulation import ArmOptions, Articulation
 from magic_verifier.floating import Perturbation
@@ -99,6 +100,7 @@ class VerifierNode(Node):
             lambda code: code in UNJUDGED,
         )
         self._warm_up()
+        self._threads = one_thread()
         self.get_logger().info("ready: waiting for goals of verify_motion")
 
     def destroy_node(self) -> None:
