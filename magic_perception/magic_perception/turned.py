@@ -43,12 +43,64 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     index = index[rng.permutation(len(index))[:5000]]
     sample, eye = points[index], eyes[index]
     band = max(0.003, 2 * noise)
+    circle = _likeliest_circle(sample, height, band, rng)
+    if circle is None:
+        return None
+    # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
+    out, ray = sample[:, :2] - circle[0], eye[:, :2] - sample[:, :2]
+    cosine = np.sum(ray * out, axis=1) / np.maximum(np.linalg.norm(ray, axis=1) * np.linalg.norm(out, axis=1), 1e-9)
+    # The inside of the far wall tells how far away the axis is, which a noisy front alone leaves open.
+    # At grazing incidence stereo rounds the silhouette off backwards, which would make the body wider.
+    inner, front = sample[cosine < -0.35], sample[cosine > 0.35]
+    fit = _fit(front, inner, circle, height, wall, band)
+    if fit is None:
+        return None
+    side, near = fit
+    radius = side.radius(front[:, 2])
+    seen = front[:, :2] - side.axis
+    widest = max(float(np.ptp(seen @ np.array([np.cos(t), np.sin(t)]))) for t in np.linspace(0, np.pi, 12, endpoint=False))
+    if 2 * float(np.median(radius)) > 1.12 * widest:
+        return None  # a broad face bent a little, not a round body
+    angles = np.arctan2(*(front[near, :2] - side.axis).T[::-1])
+    coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
+    # What reaches beyond the body must be little: a box's corner reaches 0.4 r beyond its inscribed circle.
+    if float(near.mean()) < 0.5 or coverage < 0.28 or float(np.mean(cosine < 0)) > 0.7:
+        return None
+    top = float(np.percentile(front[near, 2], 99))
+    around = points[np.abs(np.linalg.norm(points[:, :2] - side.axis, axis=1) - float(np.median(radius))) < 0.012]
+    top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 8 else top)
+    return Body(side.axis, _profile(side, front, top, band))
+
+
+@dataclass(frozen=True)
+class _Side:
+    """What :func:`round_body` fits: axis (2,); q (3,), the parabola in z / height, with respect to ``origin`` (2,)."""
+
+    origin: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    q: NDArray[np.float64]
+    height: float
+
+    @property
+    def axis(self) -> NDArray[np.float64]:
+        return self.origin + self.shift
+
+    def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """At heights z above the table, metres."""
+        z = z / self.height
+        return np.sqrt(np.maximum(self.q[0] + self.q[1] * z + self.q[2] * z**2 + self.shift @ self.shift, 1e-6))
+
+
+def _likeliest_circle(
+    sample: NDArray[np.float64], height: float, band: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], float] | None:
+    """Centre and radius of the circle through three points of one level, seen from above, near which most points lie."""
     slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
     members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
     members = [m for m in members if len(m) > 8]
     if not members:
         return None
-    # Circles through three points of one level, all hypotheses at once.
+    # All hypotheses at once.
     picked = np.stack([sample[members[i][rng.integers(len(members[i]), size=3)], :2] for i in rng.integers(len(members), size=160)])
     a = 2 * (picked[:, 1:] - picked[:, :1])
     rhs = np.sum(picked[:, 1:] ** 2, axis=2) - np.sum(picked[:, :1] ** 2, axis=2)
@@ -66,59 +118,48 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     few = sample[:1200]
     rho = np.hypot(few[:, 0] - centres[:, :1], few[:, 1] - centres[:, 1:])
     i = int(np.argmax(np.count_nonzero(np.abs(rho - radii[:, None]) < band * 1.5, axis=1)))
-    best = (centres[i], radii[i])
-    origin = best[0]
-    # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
-    out, ray = sample[:, :2] - origin, eye[:, :2] - sample[:, :2]
-    cosine = np.sum(ray * out, axis=1) / np.maximum(np.linalg.norm(ray, axis=1) * np.linalg.norm(out, axis=1), 1e-9)
-    inner_share = float(np.mean(cosine < 0))
-    # The inside of the far wall tells how far away the axis is, which a noisy front alone leaves open.
-    inner = sample[cosine < -0.35]
-    # At grazing incidence stereo rounds the silhouette off backwards, which would make the body wider.
-    sample = sample[cosine > 0.35]
-    near = np.abs(np.linalg.norm(sample[:, :2] - origin, axis=1) - best[1]) < max(0.008, 0.15 * best[1])
-    axis, model = origin, None
-    opposite = np.zeros((0, 3))
+    return centres[i], float(radii[i])
+
+
+def _fit(
+    front: NDArray[np.float64],
+    inner: NDArray[np.float64],
+    circle: tuple[NDArray[np.float64], float],
+    height: float,
+    wall: float,
+    band: float,
+) -> tuple[_Side, NDArray[np.bool_]] | None:
+    """The side through the front's points (N, 3), and which of them lie on it; ``inner``: points on the inside of the far wall."""
+    origin, first = circle
+    near = np.abs(np.linalg.norm(front[:, :2] - origin, axis=1) - first) < max(0.008, 0.15 * first)
+    side, opposite = None, np.zeros((0, 3))
     for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
         if np.count_nonzero(near) < 25:
             return None
-        p = np.concatenate([sample[near], opposite])
+        p = np.concatenate([front[near], opposite])
         local, z = p[:, :2] - origin, p[:, 2] / height
         matrix = np.column_stack([2 * local, np.ones(len(p)), z, z**2])
         model = np.linalg.lstsq(matrix, np.sum(local**2, axis=1), rcond=None)[0]
-        axis = origin + model[:2]
-        z = sample[:, 2] / height
-        radius = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6))
-        residual = np.linalg.norm(sample[:, :2] - axis, axis=1) - radius
-        near = np.abs(residual) < width
+        side = _Side(origin, model[:2], model[2:], height)
+        near = np.abs(np.linalg.norm(front[:, :2] - side.axis, axis=1) - side.radius(front[:, 2])) < width
         if len(inner):
-            away = inner[:, :2] - axis
+            away = inner[:, :2] - side.axis
             reach = np.linalg.norm(away, axis=1, keepdims=True)
-            z = inner[:, 2:] / height
-            beyond = np.sqrt(np.maximum(model[2] + model[3] * z + model[4] * z**2 + model[:2] @ model[:2], 1e-6)) - wall - reach
+            beyond = side.radius(inner[:, 2:]) - wall - reach
             opposite = np.column_stack([inner[:, :2] + away / np.maximum(reach, 1e-6) * wall, inner[:, 2]])[np.abs(beyond[:, 0]) < width]
-    seen = sample[:, :2] - axis
-    widest = max(float(np.ptp(seen @ np.array([np.cos(t), np.sin(t)]))) for t in np.linspace(0, np.pi, 12, endpoint=False))
-    if 2 * float(np.median(radius)) > 1.12 * widest:
-        return None  # a broad face bent a little, not a round body
-    share = float(near.mean())
-    angles = np.arctan2(*(sample[near, :2] - axis).T[::-1])
-    coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
-    # What reaches beyond the body must be little: a box's corner reaches 0.4 r beyond its inscribed circle.
-    if share < 0.5 or coverage < 0.28 or inner_share > 0.7:
-        return None
-    top = float(np.percentile(sample[near, 2], 99))
-    around = points[np.abs(np.linalg.norm(points[:, :2] - axis, axis=1) - float(np.median(radius))) < 0.012]
-    top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 8 else top)
+    return side, near
+
+
+def _profile(side: _Side, front: NDArray[np.float64], top: float, band: float) -> NDArray[np.float64]:
+    """Radius and z (K, 2) from the table to the top: half the parabola's, half what the points of each level say."""
     levels = np.linspace(0, top, max(4, int(top / 0.008)) + 1)
-    zs = levels / height
-    radii = np.sqrt(np.maximum(model[2] + model[3] * zs + model[4] * zs**2 + model[:2] @ model[:2], 1e-6))
-    rho = np.linalg.norm(sample[:, :2] - axis, axis=1)
+    radii = side.radius(levels)
+    rho = np.linalg.norm(front[:, :2] - side.axis, axis=1)
     for i, level in enumerate(levels):
-        here = rho[(np.abs(sample[:, 2] - level) < 0.006) & (np.abs(rho - radii[i]) < 2.5 * band)]
+        here = rho[(np.abs(front[:, 2] - level) < 0.006) & (np.abs(rho - radii[i]) < 2.5 * band)]
         if len(here) > 6:
             radii[i] = 0.5 * radii[i] + 0.5 * np.median(here)
-    return Body(axis, np.column_stack([radii, levels]))
+    return np.column_stack([radii, levels])
 
 
 def seen_into(sights: list[Sight], body: Body, noise: float) -> bool:
@@ -137,6 +178,10 @@ def seen_into(sights: list[Sight], body: Body, noise: float) -> bool:
     return told > 8 and through > 0.5 * told
 
 
+#: Spacing of the offsets at which a mask's edge is looked for, m.
+EDGE_STEP = 5e-4
+
+
 def fit_to_silhouettes(body: Body, sights: list[Sight], reach: float = 0.008) -> Body:
     """The body moved and scaled to the masks' edges, which the colour image puts to a pixel, where depth rounds them off.
 
@@ -144,77 +189,91 @@ def fit_to_silhouettes(body: Body, sights: list[Sight], reach: float = 0.008) ->
     seen, half of their difference moves the axis sideways.  A side without an edge near (a handle) says nothing.  The
     far rim's upper edge tells the height.
     """
-    axis, profile = body.axis, body.profile
-    levels = profile[:, 1]
-    inner = (levels > 0.1 * levels[-1]) & (levels < 0.97 * levels[-1])
-    steps = np.arange(-reach, reach + 2.5e-4, 5e-4)
-
-    def crossing(values: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The offset (N,) at which rows of mask values (N, S) fall below a half once and for all; NaN where they do not."""
-        below = values < 0.5
-        index = below.argmax(axis=1)
-        rows = np.arange(len(values))
-        sound = below.any(axis=1) & (index > 0) & ~(~below & (np.arange(values.shape[1]) > index[:, None])).any(axis=1)
-        before, after = values[rows, np.maximum(index - 1, 0)], values[rows, index]
-        share = np.clip((before - 0.5) / np.maximum(before - after, 1e-6), 0, 1)
-        return np.where(sound, steps[np.maximum(index - 1, 0)] + share * 5e-4, np.nan)
-
+    steps = np.arange(-reach, reach + EDGE_STEP / 2, EDGE_STEP)
     for _ in range(2):
-        radii = body.radius(levels)
-        sides, moves = [], []
-        for sight in sights:
-            away = axis - sight.eye[:2]
-            distance = max(float(np.linalg.norm(away)), 1e-6)
-            away = away / distance
-            right = np.array([away[1], -away[0]])
-            found = []
-            for sign in (-1, 1):
-                rho = radii[:, None] + steps
-                sine = np.clip(rho / distance, 0, 0.9)
-                tangent = axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * right)
-                inside, blind, _, _ = sight.sample(
-                    np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2)
-                )
-                edge = crossing(inside)
-                edge[blind.any(axis=1) | ~inner] = np.nan
-                found.append(edge)
-            middle = np.nanmedian(np.concatenate(found)) if np.isfinite(np.concatenate(found)).any() else 0.0
-            # Where a handle begins its edge is taken for the body's.
-            found = [np.where(np.abs(edge - middle) < 0.003, edge, np.nan) for edge in found]
-            sides += found
-            both = np.isfinite(found[0]) & np.isfinite(found[1])
-            if both.sum() >= 2:
-                moves.append((right, float(np.median((found[1] - found[0])[both]) / 2)))
-        if moves:
-            matrix = np.array([right for right, _ in moves] + [[0.05, 0], [0, 0.05]])
-            axis = axis + np.linalg.lstsq(matrix, np.array([move for _, move in moves] + [0, 0]), rcond=None)[0]
-        edges = np.stack(sides)
-        told = np.isfinite(edges)
-        if told.sum() >= 4:
-            # A line, so that the mask's ragged edge does not ruffle the profile.
-            where = np.broadcast_to(levels / levels[-1], edges.shape)[told]
-            slope, offset = np.polyfit(where, edges[told], 1) if np.ptp(where) > 0.4 else (0.0, float(np.median(edges[told])))
-            radii = np.maximum(radii + offset + slope * levels / levels[-1], 0.004)
-            profile = np.column_stack([radii, levels])
-        body = replace(body, axis=axis, profile=profile)
-    tops = []
-    for sight in sights:
-        away = axis - sight.eye[:2]
-        bearing = np.arctan2(away[1], away[0]) + np.linspace(-0.5, 0.5, 9)
-        rim = axis + profile[-1, 0] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-        heights = profile[-1, 1] + steps
-        spots = np.concatenate(
-            [np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2
-        )
-        inside, blind, _, _ = sight.sample(spots)
-        edge = crossing(inside)
-        edge[blind.any(axis=1)] = np.nan
-        tops += edge[np.isfinite(edge)].tolist()
+        body = _fit_sides(body, sights, steps)
+    tops = [edge for sight in sights for edge in _rim_edges(body, sight, steps)]
     if len(tops) >= 5:
-        profile = profile.copy()
+        profile = body.profile.copy()
         profile[:, 1] *= 1 + float(np.median(tops)) / profile[-1, 1]
         body = replace(body, profile=profile)
     return body
+
+
+def _crossing(values: NDArray[np.float32], steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The offset (N,) at which rows of mask values (N, S) fall below a half once and for all; NaN where they do not."""
+    below = values < 0.5
+    index = below.argmax(axis=1)
+    rows = np.arange(len(values))
+    sound = below.any(axis=1) & (index > 0) & ~(~below & (np.arange(values.shape[1]) > index[:, None])).any(axis=1)
+    before, after = values[rows, np.maximum(index - 1, 0)], values[rows, index]
+    share = np.clip((before - 0.5) / np.maximum(before - after, 1e-6), 0, 1)
+    return np.where(sound, steps[np.maximum(index - 1, 0)] + share * EDGE_STEP, np.nan)
+
+
+def _fit_sides(body: Body, sights: list[Sight], steps: NDArray[np.float64]) -> Body:
+    """One turn of moving the axis and of widening the profile to what the cameras see on the left and on the right."""
+    axis, levels = body.axis, body.profile[:, 1]
+    sides, moves = [], []
+    for sight in sights:
+        left, right, across = _side_edges(body, sight, steps)
+        sides += [left, right]
+        both = np.isfinite(left) & np.isfinite(right)
+        if both.sum() >= 2:
+            moves.append((across, float(np.median((right - left)[both]) / 2)))
+    if moves:
+        matrix = np.array([across for across, _ in moves] + [[0.05, 0], [0, 0.05]])
+        axis = axis + np.linalg.lstsq(matrix, np.array([move for _, move in moves] + [0, 0]), rcond=None)[0]
+    profile = body.profile
+    edges = np.stack(sides)
+    told = np.isfinite(edges)
+    if told.sum() >= 4:
+        # A line, so that the mask's ragged edge does not ruffle the profile.
+        where = np.broadcast_to(levels / levels[-1], edges.shape)[told]
+        slope, offset = np.polyfit(where, edges[told], 1) if np.ptp(where) > 0.4 else (0.0, float(np.median(edges[told])))
+        profile = np.column_stack([np.maximum(body.radius(levels) + offset + slope * levels / levels[-1], 0.004), levels])
+    return replace(body, axis=axis, profile=profile)
+
+
+def _side_edges(
+    body: Body, sight: Sight, steps: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """How much wider the mask is than the body, metres for each level (K,), on a camera's left and right; and the way to its right (2,)."""
+    levels = body.profile[:, 1]
+    inner = (levels > 0.1 * levels[-1]) & (levels < 0.97 * levels[-1])
+    away = body.axis - sight.eye[:2]
+    distance = max(float(np.linalg.norm(away)), 1e-6)
+    away = away / distance
+    across = np.array([away[1], -away[0]])
+    found = []
+    for sign in (-1, 1):
+        rho = body.radius(levels)[:, None] + steps
+        sine = np.clip(rho / distance, 0, 0.9)
+        tangent = body.axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * across)
+        inside, blind, _, _ = sight.sample(np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2))
+        edge = _crossing(inside, steps)
+        edge[blind.any(axis=1) | ~inner] = np.nan
+        found.append(edge)
+    middle = np.nanmedian(np.concatenate(found)) if np.isfinite(np.concatenate(found)).any() else 0.0
+    # Where a handle begins its edge is taken for the body's.
+    left, right = (np.where(np.abs(edge - middle) < 0.003, edge, np.nan) for edge in found)
+    return left, right, across
+
+
+def _rim_edges(body: Body, sight: Sight, steps: NDArray[np.float64]) -> list[float]:
+    """How much higher the mask reaches than the far rim, metres, at nine places around it; fewer where it cannot be told."""
+    axis, profile = body.axis, body.profile
+    away = axis - sight.eye[:2]
+    bearing = np.arctan2(away[1], away[0]) + np.linspace(-0.5, 0.5, 9)
+    rim = axis + profile[-1, 0] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    heights = profile[-1, 1] + steps
+    spots = np.concatenate(
+        [np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2
+    )
+    inside, blind, _, _ = sight.sample(spots)
+    edge = _crossing(inside, steps)
+    edge[blind.any(axis=1)] = np.nan
+    return edge[np.isfinite(edge)].tolist()
 
 
 def build_round(
@@ -314,22 +373,13 @@ def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[
 def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, parameters: Parameters) -> tuple[list[Mesh], list[Mesh]] | None:
     """A handle as bars in the upright plane through the body's axis: meshes and convex pieces, or ``None`` if nothing is left after carving."""
     local = out[:, :2] - body.axis
-    direction = local.mean(axis=0)
-    angle = float(np.arctan2(direction[1], direction[0]))
-    for _ in range(3):
-        along = np.array([np.cos(angle), np.sin(angle)])
-        across = np.array([-along[1], along[0]])
-        low, high = np.percentile(local @ across, [4, 96])
-        angle += float(np.arctan2((low + high) / 2, np.median(local @ along)))
-    thickness = float(np.clip(high - low, 0.005, 0.03))
-    along = np.array([np.cos(angle), np.sin(angle)])
+    along, thickness = _handle_plane(local)
     e_s, e_z = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
     e_n = np.cross(e_s, e_z)
     cell = 0.001
-    reach = float(np.percentile(local @ along, 99.5))
     start = float(body.profile[:, 0].min()) - 0.004
     top = float(max(body.profile[-1, 1], np.percentile(out[:, 2], 99))) + 0.004
-    s = np.arange(start, reach + 0.006, cell)
+    s = np.arange(start, float(np.percentile(local @ along, 99.5)) + 0.006, cell)
     z = np.arange(0.0, top, cell)
     grid_s, grid_z = np.meshgrid(s, z)
     base = np.array([*body.axis, 0.0])
@@ -350,15 +400,7 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
         field = carve(useful, columns, max(0.02, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
     else:
         field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
-    within = grid_s < body.radius(grid_z)
-    attach = within & (grid_s > body.radius(grid_z) - 0.0025) & (grid_z < body.profile[-1, 1])
-    solid = (field > 0.5) & near & ~within
-    # Where the bar meets the body its points are few: join them over 5 mm.
-    reachable = cv2.dilate(attach.astype(np.uint8), np.ones((1, 11), np.uint8)) > 0
-    solid |= reachable & (field > 0.5) & ~within & (cv2.dilate(solid.astype(np.uint8), np.ones((5, 11), np.uint8)) > 0)
-    touching = attach & (cv2.dilate(solid.astype(np.uint8), np.ones((3, 7), np.uint8)) > 0)
-    solid |= touching
-    solid = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    solid = _bars(field > 0.5, near, grid_s, grid_z, body)
     parts = [
         p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5
     ]
@@ -374,3 +416,32 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
         for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)
     ]
     return bars, pieces
+
+
+def _handle_plane(local: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Direction (2,) from the axis in which a handle's points (N, 2) stand off, seen from above, and its thickness in metres."""
+    direction = local.mean(axis=0)
+    angle = float(np.arctan2(direction[1], direction[0]))
+    for _ in range(3):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        low, high = np.percentile(local @ across, [4, 96])
+        angle += float(np.arctan2((low + high) / 2, np.median(local @ along)))
+    return np.array([np.cos(angle), np.sin(angle)]), float(np.clip(high - low, 0.005, 0.03))
+
+
+def _bars(
+    seen: NDArray[np.bool_], near: NDArray[np.bool_], grid_s: NDArray[np.float64], grid_z: NDArray[np.float64], body: Body
+) -> NDArray[np.uint8]:
+    """The handle's cells in its plane: what was ``seen`` solid ``near`` its points, joined to the body.
+
+    All (Z, S); grid_s and grid_z are the cells' distances from the axis and heights, metres.
+    """
+    within = grid_s < body.radius(grid_z)
+    attach = within & (grid_s > body.radius(grid_z) - 0.0025) & (grid_z < body.profile[-1, 1])
+    solid = seen & near & ~within
+    # Where the bar meets the body its points are few: join them over 5 mm.
+    reachable = cv2.dilate(attach.astype(np.uint8), np.ones((1, 11), np.uint8)) > 0
+    solid |= reachable & seen & ~within & (cv2.dilate(solid.astype(np.uint8), np.ones((5, 11), np.uint8)) > 0)
+    solid |= attach & (cv2.dilate(solid.astype(np.uint8), np.ones((3, 7), np.uint8)) > 0)
+    return cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
