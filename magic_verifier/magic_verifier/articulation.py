@@ -117,6 +117,9 @@ class Articulation:
         self._rest = robot.config.opening - float(strokes.sum())
 
     def _name_links(self, world: World, robot: Description) -> None:
+        for part in (BASE, ARM, FINGERS):
+            if world.has(part):
+                raise MagicError(Code.BAD_SCENE, "object id", part, f"ids other than {BASE}, {ARM} and {FINGERS}, which are the robot's")
         pads = world.material(self._options.finger_friction)
         for link in self.body.links:
             part = FINGERS if link.name in robot.finger_links else BASE if link.name in robot.foot else ARM

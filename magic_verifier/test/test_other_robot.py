@@ -28,7 +28,7 @@ from magic_planner.robot import Robot
 from magic_verifier.articulation import ArmOptions, Articulation, collision_groups
 from magic_verifier.film import film_strip
 from magic_verifier.simulation import Settings, World
-from magic_verifier.verification import Limits, verify
+from magic_verifier.verification import verify
 
 #: One gain for all joints: neither of these arms has the Panda's seven.
 GAINS = ArmOptions(stiffness=(3000.0,), damping=(100.0,))
@@ -106,6 +106,13 @@ def test_a_plan_for_another_arm_is_refused(pull):
     assert "panda_joint1" in verdict.message and "joint_turn" in verdict.message
 
 
+def test_a_thing_that_calls_itself_the_arm_is_refused(config, pull):
+    (strategy, tool, target, _, table, candidate), plan = pull
+    thing = scenes.item("arm", [scenes.block((-0.5, -0.4), (-0.5, -0.4), (0, 0.1))])
+    verdict = verify(strategy, tool, target, (thing,), table, candidate, plan, arm_options=GAINS, robot=Description(config))
+    assert verdict.code == Code.BAD_SCENE and "'arm'" in verdict.message
+
+
 @pytest.mark.parametrize("what", ["mass", "inertia"])
 def test_what_a_urdf_leaves_out_of_masses_is_filled_in(config, pull, tmp_path, what):
     """Links without a mass are as heavy as water, a mass without an inertia is a box of its shapes' size."""
@@ -122,10 +129,10 @@ def test_what_a_urdf_leaves_out_of_masses_is_filled_in(config, pull, tmp_path, w
     assert verify(*scene, plan, arm_options=GAINS, robot=robot).success
 
 
-def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, tmp_path):
+def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, pull, tmp_path):
     """The first joint becomes an upright axis: at rest it carries the weight of all above it."""
     first = '<joint name="joint_turn" type="revolute">'
-    robot = edited(config, tmp_path, (first, first.replace("revolute", "prismatic")), ('lower="-3.0" upper="3.0"', 'lower="-1" upper="1"'))
+    robot = edited(config, tmp_path, (first, first.replace("revolute", "prismatic")))
     world = World(Settings())
     arm = Articulation(world, robot, ArmOptions(stiffness=(1e5,), damping=(3e3,)))
     home = np.array(config.home)
@@ -136,7 +143,12 @@ def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, tmp_path):
         world.step()
     above = sum(mass for name, (_, _, mass) in six_axis.BOXES.items() if name != "foot") + 2 * 0.05
     assert abs(arm.transmitted()[0]) == pytest.approx(9.81 * above, rel=0.01)
-    assert Limits().tracking_slide < Limits().tracking
+    # A soft drive of that axis lags by more than 10 mm, where 0.1 rad would be allowed.
+    scene, plan = pull
+    soft = ArmOptions(stiffness=(200.0,) + (3000.0,) * 5, damping=(100.0,))
+    verdict = verify(*scene, plan, arm_options=soft, robot=robot)
+    assert verdict.code == Code.LIMIT_EXCEEDED and "joint_turn lags" in verdict.message and "up to 0.01 m" in verdict.message
+    assert 0.01 < verdict.metrics["tracking_error_slide"] < 0.1
 
 
 @pytest.mark.parametrize("task", ["hooking", "hanging"])
