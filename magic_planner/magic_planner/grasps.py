@@ -25,6 +25,9 @@ from magic_planner.collision import Body, hull, mass_centre, solid, solid_pieces
 from magic_planner.lines import crossings, through
 from magic_planner.robot import Robot
 
+#: Sine of the slope up to which fingers are made to close level, which turns them against the faces by as much.
+LEVEL = 0.17
+
 
 @dataclass(frozen=True)
 class GraspSettings:
@@ -61,8 +64,13 @@ class Grasp:
     cost: float
 
 
-def surface(pieces: Sequence[Mesh], count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``count`` points (N, 3) spread evenly over the hulls of pieces and the outward normals (N, 3) there; none where there is no area."""
+def surface(
+    pieces: Sequence[Mesh], count: int, rng: np.random.Generator, spared: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``count`` points (N, 3) spread evenly over the hulls of pieces and the outward normals (N, 3) there; none where there is no area.
+
+    spared (3,): unit direction; faces across it get fewer points, by the squared sine of the angle to it, but a tenth at least.
+    """
     corners = np.concatenate([vertices[faces] for vertices, faces in (hull(piece.vertices) for piece in pieces)])
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(crosses, axis=1)
@@ -70,9 +78,10 @@ def surface(pieces: Sequence[Mesh], count: int, rng: np.random.Generator) -> tup
     corners, crosses, areas = corners[good], crosses[good], areas[good]
     if not len(areas):
         return np.zeros((0, 3)), np.zeros((0, 3))
+    weights = areas if spared is None else areas * np.maximum(1 - (crosses @ spared / areas) ** 2, 0.1)
     # One stratified draw along the cumulated area: even cover, few samples.
     share = (np.arange(count) + rng.uniform(size=count)) / count
-    face = np.searchsorted(np.cumsum(areas) / areas.sum(), share).clip(0, len(areas) - 1)
+    face = np.searchsorted(np.cumsum(weights) / weights.sum(), share).clip(0, len(areas) - 1)
     u, v = rng.uniform(size=(2, count, 1))
     over = u + v > 1
     u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
@@ -114,10 +123,17 @@ def in_the_way(
 
 
 def antipodal(
-    pieces: Sequence[Mesh], opening: float, settings: GraspSettings, rng: np.random.Generator
+    pieces: Sequence[Mesh],
+    opening: float,
+    settings: GraspSettings,
+    rng: np.random.Generator,
+    up: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces."""
-    points, normals = surface(pieces, settings.samples, rng)
+    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces.
+
+    up (3,): out of the table on which the pieces lie.  Few points are spent on faces across it, where a finger has no room below.
+    """
+    points, normals = surface(pieces, settings.samples, rng, up)
     if not len(points):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     width, exit_normal, inside = through(solid(pieces), points, -normals)
@@ -144,106 +160,152 @@ def propose(
     poses[0] is where the tool lies when it is picked up, the others are the task's.  static, swept (N, 3): points of other
     things as :func:`in_the_way` wants them.  Raises NO_GRASP saying at which test the last of them fell.
     """
-    pieces = solid_pieces(tool)
-    rng = np.random.default_rng(seed)
     budget = budget or Budget()
-    centres, closing, widths = antipodal(pieces, robot.config.opening, settings, rng)
-    if not len(widths):
-        raise MagicError(
-            Code.NO_GRASP,
-            f"antipodal grasps of {tool.id}",
-            f"none in {settings.samples} samples",
-            f"two faces up to {robot.config.opening - 2 * settings.margin:.3f} m apart whose normals agree to {settings.agreement}",
-        )
-    contact = tool_from_contact[:3, 3]
-    away = np.linalg.norm(centres - contact, axis=1) > settings.away
-    if not away.any():
-        raise MagicError(Code.NO_GRASP, f"grasps of {tool.id}", "all at the contact", f"one at least {settings.away} m away from it")
-    centres, closing, widths = centres[away], closing[away], widths[away]
-    terms = _Terms(pieces, tool_from_contact, poses, table, robot, settings)
-    first = terms.of_pairs(centres, closing, widths)
-    # Of each neighbourhood and closing direction the best pair, and of those the best.
-    cells: dict[tuple[int, ...], int] = {}
-    for i in np.argsort(first, kind="stable"):
-        axis = closing[i] * (1 if closing[i][np.abs(closing[i]).argmax()] > 0 else -1)
-        cells.setdefault((*np.floor(centres[i] / 0.012).astype(int), *np.round(axis * 2).astype(int)), int(i))
-    few = np.array(list(cells.values())[: settings.pairs])
-    centres, closing, widths, first = centres[few], closing[few], widths[few], first[few]
-    frames, pair = _frames(robot, centres, closing, settings)
+    return _Proposal(robot, tool, tool_from_contact, table, poses, settings, seed, static, swept, budget).grasps()
 
-    # The hand above the table: where the tool is picked up it may be drawn back along its own axis, as far as the fingertips still hold.
-    corners = np.concatenate([_box_corners(mesh) for mesh in robot.hand.values()])
-    room = _heights(frames, corners, poses[:1], table)[0] - settings.clearance
-    up_in_tool = poses[0, :3, :3].T @ table[:3]
-    descent = -(frames[:, :3, 2] @ up_in_tool)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        back = np.where(room < 0, np.where(descent > 0.1, -room / descent, np.inf), 0.0)
-    allowed = max(0.0, robot.tip_reach - 0.0025)
-    low = back <= allowed
-    if not low.any():
-        raise MagicError(
-            Code.NO_GRASP, f"grasps of {tool.id}", "the hand would go through the table where the tool lies", "fingertips above the table"
-        )
-    frames, pair, back = frames[low], pair[low], back[low]
-    frames[:, :3, 3] -= frames[:, :3, 2] * back[:, None]
-    if len(poses) > 1:
-        high = _heights(frames, corners, poses[1:], table).min(axis=0) > settings.clearance * 0.5
-        if not high.any():
-            raise MagicError(
-                Code.NO_GRASP,
-                f"grasps of {tool.id}",
-                "the hand would go through the table during the task",
-                "a hand above the table on the whole path",
-            )
-        frames, pair, back = frames[high], pair[high], back[high]
 
-    budget.check("grasp")
-    costs = first[pair] + terms.of_approach(frames, back)
-    own = surface(pieces, 400, rng)[0]
-    nothing = np.zeros((0, 3))
-    around = (nothing if static is None else static, nothing if swept is None else swept)
-    ranked, kept, alone = np.argsort(costs, kind="stable"), [], 0
-    for first_of in range(0, len(ranked), settings.poses):
-        budget.check("grasp")
-        lot = ranked[first_of : first_of + settings.poses]
-        lot = lot[~in_the_way(robot, frames[lot], nothing, own, settings.standoff)]
-        alone += len(lot)
-        kept.append(lot[~in_the_way(robot, frames[lot], *around, settings.standoff)])
-        if sum(len(k) for k in kept) >= 100:
-            break
-    keep = np.concatenate(kept)
-    if not len(keep):
-        blocking = f"{tool.id} itself" if not alone else "the target or an obstacle"
-        raise MagicError(
-            Code.NO_GRASP,
-            f"{len(ranked)} grasps of {tool.id}",
-            f"the open hand and {blocking} are in collision for {alone if alone else 'all'} of them",
-            "an open hand clear of everything",
-        )
-    frames, pair, costs = frames[keep], pair[keep], costs[keep]
-    order = np.argsort(costs, kind="stable")
-    looked = order[: settings.looked]
-    costs[order[settings.looked :]] += 5.0
-    budget.check("grasp")
-    centred, shift = _centred(robot, frames[looked], pieces)
-    moved = np.flatnonzero(shift > 0.001)
-    if len(moved):
-        fits = (_heights(centred[moved], corners, poses, table) > settings.clearance * 0.5).all(axis=0)
-        for points, sweep in ((own, settings.standoff), (around[0], 0.0), (around[1], settings.standoff)):
-            fits[fits] = ~in_the_way(robot, centred[moved[fits]], nothing, points, sweep)
-        frames[looked[moved[fits]]] = centred[moved[fits]]
-    budget.check("grasp")
-    costs[looked] += _misfit(robot, frames[looked], widths[pair[looked]], pieces, terms)
-    order = order[np.argsort(costs[order], kind="stable")]
-    # The arm's reach decides in the end, so what comes first should differ: each further grasp of a neighbourhood stands back.
+class _Proposal:
+    """The stages of :func:`propose`, each of which leaves fewer grasps."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        tool: SceneObject,
+        tool_from_contact: NDArray[np.float64],
+        table: NDArray[np.float64],
+        poses: NDArray[np.float64],
+        settings: GraspSettings,
+        seed: int,
+        static: NDArray[np.float64] | None,
+        swept: NDArray[np.float64] | None,
+        budget: Budget,
+    ) -> None:
+        self.robot, self.tool, self.table, self.poses, self.settings, self.budget = robot, tool, table, poses, settings, budget
+        self.pieces = solid_pieces(tool)
+        self.rng = np.random.default_rng(seed)
+        self.up = poses[0, :3, :3].T @ table[:3]
+        self.contact = tool_from_contact[:3, 3]
+        self.terms = _Terms(self.pieces, tool_from_contact, poses, table, robot, settings)
+        self.corners = np.concatenate([_box_corners(mesh) for mesh in robot.hand.values()])
+        nothing = np.zeros((0, 3))
+        self.static, self.swept = (nothing if points is None else points for points in (static, swept))
+
+    def grasps(self) -> list[Grasp]:
+        """The grasps, best first."""
+        centres, closing, widths, first = self._pairs()
+        frames, pair = _frames(self.robot, centres, closing, self.settings, self.up)
+        low, back = self._above_table(frames)
+        frames, pair = frames[low], pair[low]
+        self.budget.check("grasp")
+        costs = first[pair] + self.terms.of_approach(frames, back)
+        own = surface(self.pieces, 400, self.rng)[0]
+        keep = self._clear(frames, costs, own)
+        frames, pair, costs = frames[keep], pair[keep], costs[keep]
+        order = np.argsort(costs, kind="stable")
+        looked = order[: self.settings.looked]
+        costs[order[self.settings.looked :]] += 5.0
+        self.budget.check("grasp")
+        frames[looked] = self._moved_to_middle(frames[looked], own)
+        self.budget.check("grasp")
+        misfit = _misfit(self.robot, frames[looked], widths[pair[looked]], self.pieces, self.terms)
+        if np.isfinite(misfit).any():
+            costs[looked] += misfit
+        return [Grasp(frames[i], float(widths[pair[i]]), float(costs[i])) for i in _varied(frames, costs) if np.isfinite(costs[i])]
+
+    def _refused(self, what: str, value: str, allowed: str) -> MagicError:
+        return MagicError(Code.NO_GRASP, f"{what} of {self.tool.id}", value, allowed)
+
+    def _pairs(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Centres (M, 3), closing directions (M, 3), widths (M,) and costs (M,): of each neighbourhood and direction the best pair."""
+        settings, opening = self.settings, self.robot.config.opening
+        centres, closing, widths = antipodal(self.pieces, opening, settings, self.rng, self.up)
+        if not len(widths):
+            fits = f"two faces up to {opening - 2 * settings.margin:.3f} m apart whose normals agree to {settings.agreement}"
+            raise self._refused("antipodal grasps", f"none in {settings.samples} samples", fits)
+        closing = _levelled(closing, self.up)
+        away = np.linalg.norm(centres - self.contact, axis=1) > settings.away
+        if not away.any():
+            raise self._refused("grasps", "all at the contact", f"one at least {settings.away} m away from it")
+        centres, closing, widths = centres[away], closing[away], widths[away]
+        costs = self.terms.of_pairs(centres, closing, widths)
+        cells: dict[tuple[int, ...], int] = {}
+        for i in np.argsort(costs, kind="stable"):
+            axis = closing[i] * (1 if closing[i][np.abs(closing[i]).argmax()] > 0 else -1)
+            cells.setdefault((*np.floor(centres[i] / 0.012).astype(int), *np.round(axis * 2).astype(int)), int(i))
+        few = np.array(list(cells.values())[: settings.pairs])
+        return centres[few], closing[few], widths[few], costs[few]
+
+    def _above_table(self, frames: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Indices (L,) of the frames whose hand stays above the table, and how far (L,) they were drawn back for that, in place.
+
+        Where the tool is picked up the hand may be drawn back along its own axis, as long as the fingertips can still reach the
+        tool; how much of them is on it then, their patches tell.
+        """
+        room = _heights(frames, self.corners, self.poses[:1], self.table)[0] - self.settings.clearance
+        descent = -(frames[:, :3, 2] @ self.up)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            back = np.where(room < 0, np.where(descent > 0.1, -room / descent, np.inf), 0.0)
+        low = np.flatnonzero(back <= 2 * self.robot.tip_reach)
+        if not len(low):
+            raise self._refused("grasps", "the hand would go through the table where the tool lies", "fingertips above the table")
+        frames[low, :3, 3] -= frames[low, :3, 2] * back[low, None]
+        if len(self.poses) > 1:
+            low = low[_heights(frames[low], self.corners, self.poses[1:], self.table).min(axis=0) > self.settings.clearance * 0.5]
+            if not len(low):
+                raise self._refused(
+                    "grasps", "the hand would go through the table during the task", "a hand above the table on the whole path"
+                )
+        return low, back[low]
+
+    def _clear(self, frames: NDArray[np.float64], costs: NDArray[np.float64], own: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Indices of frames whose open hand meets no points: lots by cost until there are enough."""
+        robot, settings = self.robot, self.settings
+        ranked, kept, alone = np.argsort(costs, kind="stable"), [], 0
+        for first in range(0, len(ranked), settings.poses):
+            self.budget.check("grasp")
+            lot = ranked[first : first + settings.poses]
+            lot = lot[~in_the_way(robot, frames[lot], np.zeros((0, 3)), own, settings.standoff)]
+            alone += len(lot)
+            kept.append(lot[~in_the_way(robot, frames[lot], self.static, self.swept, settings.standoff)])
+            if sum(len(k) for k in kept) >= 100:
+                break
+        keep = np.concatenate(kept)
+        if not len(keep):
+            blocking = "the target or an obstacle" if alone else f"{self.tool.id} itself"
+            value = f"the open hand and {blocking} are in collision for {alone or 'all'} of them"
+            raise self._refused(f"{len(ranked)} grasps", value, "an open hand clear of everything")
+        return keep
+
+    def _moved_to_middle(self, frames: NDArray[np.float64], own: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The frames, those moved by :func:`_centred` whose hand is as clear there."""
+        robot, settings = self.robot, self.settings
+        centred, shift = _centred(robot, frames, self.pieces)
+        moved = np.flatnonzero(shift > 0.001)
+        fits = (_heights(centred[moved], self.corners, self.poses, self.table) > settings.clearance * 0.5).all(axis=0)
+        for static, swept in ((np.zeros((0, 3)), own), (self.static, self.swept)):
+            fits[fits] = ~in_the_way(robot, centred[moved[fits]], static, swept, settings.standoff)
+        result = frames.copy()
+        result[moved[fits]] = centred[moved[fits]]
+        return result
+
+
+def _varied(frames: NDArray[np.float64], costs: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices by cost, where each further grasp of a neighbourhood stands back: the arm's reach decides in the end, so what comes
+    first should differ."""
     seen: dict[tuple[int, ...], int] = {}
-    rank = []
+    rank = np.zeros(len(costs))
+    order = np.argsort(costs, kind="stable")
     for i in order:
         key = (*np.floor(frames[i, :3, 3] / 0.03).astype(int), *np.round(frames[i, :3, :2].ravel() * 1.2).astype(int))
-        seen[key] = seen.get(key, -1) + 1
-        rank.append(seen[key])
-    order = order[np.argsort(costs[order] + 0.2 * np.array(rank), kind="stable")]
-    return [Grasp(frames[i], float(widths[pair[i]]), float(costs[i])) for i in order]
+        rank[i] = seen[key] = seen.get(key, -1) + 1
+    return order[np.argsort((costs + 0.2 * rank)[order], kind="stable")]
+
+
+def _levelled(directions: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit directions (M, 3), those that are nearly level made level: open fingers on a slant meet the table with one of them first."""
+    slope = directions @ up
+    level = directions - np.where(np.abs(slope) < LEVEL, slope, 0.0)[:, None] * up
+    return np.asarray(level / np.linalg.norm(level, axis=1, keepdims=True))
 
 
 def pad_profiles(
@@ -302,6 +364,15 @@ class Patches:
         count = self.contact.sum(axis=(1, 2))
         return np.asarray(np.einsum("gadk,adj->gkj", self.contact, self.grid) / np.maximum(count, 1)[..., None])
 
+    def secure(self) -> NDArray[np.float64]:
+        """(G,): the share of its cells that a pad still touches when the tool has shifted by a cell to the worst side, 1 for a pad
+        that is touched all over."""
+        touched = self.contact
+        sides = (touched[:, 1:], touched[:, :-1], touched[:, :, 1:], touched[:, :, :-1])
+        left = np.min([side.sum(axis=(1, 2)) for side in sides], axis=0)
+        whole = 1 - 1 / min(self.grid.shape[:2])
+        return np.asarray(np.minimum(left / np.maximum(touched.sum(axis=(1, 2)), 1) / whole, 1.0).min(axis=1))
+
     def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Of the smaller patch: mean distance (G,) of its cells from its middle, and half its extent (G, 2) across and along the
         fingers; half a cell is added to each, for a cell is not a point.  Metres."""
@@ -329,12 +400,15 @@ def _centred(robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh]) 
 def _misfit(
     robot: Robot, frames: NDArray[np.float64], widths: NDArray[np.float64], pieces: Sequence[Mesh], terms: _Terms | None = None
 ) -> NDArray[np.float64]:
-    """(G,) cost of finger pads that do not lie flat on opposite faces: what is gripped so is shoved, turns or slips when they close.
+    """(G,) cost of finger pads that do not lie flat on opposite faces: what is gripped so is shoved, turns or slips when they close;
+    infinite where a pad meets nothing.
 
     From the heights under the pads: how far a pad is stopped by something else before it is where the grasp wants it (1 a
     centimetre), how far the middles of the two contact areas are from opposite (1 a centimetre), how far the faces are tilted
     (2 a radian), how little of the pad is on them (1.0 where nothing is), how far off the middle the tool is (1 for 2 cm), how far
-    out on the pads (1.6 at their edges: what is held by the edge alone is squeezed out), and how much of what the patches can hold the motion asks of them (1 for half, 4 for all, up to 9).
+    out on the pads (0.8 at their edges), how much of the touch a small shift takes (1.5 for half, 13.5 for all of it: what is held
+    by the edge alone is squeezed out), and how much of what the patches can hold the motion asks of them (1 for half, 4 for all,
+    up to 9).
     """
     if not len(frames):
         return np.zeros(0)
@@ -360,10 +434,11 @@ def _misfit(
         + 2.0 * tilts
         + np.maximum(0.0, 1 - share / 0.5)
         + np.abs(safe[:, 0] - safe[:, 1]) / 2 / 0.02
-        + 2.0 * np.maximum(0.0, np.linalg.norm(middles.mean(axis=1) / np.abs(grid).max(axis=(0, 1)), axis=1) - 0.2)
+        + np.maximum(0.0, np.linalg.norm(middles.mean(axis=1) / np.abs(grid).max(axis=(0, 1)), axis=1) - 0.2)
+        + 1.5 * (1 / np.maximum(patches.secure(), 0.1) - 1)
         + np.minimum((used / 0.5) ** 2, 9.0)
     )
-    return np.where(there, cost, 12.0)
+    return np.where(there, cost, np.inf)
 
 
 def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
@@ -372,10 +447,14 @@ def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _frames(
-    robot: Robot, centres: NDArray[np.float64], closing: NDArray[np.float64], settings: GraspSettings
+    robot: Robot, centres: NDArray[np.float64], closing: NDArray[np.float64], settings: GraspSettings, up: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """tool_from_tcp (G, 4, 4) of every approach direction and both ways round of each pair, and the pair's index (G,)."""
-    helper = np.where(np.abs(closing[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    """tool_from_tcp (G, 4, 4) of every approach direction and both ways round of each pair, and the pair's index (G,).
+
+    Among the approach directions is the one that is nearest to straight down, against ``up`` (3,).
+    """
+    level = np.eye(3)[int(np.abs(up).argmin())]
+    helper = np.where(np.abs(closing @ up)[:, None] < 0.9, up, level)
     side = np.cross(closing, helper)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(closing, side)

@@ -139,7 +139,7 @@ def test_pads_that_meet_flat_opposite_faces_are_preferred(arm):
     askew = _misfit(arm.robot, transforms.from_rpy(0, 0, np.deg2rad(15))[None], widths, [bar])[0]
     end = _misfit(arm.robot, transforms.make(translation=[0.103, 0, 0])[None], widths, [bar])[0]  # the pads hang over the bar's end
     assert ledge > 2 and askew > 0.4 and end > 0.15
-    assert _misfit(arm.robot, transforms.make(translation=[0.3, 0, 0])[None], widths, [bar])[0] == 12.0
+    assert _misfit(arm.robot, transforms.make(translation=[0.3, 0, 0])[None], widths, [bar])[0] == np.inf
 
 
 def test_patches_are_as_large_as_what_the_pads_touch(arm):
@@ -164,6 +164,29 @@ def test_a_grip_by_the_edge_of_the_pads_is_moved_to_their_middle(arm):
     assert shift[0] < 0.0025 < 0.003 < shift[1]
     np.testing.assert_allclose(moved[:, :2, 3], 0, atol=1e-6)
     assert _misfit(arm.robot, moved[1:], np.array([0.02]), bar)[0] < _misfit(arm.robot, frames[1:], np.array([0.02]), bar)[0]
+
+
+def test_what_the_edge_of_the_pads_holds_is_lost_by_a_small_shift(arm):
+    tall, flat = [scenes.box([0.2, 0.02, 0.1])], [scenes.box([0.2, 0.02, 0.003])]
+    reach = arm.robot.tip_reach
+    frames = np.stack([np.eye(4), transforms.make(translation=[0, 0, -reach + 0.001])])  # the second by the very tips
+    assert Patches.of(arm.robot, frames[:1], tall).secure()[0] == 1.0
+    middle, tips = Patches.of(arm.robot, frames, flat).secure()
+    assert middle > 0.7 and tips == 0.0
+    misfit = _misfit(arm.robot, frames, np.array([0.02, 0.02]), flat)
+    assert misfit[1] > misfit[0] + 5
+
+
+def test_a_flat_tool_is_gripped_as_deep_as_the_table_lets_the_fingers(arm):
+    """A bar 7 mm high on the table: whatever the height of a sampled point, level fingers reach down to the table."""
+    bar = scenes.item("bar", [scenes.box([0.2, 0.02, 0.007])], transforms.from_rpy(0.05, 0, 0, [0.5, 0, 0.0045]))
+    contact = transforms.make(translation=[0.1, 0, 0])
+    grasps = propose(arm.robot, bar, contact, TABLE, bar.world_from_object[None], GraspSettings(), 0)
+    tips = np.array([0.0, 0, arm.robot.tip_reach])
+    for grasp in grasps[:5]:
+        hand = bar.world_from_object @ grasp.tool_from_tcp
+        assert abs(hand[2, 1]) < 1e-6, "level"
+        assert transforms.apply(hand, tips)[2] < 0.003, "down to the table"
 
 
 def test_what_the_pads_are_asked_to_hold_is_weight_and_lever(arm):
