@@ -13,6 +13,7 @@ import math
 import os
 import shlex
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,11 @@ class LaunchFile:
     arguments: list[Argument] = field(default_factory=list)
     processes: list[Process] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
+
+
+def _lower(value: bool) -> str:
+    """A truth as launch files write it."""
+    return str(value).lower()
 
 
 @dataclass
@@ -383,71 +389,54 @@ class _Reader:
         raise self.wrong(f"'{text}' has a $( that is not closed")
 
     def evaluate(self, text: str, scope: _Scope) -> str:
+        """What one substitution, without its ``$(`` and ``)``, stands for."""
         name, _, rest = text.strip().partition(" ")
         arguments = self.split(rest, scope)
+        # How many arguments a substitution takes, at least and at most, and what it makes of them.
+        known: dict[str, tuple[int, float, Callable[..., str]]] = {
+            "var": (1, 2, lambda *a: self.configuration(scope, *a)),
+            "env": (1, 2, lambda *a: self.variable(scope, *a)),
+            "find-pkg-share": (1, 1, lambda a: str(packages.share_of(a))),
+            "find-pkg-prefix": (1, 1, lambda a: str(packages.prefix_of(a))),
+            "dirname": (0, 0, lambda: str(self.stack[-1].parent)),
+            "eval": (0, math.inf, lambda *a: self.computed(" ".join(a))),
+            "equals": (2, 2, lambda a, b: _lower(a == b)),
+            "not-equals": (2, 2, lambda a, b: _lower(a != b)),
+            "not": (1, 1, lambda a: _lower(not self.truth(a, "not"))),
+            "and": (2, 2, lambda a, b: _lower(all([self.truth(a, "and"), self.truth(b, "and")]))),
+            "or": (2, 2, lambda a, b: _lower(any([self.truth(a, "or"), self.truth(b, "or")]))),
+        }
+        if name not in known:
+            raise self.wrong(f"unknown substitution $({name}) (allowed: {', '.join(known)})")
+        low, high, value = known[name]
+        if not low <= len(arguments) <= high:
+            raise self.wrong(f"$({text}) has {len(arguments)} arguments (allowed: {low}{'' if low == high else f' to {high}'})")
+        return value(*arguments)
 
-        def count(low: int, high: int) -> None:
-            if not low <= len(arguments) <= high:
-                raise self.wrong(f"$({text}) has {len(arguments)} arguments (allowed: {low}{'' if low == high else f' to {high}'})")
+    def configuration(self, scope: _Scope, name: str, default: str | None = None) -> str:
+        """The value of a launch argument."""
+        if name in scope.configurations:
+            return scope.configurations[name]
+        if default is not None:
+            return default
+        if self.declared_only:
+            return f"$(var {name})"
+        raise self.wrong(f"launch configuration '{name}' does not exist (there are: {', '.join(sorted(scope.configurations)) or 'none'})")
 
-        if name == "var":
-            count(1, 2)
-            if arguments[0] in scope.configurations:
-                return scope.configurations[arguments[0]]
-            if len(arguments) > 1:
-                return arguments[1]
-            if self.declared_only:
-                return f"$(var {arguments[0]})"
-            raise self.wrong(
-                f"launch configuration '{arguments[0]}' does not exist (there are: {', '.join(sorted(scope.configurations)) or 'none'})"
-            )
-        if name == "env":
-            count(1, 2)
-            value = scope.environment.get(arguments[0], os.environ.get(arguments[0], arguments[1] if len(arguments) > 1 else None))
-            if value is None:
-                raise self.wrong(f"environment variable '{arguments[0]}' does not exist")
-            return value
-        if name == "find-pkg-share":
-            count(1, 1)
-            return str(packages.share_of(arguments[0]))
-        if name == "find-pkg-prefix":
-            count(1, 1)
-            return str(packages.prefix_of(arguments[0]))
-        if name == "dirname":
-            count(0, 0)
-            return str(self.stack[-1].parent)
-        if name == "equals":
-            count(2, 2)
-            return str(arguments[0] == arguments[1]).lower()
-        if name == "not-equals":
-            count(2, 2)
-            return str(arguments[0] != arguments[1]).lower()
-        if name == "not":
-            count(1, 1)
-            return str(not self.truth(arguments[0], "not")).lower()
-        if name in ("and", "or"):
-            count(2, 2)
-            left, right = (self.truth(a, name) for a in arguments)
-            return str(left and right if name == "and" else left or right).lower()
-        if name == "eval":
-            expression = " ".join(arguments)
-            try:
-                allowed = {
-                    "__builtins__": {},
-                    "math": math,
-                    "str": str,
-                    "int": int,
-                    "float": float,
-                    "bool": bool,
-                    "len": len,
-                    "min": min,
-                    "max": max,
-                }
-                return str(eval(expression, allowed))
-            except Exception as error:
-                raise self.wrong(f"$(eval {expression}): {type(error).__name__}: {error}") from None
-        known = "var, env, find-pkg-share, find-pkg-prefix, dirname, eval, equals, not-equals, not, and, or"
-        raise self.wrong(f"unknown substitution $({name}) (allowed: {known})")
+    def variable(self, scope: _Scope, name: str, default: str | None = None) -> str:
+        """The value of an environment variable, as the launch file or the shell set it."""
+        value = scope.environment.get(name, os.environ.get(name, default))
+        if value is None:
+            raise self.wrong(f"environment variable '{name}' does not exist")
+        return value
+
+    def computed(self, expression: str) -> str:
+        """A Python expression's value; like launch's own, it is as trusted as the launch file itself."""
+        allowed = {f.__name__: f for f in (str, int, float, bool, len, min, max)}
+        try:
+            return str(eval(expression, {"__builtins__": {}, "math": math, **allowed}))
+        except Exception as error:
+            raise self.wrong(f"$(eval {expression}): {type(error).__name__}: {error}") from None
 
     def split(self, text: str, scope: _Scope) -> list[str]:
         """Arguments of a substitution: separated by blanks, quoted where they hold some, with substitutions inside."""
