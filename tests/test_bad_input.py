@@ -6,12 +6,12 @@ import time
 
 import numpy as np
 import pytest
-from rclpy.executors import MultiThreadedExecutor
 
 from magic_bringup import bag_file, demo, fakes
 from magic_bringup.testing import DEADLINE, Bench, camera_messages, feeding, started, until
 from magic_core import conversions, shapes, transforms
 from magic_core.errors import Code
+from magic_core.executor import ThreadedExecutor
 
 DEPTH, COLOR, INFO = "/aligned_depth_to_color/image_raw", "/color/image_raw", "/color/camera_info"
 
@@ -107,7 +107,7 @@ class stand_ins:
 
     def __enter__(self):
         self.node = fakes.FakeServers()
-        self.executor = MultiThreadedExecutor(4)
+        self.executor = ThreadedExecutor(4)
         self.executor.add_node(self.node)
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)
         self.thread.start()

@@ -7,11 +7,11 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from rclpy.executors import MultiThreadedExecutor
 
 from magic_bringup import fakes
 from magic_bringup.testing import feeding, first_messages, started, until
 from magic_core.errors import Code
+from magic_core.executor import ThreadedExecutor
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "hanging"
 HOME = [0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4]
@@ -31,7 +31,7 @@ def test_a_mug_is_hung_by_arm_and_gripper(tmp_path):
         bench.ready()
         arm = fakes.FakeArm(thickness=0.0)
         arm.positions = list(HOME)
-        executor = MultiThreadedExecutor(4)
+        executor = ThreadedExecutor(4)
         executor.add_node(arm)
         thread = threading.Thread(target=executor.spin, daemon=True)
         thread.start()

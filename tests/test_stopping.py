@@ -8,13 +8,13 @@ import time
 from pathlib import Path
 
 import pytest
-from rclpy.executors import MultiThreadedExecutor
 
 from magic_bringup import fakes
 from magic_bringup.demo import Options
 from magic_bringup.graph import NODES
 from magic_bringup.testing import DEADLINE, started, until
 from magic_core.errors import Code
+from magic_core.executor import ThreadedExecutor
 
 SERVER = {
     "execute": True,
@@ -44,7 +44,7 @@ def graph(tmp_path):
             return 0, ""
 
         arm.on_move = move
-        executor = MultiThreadedExecutor(6)
+        executor = ThreadedExecutor(6)
         executor.add_node(servers)
         executor.add_node(arm)
         thread = threading.Thread(target=executor.spin, daemon=True)

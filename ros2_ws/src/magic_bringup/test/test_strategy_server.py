@@ -9,7 +9,6 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
@@ -22,6 +21,7 @@ from magic_core import conversions, qos, transforms
 from magic_core import strategy as strategies
 from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
+from magic_core.executor import ThreadedExecutor
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.srv import MatchContact
 
@@ -62,7 +62,7 @@ class Bench:
         ):
             self.node.create_subscription(kind, topic, lambda m, k=key: self._hear(k, m), qos.LATCHED)
         self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.executor = MultiThreadedExecutor(8, context=context)
+        self.executor = ThreadedExecutor(8, context=context)
         for node in (self.server, self.fakes, self.node):
             self.executor.add_node(node)
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)
