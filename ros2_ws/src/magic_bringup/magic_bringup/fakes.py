@@ -244,7 +244,7 @@ class FakeArm(Node):
         if not self.tells:
             return
         fingers, arm = [self.opening / 2] * len(FINGERS), list(self.positions)
-        parts = [(FINGERS, fingers), (JOINTS, arm)] if self.apart else [((*FINGERS, *JOINTS), fingers + arm)]
+        parts = [(JOINTS, arm), (FINGERS, fingers)] if self.apart else [((*FINGERS, *JOINTS), fingers + arm)]
         stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
         for names, positions in parts:
             message = JointState(name=names, position=positions, velocity=[self.velocity] * len(names))

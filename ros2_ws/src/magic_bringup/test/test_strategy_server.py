@@ -13,7 +13,7 @@ from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from magic_bringup import fakes
+from magic_bringup import fakes, pipeline
 from magic_bringup.domain import free_domain
 from magic_bringup.remote import Token
 from magic_bringup.strategy_server import StrategyServer, complaint_code
@@ -222,16 +222,22 @@ def test_a_plan_of_another_variant_is_not_published(bench):
     assert not bench.messages["arm"]
 
 
-def test_what_is_canceled_when_it_has_just_been_verified_is_not_published(bench):
-    def verify(goal, canceled):
-        for token in bench.server._goals.values():
-            token._canceled = True  # silently: the server notices only when it looks
-        return fakes.FakeServers.verify(goal, canceled)
+def test_what_is_canceled_when_it_has_just_been_verified_is_not_published(bench, monkeypatch):
+    execute = pipeline.Run.execute
 
-    bench.fakes.on_verify = verify
+    def canceled_afterwards(run):
+        outcome = execute(run)
+        for token in bench.server._goals.values():
+            token.cancel()
+        return outcome
+
+    monkeypatch.setattr(pipeline.Run, "execute", canceled_afterwards)
     result, _ = bench.run()
     assert result.code == Code.CANCELED, result.message
-    assert not bench.messages["tool"]
+    monkeypatch.undo()
+    bench.run()
+    bench.wait(lambda: bench.messages["tool"])
+    assert len(bench.messages["tool"]) == 1
 
 
 def test_markers_that_cannot_be_drawn_change_nothing_else(bench, monkeypatch):
