@@ -38,7 +38,11 @@ FRAMES, PERIOD = 3, 0.2
 JOINT_PERIOD, POSE_PERIOD = 0.05, 0.05
 #: The demonstrations are seen with less resolution (a mode of the D435) and more often.
 D435_SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
-DEMONSTRATION_FRAMES = 4
+DEMONSTRATION_FRAMES = 3
+#: Before it is used, the tool lies on the table at x, y, yaw, seen so often, and is then taken to where its use begins: seconds.
+PICKED_UP_FROM = {"hooking": (0.44, -0.24, 0.3), "hanging": (0.44, -0.26, 0.2), "scooping": (0.46, 0.31, 0.1)}
+LYING_FRAMES = 2
+REST, TAKE = 0.6, 3.4
 
 #: Where the cameras stand: left and right in front of the robot, looking back and down at the table.
 CAMERAS = {
@@ -231,7 +235,7 @@ def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, 
 
 
 def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array]) -> None:
-    """The tool in use: its pose and the target's over time, the target moved by physics, seen by both cameras on the way."""
+    """The tool lying, taken up and in use: its pose and the target's over time, the target moved by physics, seen by both cameras."""
     made = {
         key: make(strategy.environment[key]["family"], strategy.environment[key]["seed"], **strategy.environment[key]["parameters"])
         for key in ("tool", "target")
@@ -243,9 +247,15 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
     times = strategy.times
     settle = 2.0 if strategy.releases else 0.5
 
+    rest = settled(tool, lying(tool, *PICKED_UP_FROM[strategy.name]))
+    above = transforms.make(translation=[0, 0, 0.25]) @ rest
+    begin = REST + TAKE
+    way = np.stack([rest, rest, above, world_from_tool[0], *world_from_tool[1:]])
+    times = np.array([0.0, REST, REST + 0.4 * TAKE, begin, *(begin + times[1:] - times[0])])
+
     world = _World()
     friction = strategy.physics.friction
-    world.add("tool", tool, world_from_tool[0], "kinematic", friction, strategy.physics.tool_density)
+    world.add("tool", tool, rest, "kinematic", friction, strategy.physics.tool_density)
     world.add(
         "target",
         target,
@@ -261,8 +271,8 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
         world.add(item.id, shapes[item.id], item.world_from_object, "static", friction)
     duration = times[-1] + settle
     at = np.arange(0, duration + 1e-9, 1 / _World.FREQUENCY)
-    commanded = transforms.interpolate(times, world_from_tool, at)
-    poses: list[tuple[float, Array, Array]] = [(0.0, world_from_tool[0], world_from_target)]
+    commanded = transforms.interpolate(times, way, at)
+    poses: list[tuple[float, Array, Array]] = [(0.0, rest, world_from_target)]
     released = False
     for k, t in enumerate(at[1:], start=1):
         if strategy.releases and t > times[-1]:
@@ -278,7 +288,10 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
     with Recording(path) as bag:
         events: list[tuple[float, object, tuple]] = []
         first = None
-        for index, k in enumerate(np.linspace(0, len(poses) - 1, DEMONSTRATION_FRAMES).round().astype(int)):
+        seen = np.concatenate(
+            [np.linspace(0, REST, LYING_FRAMES + 1)[:-1] / POSE_PERIOD, np.linspace(begin / POSE_PERIOD, len(poses) - 1, DEMONSTRATION_FRAMES)]
+        )
+        for index, k in enumerate(seen.round().astype(int)):
             t, tool_pose, target_pose = poses[k]
             meshes = [
                 tool.mesh.transformed(tool_pose),

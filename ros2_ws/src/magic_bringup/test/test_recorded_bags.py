@@ -128,7 +128,7 @@ def test_fixtures_are_announced_complete(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DEMONSTRATIONS)
-def test_a_demonstration_does_what_its_strategy_says(name: str) -> None:
+def test_a_demonstration_does_what_its_strategy_says(name: str, recorder: ModuleType) -> None:
     from magic_core import strategy as strategies
     from magic_core.shapes.fixtures import demonstrated_pose
 
@@ -138,8 +138,10 @@ def test_a_demonstration_does_what_its_strategy_says(name: str) -> None:
     stamps = np.array([s for s, _ in content["/demonstration/tool_pose"]]) * 1e-9
     tool = np.stack([convert.pose_from_msg(m.pose) for _, m in content["/demonstration/tool_pose"]])
     target = np.stack([convert.pose_from_msg(m.pose) for _, m in content["/demonstration/target_pose"]])
-    times = stamps - stamps[0]
-    moving = times <= strategy.times[-1]
+    lying = stamps - stamps[0] <= recorder.REST
+    assert np.abs(tool[lying] - tool[0]).max() < 1e-6 and tool[0][2, 3] < 0.05
+    times = stamps - stamps[0] - recorder.REST - recorder.TAKE
+    moving = (times >= 0) & (times <= strategy.times[-1])
     expected = transforms.interpolate(strategy.times, demonstrated_pose(strategy.environment) @ strategy.target_from_tool, times[moving])
     assert np.abs(tool[moving][:, :3, 3] - expected[:, :3, 3]).max() < 0.002
     if task == "hooking":
