@@ -21,6 +21,7 @@ setup(
         "console_scripts": [
             f"verifier = {PACKAGE}.node:main",
             f"evaluate = {PACKAGE}.evaluate:main",
+            f"learn = {PACKAGE}.learn:main",
         ]
     },
 )

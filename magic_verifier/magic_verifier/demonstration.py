@@ -11,6 +11,7 @@ it carries.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.scene import CanonicalView, SceneObject
-from magic_core.strategy import Strategy
+from magic_core.strategy import Physics
 from magic_verifier.floating import TARGET, TOOL, FloatingRun, make_setup
 from magic_verifier.goals import TOUCH
 from magic_verifier.simulation import Settings
@@ -28,7 +29,8 @@ from magic_verifier.simulation import Settings
 @dataclass(frozen=True)
 class Replay:
     """What a replay found: contact points p_T in the tool's and p_O in the target's frame (3,) metres, the unit outward
-    normal of each surface there (3,) in the same frames, the share of the goal phase in contact, and how many points were read."""
+    normal of each surface there (3,) in the same frames, the share of the goal phase in contact, how many points were read, and
+    when in the phase they touched first and last, seconds from the motion's start."""
 
     tool_point: NDArray[np.float64]
     tool_normal: NDArray[np.float64]
@@ -36,10 +38,36 @@ class Replay:
     target_normal: NDArray[np.float64]
     contact_share: float
     points: int
+    first: float
+    last: float
+
+
+class Shown(Protocol):
+    """What a replay needs of a demonstration; a Strategy has it."""
+
+    @property
+    def name(self) -> str:
+        """Its name, for messages."""
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(T,) seconds."""
+
+    @property
+    def target_from_tool(self) -> NDArray[np.float64]:
+        """(T, 4, 4), with the target's frame where it stood when the motion began."""
+
+    @property
+    def physics(self) -> Physics:
+        """Friction and densities."""
+
+    @property
+    def releases(self) -> bool:
+        """Whether the tool is let go at the end."""
 
 
 def replay(
-    strategy: Strategy,
+    strategy: Shown,
     tool: SceneObject,
     target: SceneObject,
     obstacles: tuple[SceneObject, ...] = (),
@@ -85,6 +113,7 @@ def replay(
     world_from_still = target.world_from_object.copy()
     sums = {name: np.zeros(3) for name in ("tool_point", "tool_normal", "target_point", "target_normal")}
     weight, count, touched, looked = 0.0, 0, 0, 0
+    moments: list[float] = []
     while run.time < run.duration:
         run.advance()
         run.world.check((TOOL,) if releases else (TOOL, TARGET))
@@ -93,6 +122,7 @@ def replay(
         looked += 1
         touches = [t for t in run.world.touches(TOOL, TARGET, TOUCH) if np.linalg.norm(t.impulse) > 0]
         touched += bool(touches)
+        moments += [run.time] if touches else []
         world_from_still[:3, 3] = run.world.position(TARGET)
         tool_from_world, target_from_world = transforms.inverse(run.world.pose(TOOL)), transforms.inverse(world_from_still)
         for touch in touches:
@@ -118,6 +148,8 @@ def replay(
         transforms.unit(sums["target_normal"]),
         touched / max(looked, 1),
         count,
+        moments[0],
+        moments[-1],
     )
 
 

@@ -115,7 +115,7 @@ def posed(mesh: Mesh, kind: str | None, entry: PoseEntry) -> tuple[Mesh, NDArray
 
 def canonical_turn(mesh: Mesh, kind: str) -> NDArray[np.float64]:
     """object_from_mesh (4, 4), a turn alone: how a mesh without a given pose is set on the table (see the module)."""
-    box, extents = _box(mesh)
+    box, extents = box_axes(mesh)
     if kind == "top":
         # Already flat: not to be turned by the little that the least box differs from it.
         return np.eye(4) if mesh.extents[2] <= 1.05 * extents[0] + 1e-6 else _turn_up(box[0])
@@ -152,7 +152,7 @@ def _turn_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return transforms.from_rotvec(axis / length * np.arctan2(length, up[2]))
 
 
-def _box(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def box_axes(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Axes (3, 3) of the least box as rows and its edges (3,), the shortest first; the mesh's own box where there is none."""
     import trimesh
 

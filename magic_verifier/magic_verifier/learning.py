@@ -1,0 +1,320 @@
+"""A strategy from one demonstration (paper, III-A): objects, the tool's motion, and what the motion was for.
+
+1. The motion is replayed in physics.  Where tool and target press on each other are the contact points p_T and p_O; when they
+   first do is when the contact is made.
+2. The plane in which the contact is reasoned about is chosen: across the thinnest side of the tool that the contact's normal does not
+   lie along.  Looked at from above if that direction is upright, else from the side; in section where the contact is
+   inside the silhouette, as a bowl's is.
+3. The part of the motion that belongs to the contact is kept, with its phases: approach, contact, goal, retreat.  Where the tool keeps
+   its attitude it becomes waypoints (mode ``plan``), else it is carried over as it is (``retarget``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.contact import OPPOSED, Contact, ContactCandidate
+from magic_core.errors import Code, MagicError
+from magic_core.motion import MotionPlan, Phase
+from magic_core.rendering import canonical_view
+from magic_core.scene import VIEW_KINDS, CanonicalView, SceneObject
+from magic_core.shapes import section_view
+from magic_core.strategy import MODES, Goal, Physics, Strategy, Waypoint
+from magic_matcher import contour as contours
+from magic_matcher import curvature
+from magic_matcher.matching import target_contact, target_view, to_contact
+from magic_verifier import goals
+from magic_verifier.demonstration import Replay, replay
+from magic_verifier.posing import box_axes
+from magic_verifier.verification import Verdict, verify
+
+Array = NDArray[np.float64]
+#: Samples of the motion are kept if they are so far from the one before: metres, radians, seconds.
+SPACING = (0.002, np.deg2rad(1.0), 0.25)
+#: The motion is kept from where the contact is so far from where it will be made, and the approach ends so far from there, metres.
+APPROACH, NEAR = 0.12, 0.02
+#: Rolling moves a contact: it is read until the tool has turned by so much since it was made (rad), for so long (s) at least.
+TURNED, READ = np.deg2rad(10.0), 0.2
+#: Directions so near (rad) to upright or to level are taken to be so.
+NEARLY = np.deg2rad(20.0)
+#: A tool that turns less than this (rad) keeps its attitude.
+ATTITUDE = np.deg2rad(15.0)
+#: How far (m) a contact point may lie from the outline on which it is matched, and this share of the object's size.
+OFF_OUTLINE, OFF_SHARE = 0.006, 0.03
+#: Waypoints stand for the motion to this (m); between them the tool moves at the demonstrated speed within these bounds (m/s).
+STRAIGHT, SPEEDS = 0.005, (0.02, 0.12)
+#: A motion that goes on for so long (s) after tool and target have parted ends in a retreat.
+PARTED = 0.3
+#: The tool rests (is let go) from when it moves no more than this, metres and radians.
+RESTS = (0.002, np.deg2rad(2.0))
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the demonstration was for.  view and mode: one of VIEW_KINDS and MODES, or empty to have them found."""
+
+    name: str
+    goal: Goal
+    physics: Physics = field(default_factory=Physics)
+    releases: bool = False
+    view: str = ""
+    mode: str = ""
+    description: str = ""
+    simulatable: bool = True
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What was seen.  tool: as it was when ``times`` (T,) begin, in seconds; world_from_tool (T, 4, 4): its object frame's motion;
+    target and obstacles where they stood then; table (4,): plane, unit normal up."""
+
+    tool: SceneObject
+    target: SceneObject
+    obstacles: tuple[SceneObject, ...]
+    table: Array
+    times: Array
+    world_from_tool: Array
+
+
+@dataclass(frozen=True)
+class Learned:
+    """The strategy; how far (m) the contacts that the replay read are from the outlines' points that stand for them; and the verdict on
+    the strategy carried out with the demonstrated objects by a floating gripper (None where simulation cannot judge it)."""
+
+    strategy: Strategy
+    tool_gap: float
+    target_gap: float
+    verdict: Verdict | None
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """The tool's motion in the target's frame, with what a replay needs."""
+
+    name: str
+    times: Array
+    target_from_tool: Array
+    physics: Physics
+    releases: bool
+
+    def index(self, time: float) -> int:
+        """Of the sample nearest to a time."""
+        return int(np.abs(self.times - time).argmin())
+
+
+def learn(demonstration: Demonstration, task: Task) -> Learned:
+    """The strategy that a demonstration shows.
+
+    Raises BAD_MOTION (times, poses), BAD_REQUEST (unknown view, mode or goal; a contact that no view shows in profile), LOST_CONTACT
+    (tool and target never press on each other in the replay), and what the replay raises.
+    """
+    for what, value, allowed in (("view", task.view, VIEW_KINDS), ("mode", task.mode, MODES)):
+        if value and value not in allowed:
+            raise MagicError(Code.BAD_REQUEST, what, value, allowed)
+    motion = _motion(demonstration, task)
+    found, made, parted = _contacts(demonstration, task, motion)
+    target = demonstration.target
+    world_from_tool = target.world_from_object @ motion.target_from_tool[motion.index(made)]
+    normal = target.world_from_object[:3, :3] @ found.target_normal
+    came = world_from_tool[:3, 3] - (target.world_from_object @ motion.target_from_tool[_last_away(motion, found, made, APPROACH)])[:3, 3]
+    direction = view_direction(demonstration.tool, world_from_tool, normal, came)
+    normal = levelled(transforms.unit(normal - (normal @ direction) * direction))
+    view, contact, tool_gap = _tool_contact(demonstration.tool, world_from_tool, direction, found, task.view)
+    draft = Strategy(
+        name=task.name,
+        description=task.description,
+        view=view.kind,
+        mode="retarget",
+        tool_view=view,
+        tool_contact=contact,
+        target_view=view,
+        target_contact=contact,
+        target_normal=normal,
+        target_view_direction=direction,
+        times=motion.times,
+        target_from_tool=motion.target_from_tool,
+        tool_mesh=demonstration.tool.mesh,
+        target_mesh=target.mesh,
+        waypoints=(),
+        goal=task.goal,
+        physics=task.physics,
+        releases=task.releases,
+        simulatable=task.simulatable,
+    )
+    seen = target_view(target, draft)
+    touched = target_contact(draft, seen, target.world_from_object)
+    off = seen.pixels(touched.object_from_contact[:3, 3]) - seen.pixels(found.target_point)
+    strategy = _with_motion(replace(draft, target_view=seen, target_contact=touched), motion, made, parted, task.mode)
+    return Learned(strategy, tool_gap, float(np.linalg.norm(off)) * seen.metres_per_pixel, _tried(demonstration, strategy))
+
+
+def _motion(demonstration: Demonstration, task: Task) -> _Motion:
+    """The motion, thinned, up to where the tool rests if it is let go."""
+    times, poses = np.asarray(demonstration.times, dtype=float), np.asarray(demonstration.world_from_tool, dtype=float)
+    if len(times) < 2 or poses.shape != (len(times), 4, 4) or not (np.all(np.isfinite(times)) and np.all(np.isfinite(poses))):
+        raise MagicError(Code.BAD_MOTION, "the tool's motion", f"{len(times)} times, poses {poses.shape}", "two or more finite timed poses")
+    if not np.all(np.diff(times) > 0):
+        raise MagicError(Code.BAD_MOTION, "times of the tool's motion", float(np.diff(times).min()), "increasing")
+    if task.releases:
+        moves = [_apart(pose, poses[-1]) for pose in poses]
+        rests = max((k + 1 for k, (way, turn) in enumerate(moves) if way > RESTS[0] or turn > RESTS[1]), default=0)
+        times, poses = times[: rests + 1], poses[: rests + 1]
+    kept = [0]
+    for k in range(1, len(times)):
+        way, turn = _apart(poses[k], poses[kept[-1]])
+        if way >= SPACING[0] or turn >= SPACING[1] or times[k] - times[kept[-1]] >= SPACING[2] or k == len(times) - 1:
+            kept.append(k)
+    if len(kept) < 2:
+        raise MagicError(Code.BAD_MOTION, "the tool's motion", "the tool does not move", "a tool in use")
+    target_from_world = transforms.inverse(demonstration.target.world_from_object)
+    return _Motion(task.name, times[kept] - times[0], target_from_world @ poses[kept], task.physics, task.releases)
+
+
+def _apart(a: Array, b: Array) -> tuple[float, float]:
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), transforms.rotation_angle(a, b)
+
+
+def _contacts(demonstration: Demonstration, task: Task, motion: _Motion) -> tuple[Replay, float, float]:
+    """What the replay reads, when the contact is made and when tool and target part, seconds."""
+    end = float(motion.times[-1])
+    scene = demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table
+    if task.releases:
+        return replay(motion, *scene, phases=(Phase("goal", 0.0, end),)), end, end
+    whole = replay(motion, *scene, phases=(Phase("goal", 0.0, end),))
+    made = motion.index(whole.first)
+    turned = [k for k in range(made, len(motion.times)) if _apart(motion.target_from_tool[k], motion.target_from_tool[made])[1] > TURNED]
+    until = min(whole.last, float(motion.times[turned[0]]) if turned else end)
+    until = min(max(until, whole.first + READ), end)
+    phases = (Phase("approach", 0.0, whole.first), Phase("contact", whole.first, until), Phase("goal", until, end + 1e-3))
+    return replay(motion, *scene, phases=phases, watched="contact"), whole.first, whole.last
+
+
+def _last_away(motion: _Motion, found: Replay, made: float, distance: float) -> int:
+    """The last sample before the contact is made at which the tool's contact point is so far (m) from where it will be then."""
+    points = motion.target_from_tool[:, :3, :3] @ found.tool_point + motion.target_from_tool[:, :3, 3]
+    at = motion.index(made)
+    far = np.flatnonzero(np.linalg.norm(points[:at] - points[at], axis=1) >= distance)
+    return int(far[-1]) if len(far) else 0
+
+
+def view_direction(tool: SceneObject, world_from_tool: Array, normal: Array, came: Array) -> Array:
+    """The direction (3,), world, in which the contact is looked at: down, or level.
+
+    world_from_tool (4, 4) when the contact is made; normal (3,): of the target's surface; came (3,): how the tool came there.
+    Raises BAD_REQUEST where the tool's thinnest side that shows the contact in profile is neither upright nor level.
+    """
+    axes, _ = box_axes(tool.mesh)
+    directions = axes @ world_from_tool[:3, :3].T
+    direction = next(d for d in directions if abs(d @ normal) < 0.7)
+    direction = levelled(direction)
+    if abs(direction[2]) == 1.0:
+        return np.array([0.0, 0.0, -1.0])
+    if direction[2] != 0.0:
+        raise MagicError(
+            Code.BAD_REQUEST,
+            "direction in which the contact is seen in profile",
+            direction.round(2).tolist(),
+            "within 20 degrees of upright or of level",
+        )
+    return direction if direction @ came >= 0 else -direction
+
+
+def levelled(normal: Array) -> Array:
+    """A direction (3,), made upright or level where it nearly is: what was meant, for tables are level and things stand on them."""
+    if abs(normal[2]) > np.cos(NEARLY):
+        return np.array([0.0, 0.0, np.sign(normal[2])])
+    return transforms.unit(normal * [1.0, 1.0, 0.0]) if abs(normal[2]) < np.sin(NEARLY) else normal
+
+
+def _tool_contact(
+    tool: SceneObject, world_from_tool: Array, direction: Array, found: Replay, kind: str
+) -> tuple[CanonicalView, Contact, float]:
+    """The tool's picture as it was when the contact was made, the contact on its outline, and how far (m) that is from what was read."""
+    tool_from_world = world_from_tool[:3, :3].T
+    along = tool_from_world @ direction
+    upright = bool(abs(direction[2]) > 0.5)
+    up = tool_from_world @ ([1.0, 0.0, 0.0] if upright else [0.0, 0.0, 1.0])
+    kinds = [kind] if kind else ["top" if upright else "side", *([] if upright else ["section"])]
+    gaps: dict[str, float] = {}
+    for tried in kinds:
+        view = section_view(tool.mesh, along, up) if tried == "section" else canonical_view(tool.mesh, along, up, tried)
+        contour = contours.extract(view.mask)
+        pixel, towards = view.pixels(found.tool_point), found.tool_normal @ view.object_from_view[:3, :2]
+        away = np.linalg.norm(contour.points - pixel, axis=1) + np.where(contour.normals @ towards > 0.3, 0.0, np.inf)
+        index = int(away.argmin())
+        gaps[tried] = float(away[index]) * view.metres_per_pixel
+        if gaps[tried] <= max(OFF_OUTLINE, OFF_SHARE * contour.size * view.metres_per_pixel):
+            return view, to_contact(view, curvature.estimate(contour, index)), gaps[tried]
+    raise MagicError(
+        Code.BAD_REQUEST,
+        "distance of the contact from the tool's outline",
+        ", ".join(f"{1000 * gap:.0f} mm in the view {name}" for name, gap in gaps.items()),
+        "a contact that is seen in profile",
+    )
+
+
+def _with_motion(strategy: Strategy, motion: _Motion, made: float, parted: float, mode: str) -> Strategy:
+    """The strategy with the part of the motion that belongs to its contact, the contact points meeting when it is made."""
+    target_from_contact, tool_from_contact = (c.object_from_contact for c in (strategy.target_contact, strategy.tool_contact))
+    contacts = transforms.inverse(target_from_contact) @ motion.target_from_tool @ tool_from_contact
+    at = motion.index(made)
+    contacts[:, :2, 3] -= contacts[at, :2, 3]
+    away = np.linalg.norm(contacts[: at + 1, :3, 3] - contacts[at, :3, 3], axis=1)
+    start, near = (int(np.flatnonzero(away >= d)[-1]) if (away >= d).any() else 0 for d in (APPROACH, NEAR))
+    last = motion.index(parted) if motion.times[-1] - parted > PARTED else len(motion.times) - 1
+    ends = [(near, "approach"), (at, "contact"), (last, "goal"), (len(motion.times) - 1, "retreat")]
+    ends = [(k, name) for n, (k, name) in enumerate(ends) if k > (ends[n - 1][0] if n else start)]
+    if not mode:
+        turns = [transforms.rotation_angle(c, OPPOSED) for c in contacts[start : last + 1]]
+        mode = "plan" if max(turns) < ATTITUDE else "retarget"
+    waypoints = _waypoints(motion.times, contacts[:, :3, 3], start, ends, every=mode == "plan")
+    times = motion.times[start:] - motion.times[start]
+    target_from_tool = target_from_contact @ contacts[start:] @ transforms.inverse(tool_from_contact)
+    return replace(strategy, mode=mode, times=times, target_from_tool=target_from_tool, waypoints=waypoints)
+
+
+def _waypoints(times: Array, offsets: Array, start: int, ends: list[tuple[int, str]], every: bool) -> tuple[Waypoint, ...]:
+    """One at the end of each phase and, with ``every``, the start and those between that the path's corners need."""
+    waypoints = [Waypoint("start", offsets[start], ends[0][1])] if every else []
+    before = start
+    for end, phase in ends:
+        corners = [*(_corners(offsets, before, end) if every else ()), end]
+        for number, k in enumerate(corners, 1):
+            speed = float(np.linalg.norm(np.diff(offsets[before : k + 1], axis=0), axis=1).sum() / (times[k] - times[before]))
+            name = phase if k == end else f"{phase}_{number}"
+            waypoints.append(Waypoint(name, offsets[k], phase, float(np.clip(speed, *SPEEDS))))
+            before = k
+    return tuple(waypoints)
+
+
+def _corners(points: Array, first: int, last: int) -> list[int]:
+    """Of a path the points between two that keep straight lines within STRAIGHT of it (Douglas and Peucker, 1973)."""
+    if last - first < 2:
+        return []
+    line = points[last] - points[first]
+    inner = points[first + 1 : last] - points[first]
+    share = np.clip(inner @ line / max(float(line @ line), 1e-12), 0.0, 1.0)
+    away = np.linalg.norm(inner - share[:, None] * line, axis=1)
+    worst = first + 1 + int(away.argmax())
+    if away.max() <= STRAIGHT:
+        return []
+    return [*_corners(points, first, worst), worst, *_corners(points, worst, last)]
+
+
+def _tried(demonstration: Demonstration, strategy: Strategy) -> Verdict | None:
+    """The strategy carried out with the objects that it was shown with."""
+    from magic_planner.object_motion import plan_tool_motion
+
+    if not strategy.simulatable:
+        return None
+    goals.require(strategy)
+    scene = demonstration.tool, demonstration.target
+    candidate = ContactCandidate(
+        demonstration.tool.id, strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4)
+    )
+    motion = plan_tool_motion(strategy, *scene, candidate, "keep", demonstration.table, demonstration.obstacles)
+    return verify(strategy, *scene, demonstration.obstacles, demonstration.table, candidate, MotionPlan("fg", motion))

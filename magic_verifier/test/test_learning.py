@@ -1,0 +1,134 @@
+"""A strategy from one demonstration: the contacts that were annotated, and motions that do what was shown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from demonstrations import demonstration
+
+pytest.importorskip("magic_planner.object_motion")
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.strategy import Goal, load, save
+from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, learn, levelled
+
+
+def shown(name, turn=0.0):
+    """The demonstration that ships, everything turned about the upright by ``turn``, and its strategy."""
+    strategy, tool, target, obstacles, _ = demonstration(name)
+    around = transforms.from_rpy(0, 0, turn)
+    tool, target, *obstacles = (replace(o, world_from_object=around @ o.world_from_object) for o in (tool, target, *obstacles))
+    motion = target.world_from_object @ strategy.target_from_tool
+    seen = Demonstration(tool, target, tuple(obstacles), scenes.TABLE, strategy.times + 5.0, motion)
+    return seen, Task(name, strategy.goal, strategy.physics, strategy.releases), strategy
+
+
+@pytest.mark.parametrize(
+    ("name", "view", "mode"), [("hooking", "top", "plan"), ("hanging", "side", "plan"), ("scooping", "section", "retarget")]
+)
+def test_what_is_learned_is_what_was_annotated(name, view, mode, tmp_path):
+    seen, task, annotated = shown(name)
+    learned = learn(seen, task)
+    assert (learned.strategy.view, learned.strategy.mode) == (view, mode)
+    for ours, theirs in (
+        (learned.strategy.tool_contact, annotated.tool_contact),
+        (learned.strategy.target_contact, annotated.target_contact),
+    ):
+        # The paper's contact is a point of the picture: how deep in it does not matter.
+        across = (ours.object_from_contact[:3, 3] - theirs.object_from_contact[:3, 3]) @ theirs.object_from_contact[:3, :2]
+        assert np.linalg.norm(across) < 0.003
+        assert ours.object_from_contact[:3, 0] @ theirs.object_from_contact[:3, 0] > 0.98
+    np.testing.assert_allclose(learned.strategy.target_normal, annotated.target_normal, atol=0.02)
+    assert abs(learned.strategy.target_view_direction @ annotated.target_view_direction) > 0.999
+    assert max(learned.tool_gap, learned.target_gap) < 0.003
+    assert learned.verdict.success, learned.verdict.message
+    save(learned.strategy, tmp_path / name)
+    again = load(tmp_path / name)
+    np.testing.assert_allclose(again.target_from_tool, learned.strategy.target_from_tool, atol=1e-6)
+
+
+def test_the_waypoints_tell_the_motion_that_was_shown():
+    seen, task, annotated = shown("hooking")
+    waypoints = learn(seen, task).strategy.waypoints
+    assert [w.phase for w in waypoints] == sorted((w.phase for w in waypoints), key=["approach", "contact", "goal", "retreat"].index)
+    made = next(w for w in waypoints if w.name == "contact")
+    np.testing.assert_allclose(made.offset[:2], 0, atol=1e-9)
+    assert np.linalg.norm(waypoints[0].offset) >= APPROACH
+    assert np.linalg.norm(next(w for w in waypoints if w.name == "approach").offset) >= NEAR
+    pulled = next(w for w in waypoints if w.name == "goal").offset
+    theirs = next(w for w in annotated.waypoints if w.phase == "goal").offset
+    assert pulled[0] == pytest.approx(theirs[0], abs=0.02) and abs(pulled[1]) < 0.003
+    assert waypoints[-1].phase == "retreat" and waypoints[-1].offset[2] < -0.1, "it ended above"
+
+
+def test_a_turned_demonstration_is_the_same_strategy_turned():
+    turn = 0.7
+    plain, turned = (learn(*shown("hooking", angle)[:2]).strategy for angle in (0.0, turn))
+    around = transforms.from_rpy(0, 0, turn)[:3, :3]
+    np.testing.assert_allclose(turned.target_normal, around @ plain.target_normal, atol=0.01)
+    np.testing.assert_allclose(turned.target_view_direction, plain.target_view_direction, atol=1e-9)
+    ours, theirs = (s.tool_contact.object_from_contact for s in (turned, plain))
+    assert np.linalg.norm(ours[:3, 3] - theirs[:3, 3]) < 0.0015
+    np.testing.assert_allclose([w.offset for w in turned.waypoints[-1:]], [w.offset for w in plain.waypoints[-1:]], atol=0.004)
+
+
+def test_what_simulation_cannot_judge_is_learned_and_not_tried():
+    seen, task, _ = shown("hooking")
+    learned = learn(seen, replace(task, goal=Goal("none"), simulatable=False))
+    assert learned.verdict is None and not learned.strategy.simulatable
+
+
+def test_a_tool_that_never_touches_its_target_shows_nothing():
+    seen, task, _ = shown("hooking")
+    far = transforms.make(translation=[0, 0.5, 0])
+    with pytest.raises(MagicError) as error:
+        learn(replace(seen, world_from_tool=far @ seen.world_from_tool), task)
+    assert error.value.code == Code.LOST_CONTACT
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"times": np.zeros(2)}, Code.BAD_MOTION),
+        ({"times": np.arange(2.0), "world_from_tool": np.full((2, 4, 4), np.nan)}, Code.BAD_MOTION),
+        ({"times": np.arange(3.0), "world_from_tool": np.tile(np.eye(4), (2, 1, 1))}, Code.BAD_MOTION),
+        ({"times": np.array([0.0, -1.0]), "world_from_tool": np.tile(np.eye(4), (2, 1, 1))}, Code.BAD_MOTION),
+    ],
+)
+def test_a_motion_that_is_none_is_refused(change, code):
+    seen, task, _ = shown("hooking")
+    with pytest.raises(MagicError) as error:
+        learn(replace(seen, **change), task)
+    assert error.value.code == code
+
+
+@pytest.mark.parametrize("change", [{"view": "below"}, {"mode": "copy"}])
+def test_unknown_words_are_refused(change):
+    seen, task, _ = shown("hooking")
+    with pytest.raises(MagicError) as error:
+        learn(seen, replace(task, **change))
+    assert error.value.code == Code.BAD_REQUEST
+
+
+def test_corners_keep_a_path_and_leave_out_what_is_straight():
+    line = np.linspace([0, 0, 0], [0.3, 0, 0], 50)
+    assert _corners(line, 0, 49) == []
+    bent = np.concatenate([line, np.linspace([0.3, 0.004, 0], [0.3, 0.2, 0], 50)])
+    (corner,) = _corners(bent, 0, 99)
+    assert np.linalg.norm(bent[corner] - [0.3, 0, 0]) < STRAIGHT
+    wavy = np.column_stack([np.linspace(0, 0.3, 200), 0.02 * np.sin(np.linspace(0, 9, 200)), np.zeros(200)])
+    kept = [0, *_corners(wavy, 0, 199), 199]
+    assert len(kept) < 30
+    at = np.interp(np.arange(200), kept, np.arange(len(kept)))
+    straight = np.array([np.interp(at, np.arange(len(kept)), wavy[kept, axis]) for axis in range(3)]).T
+    assert np.linalg.norm(straight - wavy, axis=1).max() < 3 * STRAIGHT
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [([0.1, 0, 0.99], [0, 0, 1]), ([0.1, 0, -0.99], [0, 0, -1]), ([0.9, 0, 0.1], [1, 0, 0]), ([0.6, 0, 0.8], [0.6, 0, 0.8])],
+)
+def test_what_is_nearly_upright_or_level_is(given, expected):
+    np.testing.assert_allclose(levelled(transforms.unit(given)), expected, atol=1e-9)
