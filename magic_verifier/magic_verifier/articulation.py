@@ -207,6 +207,15 @@ def _load(world: World, robot: Description) -> Any:
     body.set_solver_position_iterations(world.settings.position_iterations)
     body.set_solver_velocity_iterations(world.settings.velocity_iterations)
     for link in body.links:
+        # The engine leaves out, and only logs, what it can make no hull of.
+        count = len(robot.shapes(link.name))
+        if len(link.collision_shapes) != count:
+            raise MagicError(
+                Code.BAD_REQUEST,
+                f"collision shapes of {link.name} in {robot.urdf} that could be loaded",
+                len(link.collision_shapes),
+                f"all {count}; meshes with a volume",
+            )
         for shape in link.collision_shapes:
             shape.set_collision_groups([1, 1, groups.get(link.name, 0), 0])
     return body

@@ -129,6 +129,16 @@ def test_what_a_urdf_leaves_out_of_masses_is_filled_in(config, pull, tmp_path, w
     assert verify(*scene, plan, arm_options=GAINS, robot=robot).success
 
 
+@pytest.mark.parametrize("content", ["", "solid nothing\nendsolid nothing\n", "garbage"])
+def test_a_mesh_that_is_none_is_refused(config, tmp_path, content):
+    """The engine would go on without the shape."""
+    (tmp_path / "hollow.stl").write_text(content)
+    robot = edited(config, tmp_path, ('<box size="0.08 0.08 0.32"/>', '<mesh filename="hollow.stl"/>'))
+    with pytest.raises(MagicError) as error:
+        Articulation(World(Settings()), robot, GAINS)
+    assert error.value.code == Code.BAD_REQUEST and "shoulder" in error.value.message
+
+
 def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, pull, tmp_path):
     """The first joint becomes an upright axis: at rest it carries the weight of all above it."""
     first = '<joint name="joint_turn" type="revolute">'
