@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # The main job, headless: a recorded bag becomes a trajectory that physics has agreed to, with a report to look at.
 #
-#   bash ros2_ws/demo.sh [--strategy hooking|hanging|scooping] [--variant fg|arm] [--bag DIR] [--features auto|embedded|dinov2] [--out DIR]
+#   bash ros2_ws/demo.sh [--strategy hooking|hanging|scooping|DIR] [--variant fg|arm] [--bag DIR] [--features auto|embedded|dinov2] [--out DIR]
 #
-# --strategy  what to do (default hooking)
+# --strategy  what to do (default hooking), or the folder of a strategy, with --bag
 # --variant   fg: a floating gripper moves the tool; arm: the Panda grasps and moves it (default arm)
 # --bag       the recorded bag to replay (default bags/<strategy>)
 # --features  what finds the contact: embedded ships with the package, dinov2 needs weights, auto takes what is at hand (default auto)
