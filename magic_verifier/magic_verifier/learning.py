@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import savgol_filter
 
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact, ContactCandidate
@@ -33,6 +34,8 @@ from magic_verifier.posing import box_axes
 from magic_verifier.verification import Verdict, verify
 
 Array = NDArray[np.float64]
+#: The track is taken every TICK and smoothed over WINDOW seconds.
+TICK, WINDOW = 0.02, 0.6
 #: Samples of the motion are kept if they are so far from the one before: metres, radians, seconds.
 SPACING = (0.002, np.deg2rad(1.0), 0.25)
 #: The motion is kept from where the contact is so far from where it will be made, and the approach ends so far from there, metres.
@@ -159,6 +162,7 @@ def _motion(demonstration: Demonstration, task: Task) -> _Motion:
         raise MagicError(Code.BAD_MOTION, "the tool's motion", f"{len(times)} times, poses {poses.shape}", "two or more finite timed poses")
     if not np.all(np.diff(times) > 0):
         raise MagicError(Code.BAD_MOTION, "times of the tool's motion", float(np.diff(times).min()), "increasing")
+    times, poses = smoothed(times, poses)
     if task.releases:
         moves = [_apart(pose, poses[-1]) for pose in poses]
         rests = max((k + 1 for k, (way, turn) in enumerate(moves) if way > RESTS[0] or turn > RESTS[1]), default=0)
@@ -172,6 +176,25 @@ def _motion(demonstration: Demonstration, task: Task) -> _Motion:
         raise MagicError(Code.BAD_MOTION, "the tool's motion", "the tool does not move", "a tool in use")
     target_from_world = transforms.inverse(demonstration.target.world_from_object)
     return _Motion(task.name, times[kept] - times[0], target_from_world @ poses[kept], task.physics, task.releases)
+
+
+def smoothed(times: Array, poses: Array) -> tuple[Array, Array]:
+    """A track at 1 / TICK Hz without its jitter: times (N,) and poses (N, 4, 4) of quadratics through WINDOW seconds of it.
+
+    A tracker's noise of a millimetre, at 30 Hz, is an acceleration of 1 m/s^2 and more: replayed as it is, the tool would hit what
+    it only pushed.
+    """
+    at = np.arange(times[0], times[-1] + TICK / 2, TICK)
+    even = transforms.interpolate(times, poses, at)
+    width = min(round(WINDOW / TICK), len(at)) | 1
+    if width > len(at) or width < 5:
+        return times, poses
+    quaternions = np.array([transforms.quaternion_xyzw(pose) for pose in even])
+    # Of the two quaternions of a rotation the one nearer to that before.
+    flips = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0
+    quaternions[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    values = savgol_filter(np.concatenate([even[:, :3, 3], quaternions], axis=1), width, 2, axis=0)
+    return at, np.stack([transforms.from_quaternion(row[:3], row[3:]) for row in values])
 
 
 def _apart(a: Array, b: Array) -> tuple[float, float]:

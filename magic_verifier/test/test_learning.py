@@ -12,7 +12,7 @@ pytest.importorskip("magic_planner.object_motion")
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.strategy import Goal, load, save
-from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, learn, levelled
+from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, learn, levelled, smoothed
 
 
 def shown(name, turn=0.0):
@@ -72,6 +72,32 @@ def test_a_turned_demonstration_is_the_same_strategy_turned():
     ours, theirs = (s.tool_contact.object_from_contact for s in (turned, plain))
     assert np.linalg.norm(ours[:3, 3] - theirs[:3, 3]) < 0.0015
     np.testing.assert_allclose([w.offset for w in turned.waypoints[-1:]], [w.offset for w in plain.waypoints[-1:]], atol=0.004)
+
+
+def test_a_trackers_jitter_does_no_harm():
+    seen, task, annotated = shown("hooking")
+    rng = np.random.default_rng(1)
+    times = np.arange(seen.times[0], seen.times[-1], 1 / 30)
+    poses = transforms.interpolate(seen.times, seen.world_from_tool, times)
+    poses = np.stack([pose @ transforms.from_rotvec(rng.normal(0, np.deg2rad(0.3), 3), rng.normal(0, 0.001, 3)) for pose in poses])
+    learned = learn(replace(seen, times=times, world_from_tool=poses), task)
+    ours, theirs = (s.tool_contact.object_from_contact for s in (learned.strategy, annotated))
+    assert np.linalg.norm((ours[:3, 3] - theirs[:3, 3]) @ theirs[:3, :2]) < 0.003
+    assert learned.verdict.success, learned.verdict.message
+
+
+def test_smoothing_keeps_the_motion_and_takes_the_jitter():
+    times = np.linspace(0, 4, 81)
+    way = 0.3 * (3 * (times / 4) ** 2 - 2 * (times / 4) ** 3)
+    # Past half a turn the quaternion changes its sign.
+    poses = np.stack([transforms.from_rpy(0, 0, 1.2 * t, [x, 0, 0]) for t, x in zip(times, way, strict=True)])
+    at, kept = smoothed(times, poses)
+    truth = transforms.interpolate(times, poses, at)
+    assert np.abs(kept[:, :3, 3] - truth[:, :3, 3]).max() < 5e-4
+    assert max(transforms.rotation_angle(a, b) for a, b in zip(kept, truth, strict=True)) < np.deg2rad(0.3)
+    noisy = poses.copy()
+    noisy[:, :3, 3] += np.random.default_rng(0).normal(0, 0.001, (len(times), 3))
+    assert (smoothed(times, noisy)[1][:, :3, 3] - truth[:, :3, 3]).std() < 0.0006
 
 
 def test_what_simulation_cannot_judge_is_learned_and_not_tried():
