@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -131,8 +131,12 @@ LEAST_GROWTH = 3**-0.5
 
 def grown(pieces: Iterable[Mesh], margin: float) -> tuple[Mesh, ...]:
     """Convex pieces grown by about ``margin`` metres: by that along the axes, by LEAST_GROWTH of it where they are least grown."""
+    return tuple(Mesh(*_grown(piece, margin)) for piece in pieces)
+
+
+def _grown(piece: Mesh, margin: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     steps = margin * np.concatenate([np.eye(3), -np.eye(3)])
-    return tuple(Mesh(*hull((hull(p.vertices)[0][:, None] + steps).reshape(-1, 3))) for p in pieces)
+    return _equal_hull((hull(piece.vertices)[0][:, None] + steps).reshape(-1, 3))
 
 
 def mass_centre(pieces: Sequence[Mesh]) -> tuple[float, NDArray[np.float64]]:
@@ -170,10 +174,30 @@ def shell(pieces: Iterable[Mesh]) -> list[Any]:
 def roomy_shell(pieces: Iterable[Mesh], margin: float) -> list[Any]:
     """A surface about each convex piece as one FCL triangle tree, in a list of one, that keeps ``margin`` metres from its faces.
 
-    At least LEAST_GROWTH of the margin where a piece is sharp.  Each corner of a piece goes out along the mean of the normals about
-    it; pieces with corners too sharp for that are :func:`grown`, which takes new convex hulls.
+    At least LEAST_GROWTH of the margin where a piece is sharp.  Pieces no larger than the margin become boxes.
     """
     pieces = tuple(pieces)
+    made = solid(pieces).roomy
+    if margin not in made:
+        hulls = [hull(piece.vertices) for piece in pieces]
+        extents = np.array([np.ptp(vertices, axis=0).max() for vertices, _ in hulls])
+        small = [vertices for (vertices, _), extent in zip(hulls, extents, strict=True) if extent <= margin]
+        large = [piece for piece, extent in zip(pieces, extents, strict=True) if extent > margin]
+        surfaces = [_box(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in small]
+        made[margin] = _tree(*joined(surfaces + (_roomy(large, margin) if large else []))[:2])
+    return [made[margin]]
+
+
+def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The surface of a box between two corners (3,)."""
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], dtype=np.int32)
+    return corners, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def _roomy(pieces: Sequence[Mesh], margin: float) -> list[tuple[NDArray[np.float64], NDArray[np.int32]]]:
+    """Surfaces about pieces: each corner goes out along the mean of the normals about it; pieces with corners too sharp for that
+    are grown as :func:`grown` does it, which takes new convex hulls."""
     vertices, faces, first = joined([hull(piece.vertices) for piece in pieces])
     corners = vertices[faces]
     sides = _units(np.roll(corners, -1, axis=1) - corners)
@@ -190,8 +214,7 @@ def roomy_shell(pieces: Iterable[Mesh], margin: float) -> list[Any]:
     blunt = np.minimum.reduceat(cosine, first) > LEAST_GROWTH / farthest
     piece_of_face = np.searchsorted(first, faces[:, 0], side="right") - 1
     surfaces = [(vertices + margin * out / np.maximum(cosine, 1 / farthest)[:, None], faces[blunt[piece_of_face]])]
-    surfaces += [hull(piece.vertices) for piece in grown([p for p, b in zip(pieces, blunt, strict=True) if not b], margin)]
-    return [_tree(*joined(surfaces)[:2])]
+    return surfaces + [_grown(piece, margin) for piece, b in zip(pieces, blunt, strict=True) if not b]
 
 
 def joined(
@@ -224,7 +247,8 @@ class Solid:
     """What collision tests need to know of P convex pieces, in their frame.
 
     tree: their surfaces; normals (P, F, 3), offsets (P, F): their planes, the shorter lists filled up, and how many (P,) there are
-    of each; centres (P, 3), radii (P,): balls about them; first (P, 3): a point of each.
+    of each; centres (P, 3), radii (P,): balls about them; first (P, 3): a point of each; roomy: trees of :func:`roomy_shell` made
+    so far, by margin.
     """
 
     tree: Any
@@ -234,6 +258,7 @@ class Solid:
     centres: NDArray[np.float64]
     radii: NDArray[np.float64]
     first: NDArray[np.float64]
+    roomy: dict[float, Any] = field(default_factory=dict)
 
 
 #: Solids of pieces seen lately, by their hulls, as of :data:`_HULLS`.
@@ -249,13 +274,13 @@ def solid(pieces: Iterable[Mesh]) -> Solid:
     if known is not None:
         _SOLIDS.move_to_end(key)
         return known[1]
-    planes = [_planes(vertices, faces) for vertices, faces in hulls]
+    normals, offsets, counts = _planes(hulls)
     centres = np.array([(vertices.min(axis=0) + vertices.max(axis=0)) / 2 for vertices, _ in hulls])
     result = Solid(
         tree=_tree(*joined(hulls)[:2]),
-        normals=padded([n for n, _ in planes]),
-        offsets=padded([o for _, o in planes]),
-        counts=np.array([len(o) for _, o in planes]),
+        normals=normals,
+        offsets=offsets,
+        counts=counts,
         centres=centres,
         radii=np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, centres, strict=True)]),
         first=np.array([vertices[0] for vertices, _ in hulls]),
@@ -335,11 +360,24 @@ def padded(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.stack([np.concatenate([row, np.repeat(row[:1], longest - len(row), axis=0)]) for row in rows])
 
 
-def _planes(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Outward unit normals (F, 3) of a hull's faces and their offsets (F,): inside is where normals @ x <= offsets."""
+def _planes(
+    hulls: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Outward unit normals (P, F, 3) of the hulls' faces, their offsets (P, F), and how many (P,) there are of each: inside is where
+    normals @ x <= offsets.  Triangles of one flat face count once; the shorter lists are filled up with copies of their first."""
+    vertices, faces, first = joined(hulls)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
-    good = lengths > 1e-14
+    good = lengths > min(1e-14, 1e-6 * lengths.max())
     normals = normals[good] / lengths[good][:, None]
-    return normals, np.einsum("ij,ij->i", normals, a[good])
+    offsets = np.einsum("ij,ij->i", normals, a[good])
+    piece = np.searchsorted(first, faces[good, 0], side="right") - 1
+    # To 0.01 mrad and 0.1 um.
+    once = np.unique(np.column_stack([piece, np.round(normals * 1e5), np.round(offsets * 1e7)]), axis=0, return_index=True)[1]
+    once.sort()
+    counts = np.bincount(piece[once], minlength=len(hulls))
+    starts = np.cumsum(counts) - counts
+    n = np.arange(max(int(counts.max()), 1))
+    rows = once[np.where(n < counts[:, None], starts[:, None] + n, starts[:, None]).clip(0, len(once) - 1)]
+    return normals[rows], offsets[rows], counts

@@ -43,7 +43,7 @@ class GraspSettings:
     samples: int = 500
     pairs: int = 300
     poses: int = 1500
-    looked: int = 400
+    looked: int = 240
     standoff: float = 0.08
     angles: int = 16
     clearance: float = 0.0015

@@ -32,7 +32,7 @@ class PlannerNode(Node):
     Action server: ``plan_motion`` (magic_interfaces/action/PlanMotion).  The goal
     carries everything; the node keeps no state between goals.  One goal at a time: a
     goal during another one is answered BUSY at once.  Cancelling takes effect inside
-    the stages, within one search for a free path (a second) at the latest.
+    the stages, within one search for a free path (0.5 s) at the latest.
 
     Parameters: see ``config/planner.param.yaml``.
     """

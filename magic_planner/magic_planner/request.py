@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,8 +42,8 @@ class ArmSettings:
     dwell: float = 0.5
     jump: float = 0.5
     time_step: float = 0.02
-    free_time: float = 0.25
-    searches: int = 3
+    free_time: float = 0.5
+    searches: int = 2
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,10 @@ class Request:
     marks: tuple[tuple[str, float], ...]  # names of the places the tool's motion passes, and when
     cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
     searches: int  # that may still fail
-    _grown: dict[float, list[Any]] = field(default_factory=dict)
 
     def roomy(self, margin: float) -> list[Any]:
         """The tool's surface grown by ``margin`` metres."""
-        if margin <= 0:
-            return self.shapes
-        if margin not in self._grown:
-            self._grown[margin] = roomy_shell(solid_pieces(self.tool), margin)
-        return self._grown[margin]
+        return roomy_shell(solid_pieces(self.tool), margin) if margin > 0 else self.shapes
 
     def surroundings(self, target: bool = True) -> list[str]:
         """Names of all that is in the collision world besides table and tool; without the target on request."""
