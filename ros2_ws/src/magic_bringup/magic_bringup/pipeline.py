@@ -136,7 +136,7 @@ class Progress:
 class Outcome:
     """How a run ended.  ``verified`` says that physics agreed; only then may the plan be published.
 
-    ``plan`` is also filled in for an unverified motion that the caller allowed.
+    ``plan`` is also filled in for the best match of a strategy that simulation cannot judge; its code is OK only if the caller allowed that.
     ``seconds`` holds the wall time of each stage and ``total``.
     """
 
@@ -231,18 +231,14 @@ def reflections_of(candidate: Any, reflections: Sequence[str]) -> tuple[str, ...
     return tuple(reflections) if candidate.flipped else ("keep",)
 
 
-def check(request: Request, simulatable: bool) -> None:
-    """Refuse what cannot be run before any work: an unknown variant, a bad timeout, a strategy without a simulation."""
+def check(request: Request) -> None:
+    """Refuse what cannot be run before any work: an unknown variant, a bad timeout, one object for both."""
     if request.variant not in VARIANTS:
         raise MagicError(Code.UNKNOWN_VARIANT, "variant", request.variant, VARIANTS)
     if not 0 < request.timeout < float("inf"):
         raise MagicError(Code.BAD_REQUEST, "timeout", request.timeout, "seconds above 0")
     if request.tool_id and request.tool_id == request.target_id:
         raise MagicError(Code.BAD_REQUEST, "tool_id and target_id", request.tool_id, "two different objects")
-    if not simulatable and not request.allow_unverified:
-        raise MagicError(
-            Code.NOT_VERIFIABLE, f"strategy {request.strategy!r} cannot be judged by simulation", allowed="allow_unverified = true"
-        )
 
 
 class Run:
@@ -278,7 +274,7 @@ class Run:
     def execute(self) -> Outcome:
         """Do the work."""
         try:
-            check(self._request, self._simulatable)
+            check(self._request)
             return self._work()
         except MagicError as error:
             return self._outcome(error.code, error.message)
@@ -316,9 +312,12 @@ class Run:
         if planned.code != Code.OK:
             return self._drop(Report(trial, "plan", planned.code, planned.message)), planned.code
         if not self._simulatable:
-            message = "not verified: simulation cannot judge this strategy, and the request allows that"
-            self._reports.append(Report(trial, "plan", Code.OK, message, planned.plan))
-            return self._outcome(Code.OK, message, plan=planned.plan, trial=trial), Code.OK
+            code = Code.OK if request.allow_unverified else Code.NOT_VERIFIABLE
+            message = f"not verified: simulation cannot judge the strategy {request.strategy!r}; this is the best match's motion"
+            if not request.allow_unverified:
+                message += " (allow_unverified = true accepts it)"
+            self._reports.append(Report(trial, "plan", code, message, planned.plan))
+            return self._outcome(code, message, plan=planned.plan, trial=trial), code
         self._tell("verify", trial.index, what)
         self._simulations += 1
         verdict = self._attempt("verify", trial, lambda left: self._stages.verify(request, matches, trial, planned.plan, left), Verdict)

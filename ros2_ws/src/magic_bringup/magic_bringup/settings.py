@@ -33,6 +33,7 @@ class Settings:
     verify: float
     grace: float
     execute: bool
+    execute_unverified: bool
     trajectory_action: str
     gripper_action: str
     objects_age: float
@@ -61,6 +62,13 @@ def read(node: Node) -> Settings:
         verify=seconds("verify_timeout", 60.0, "s for one verification"),
         grace=seconds("grace", 5.0, "s that an answer may come late before its server counts as dead"),
         execute=parameter(node, "execute", False, "carry verified plans out with arm and gripper", read_only=True),
+        execute_unverified=parameter(
+            node,
+            "execute_unverified",
+            False,
+            "with execute: also what simulation cannot judge, where the goal has allow_unverified",
+            read_only=True,
+        ),
         trajectory_action=parameter(
             node,
             "trajectory_action",

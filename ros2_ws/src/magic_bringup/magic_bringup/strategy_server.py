@@ -219,10 +219,13 @@ class StrategyServer(Node):
         ).execute()
         fill(result, outcome)
         # First what somebody waits for, then the pictures.
-        if outcome.verified and outcome.code == Code.OK:
+        if outcome.code == Code.OK:
             token.check()
-            self._publish(outcome.plan)
-            if self._arm is not None and outcome.plan.variant == MotionPlan.ARM:
+            if outcome.verified:
+                self._publish(outcome.plan)
+            # What physics has not passed moves the arm only where goal and server both say so; it is published nowhere.
+            wanted = outcome.verified or (goal.allow_unverified and self.settings.execute_unverified)
+            if self._arm is not None and wanted and outcome.plan.variant == MotionPlan.ARM:
                 self._carry_out(self._arm, outcome, stages, token, result, notify)
         self._show(stages, outcome)
         if goal.want_pictures:
@@ -298,7 +301,7 @@ class StrategyServer(Node):
         result: RunStrategy.Result,
         notify: Callable[[pipeline.Progress], None],
     ) -> None:
-        """Have arm and gripper do what physics has passed, and write into the result how that went."""
+        """Have arm and gripper do what was planned, and write into the result how that went."""
 
         def tell(text: str) -> None:
             index = outcome.reports[-1].trial.index
@@ -308,13 +311,14 @@ class StrategyServer(Node):
         try:
             check_alone(self, self._server_name)
             self._check_scene(stages.scene, token)
-            self.get_logger().warning("the arm is about to move: carrying out the verified plan")
+            kind = "verified" if outcome.verified else "UNVERIFIED"
+            self.get_logger().warning(f"the arm is about to move: carrying out the {kind} plan")
             arm.execute(outcome.plan, token, tell)
             result.executed = True
             sentence += "; carried out by the arm"
         except Exception as error:
             result.code, message = describe(self, error)
-            sentence = f"verified ({sentence}), but not carried out to the end: {message}"
+            sentence = f"{'verified' if outcome.verified else 'planned'} ({sentence}), but not carried out to the end: {message}"
             self.get_logger().error(sentence)
         result.message = pipeline.with_metrics(sentence, list(metrics.items()))
 

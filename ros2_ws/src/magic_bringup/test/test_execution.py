@@ -399,6 +399,28 @@ def test_what_is_not_verified_or_not_for_the_arm_moves_nothing(bench):
     assert not bench.arm.log
 
 
+@pytest.mark.parametrize("allow", [True, False])
+def test_what_simulation_cannot_judge_moves_the_arm_only_if_goal_and_server_say_so(folder, allow):
+    """The server's half of it is missing in the test above."""
+    bench = Bench(folder, execute=True, execute_unverified=True, state_age=10.0, objects_age=10.0, **ACTIONS)
+    arm = fakes.FakeArm(context=bench.context)
+    try:
+        bench.executor.add_node(arm)
+        bench.until(lambda: not bench.server._arm.ready())
+        sees(bench, fakes.scene())
+        believes(bench, [0.0] * 7)
+        result, _ = bench.run(strategy="dynamic", variant="arm", allow_unverified=allow)
+        assert (result.code, result.verified, result.executed) == (0 if allow else Code.NOT_VERIFIABLE, False, allow), result.message
+        assert bool(arm.log) == allow
+        # A verified run proves that the channel works and that nothing came before it.
+        assert bench.run(variant="arm")[0].verified
+        bench.wait(lambda: bench.messages["arm"])
+        assert len(bench.messages["arm"]) == 1
+    finally:
+        bench.close()
+        arm.destroy_node()
+
+
 def test_without_a_gripper_nothing_moves(folder):
     bench = Bench(folder, execute=True, trajectory_action="arm/follow_joint_trajectory", gripper_action="nowhere", server_timeout=0.5)
     arm = fakes.FakeArm(context=bench.context)

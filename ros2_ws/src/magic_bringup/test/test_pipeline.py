@@ -154,11 +154,11 @@ def test_cancel_between_stages():
 
 def test_what_cannot_be_simulated():
     script = Script([candidate()])
-    assert execute(script, simulatable=False).code == Code.NOT_VERIFIABLE
-    assert not script.calls
-    outcome = execute(script, simulatable=False, allow=True)
-    assert (outcome.code, outcome.verified, outcome.simulations) == (Code.OK, False, 0)
-    assert outcome.plan == ("plan", 0, 0)
+    for allow, code in ((False, Code.NOT_VERIFIABLE), (True, Code.OK)):
+        outcome = execute(script, simulatable=False, allow=allow)
+        assert (outcome.code, outcome.verified, outcome.simulations) == (code, False, 0)
+        assert outcome.plan == ("plan", 0, 0)
+        assert outcome.message.startswith("not verified") and ("allow_unverified" in outcome.message) != allow
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_what_cannot_be_simulated():
 )
 def test_bad_requests(request_, code):
     with pytest.raises(MagicError) as error:
-        check(request_, True)
+        check(request_)
     assert error.value.code == code
 
 

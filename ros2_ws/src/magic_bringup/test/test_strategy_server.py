@@ -314,7 +314,6 @@ def test_goals_carry_what_the_servers_need(bench):
         ({"variant": "legs"}, Code.UNKNOWN_VARIANT, ("legs", "fg", "arm")),
         ({"timeout": -1.0}, Code.BAD_REQUEST, ("-1",)),
         ({"tool_id": "object_2"}, Code.BAD_REQUEST, ("object_2",)),
-        ({"strategy": "dynamic"}, Code.NOT_VERIFIABLE, ("dynamic", "allow_unverified")),
     ],
 )
 def test_bad_goals_are_answered_before_any_work(bench, goal, code, says):
@@ -324,9 +323,13 @@ def test_bad_goals_are_answered_before_any_work(bench, goal, code, says):
     assert not bench.fakes.goals
 
 
-def test_an_unverifiable_motion_is_returned_but_not_published(bench):
-    result, _ = bench.run(strategy="dynamic", allow_unverified=True)
-    assert (result.code, result.verified, result.simulations) == (0, False, 0), result.message
+@pytest.mark.parametrize(
+    "allow, code, status",
+    [(False, Code.NOT_VERIFIABLE, GoalStatus.STATUS_ABORTED), (True, Code.OK, GoalStatus.STATUS_SUCCEEDED)],
+)
+def test_an_unverifiable_motion_is_returned_but_not_published(bench, allow, code, status):
+    result, ended = bench.run(strategy="dynamic", allow_unverified=allow)
+    assert (result.code, result.verified, result.simulations, ended) == (code, False, 0, status), result.message
     assert len(result.plan.tool_trajectory.points) == 2
     # A verified run afterwards proves that the channel works and that nothing came before it.
     bench.run()
