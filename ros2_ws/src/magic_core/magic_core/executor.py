@@ -5,11 +5,11 @@ from __future__ import annotations
 import concurrent.futures
 import threading
 import traceback
-from typing import Any
 
 from rclpy.context import Context
 from rclpy.executors import ConditionReachedException, Executor, ExternalShutdownException, ShutdownException, TimeoutException
 from rclpy.logging import get_logger
+from rclpy.task import Task
 
 
 class ThreadedExecutor(Executor):
@@ -25,23 +25,31 @@ class ThreadedExecutor(Executor):
     def __init__(self, threads: int, *, context: Context | None = None) -> None:
         super().__init__(context=context)
         self._pool = concurrent.futures.ThreadPoolExecutor(threads, thread_name_prefix="callback")
-        self._begun: set[concurrent.futures.Future[None]] = set()
+        self._handed: dict[concurrent.futures.Future[None], Task] = {}  # over to the threads, and not done yet
+        self._taking = threading.Lock()  # held while callbacks are waited for: what is waited on must not be destroyed meanwhile
         self._closed = False
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for one callback, and until a thread has begun it; each at most ``timeout_sec``, s."""
-        try:
-            callback, _, _ = self.wait_for_ready_callbacks(timeout_sec=timeout_sec)
-        except (TimeoutException, ConditionReachedException, ShutdownException, ExternalShutdownException):
-            return
         begun = threading.Event()
-        future = self._pool.submit(self._work, callback, begun)
-        self._begun.add(future)
-        future.add_done_callback(self._begun.discard)
+        with self._taking:
+            if self._closed:
+                return
+            try:
+                callback, _, _ = self.wait_for_ready_callbacks(timeout_sec=timeout_sec, condition=self._is_closed)
+            except (TimeoutException, ConditionReachedException, ShutdownException, ExternalShutdownException):
+                return
+            future = self._pool.submit(self._work, callback, begun)
+            self._handed[future] = callback
+        future.add_done_callback(self._handed.pop)
+        future.add_done_callback(lambda _: begun.set())  # also where the shutdown cancels it
         # Where no thread is free by then, the callback comes once more, which does no harm: it is only done once.
         begun.wait(timeout_sec)
 
-    def _work(self, callback: Any, begun: threading.Event) -> None:
+    def _is_closed(self) -> bool:
+        return self._closed
+
+    def _work(self, callback: Task, begun: threading.Event) -> None:
         begun.set()
         callback()
         error = callback.exception() if callback.done() else None
@@ -51,6 +59,12 @@ class ThreadedExecutor(Executor):
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Take nothing more, and wait for the callbacks at work; false where some have not ended in ``timeout_sec``, s."""
         self._closed = True
-        super().shutdown(timeout_sec)
+        self.wake()
+        with self._taking:
+            super().shutdown(timeout_sec)
+            handed = dict(self._handed)
         self._pool.shutdown(wait=False, cancel_futures=True)
-        return not concurrent.futures.wait(set(self._begun), timeout_sec).not_done
+        for future, callback in handed.items():
+            if future.cancelled():
+                callback.cancel()
+        return not concurrent.futures.wait([f for f in handed if not f.cancelled()], timeout_sec).not_done

@@ -1,12 +1,12 @@
 """The executor with threads: what it costs, what it survives, and how it ends."""
 
+import contextlib
 import os
 import threading
-import time
 
 import pytest
 import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 
 from magic_core.executor import ThreadedExecutor
@@ -49,21 +49,29 @@ def timer(bench, callback, period=0.001):
     return bench.node.create_timer(period, callback, callback_group=bench.group)
 
 
-@pytest.mark.parametrize("bench", [1], indirect=True)
-def test_waiting_for_a_free_thread_costs_nothing(bench):
-    begun = threading.Event()
+@pytest.mark.parametrize("bench", [3], indirect=True)
+def test_a_callback_is_handed_over_once(bench, monkeypatch):
+    """rclpy's own executor hands it over again and again until a thread has begun it: tens of times beside a computation."""
+    handed, done = [], []
+    enough = threading.Event()
+    submit = bench.executor._pool.submit
+    monkeypatch.setattr(bench.executor._pool, "submit", lambda *a: handed.append(a) or submit(*a))
 
-    def work():
-        begun.set()
-        bench.release.wait(DEADLINE)
+    def compute():
+        while not bench.release.is_set():  # holds Python's lock as long as it may
+            sum(range(1000))
 
-    timer(bench, work)  # holds the only thread
-    timer(bench, lambda: None)  # would like to have it
+    def tick():
+        done.append(None)
+        if len(done) == 100:
+            enough.set()
+
+    bench.node.create_timer(0.001, compute, callback_group=MutuallyExclusiveCallbackGroup())
+    for _ in range(2):
+        bench.node.create_timer(0.005, tick, callback_group=MutuallyExclusiveCallbackGroup())
     bench.start()
-    assert begun.wait(DEADLINE)
-    before = time.process_time()
-    bench.release.wait(1.0)  # nobody sets it: a second passes
-    assert time.process_time() - before < 0.3  # rclpy's own executor takes all of the second
+    assert enough.wait(DEADLINE)
+    assert len(handed) < 1.2 * len(done) + 10
 
 
 def test_callbacks_run_side_by_side(bench):
@@ -72,13 +80,15 @@ def test_callbacks_run_side_by_side(bench):
 
     def meet():
         if not met.is_set():
-            meeting.wait(DEADLINE)
-            met.set()
+            with contextlib.suppress(threading.BrokenBarrierError):
+                meeting.wait(DEADLINE)
+                met.set()
 
     timer(bench, meet)
     timer(bench, meet)
     bench.start()
     assert met.wait(DEADLINE)
+    meeting.abort()  # for a third call that came in between
 
 
 def test_an_exception_out_of_a_callback_ends_nothing_else(bench, capfd):
@@ -87,13 +97,14 @@ def test_an_exception_out_of_a_callback_ends_nothing_else(bench, capfd):
 
     def faulty():
         calls.append(None)
-        if len(calls) > 2:
+        if len(calls) > 20:
             went_on.set()
         raise ValueError("a defect")
 
     timer(bench, faulty)
     bench.start()
     assert went_on.wait(DEADLINE)
+    bench.close()  # now all is said
     assert "ValueError: a defect" in capfd.readouterr().err
 
 
@@ -112,3 +123,24 @@ def test_shutdown_waits_for_the_callbacks_at_work(bench):
     bench.release.set()
     assert bench.executor.shutdown(DEADLINE)
     assert ended.is_set()
+
+
+@pytest.mark.parametrize("bench", [1], indirect=True)
+def test_shutdown_ends_the_spinning_where_all_threads_are_taken(bench):
+    begun = threading.Event()
+
+    def work():
+        begun.set()
+        bench.release.wait(DEADLINE)
+
+    for _ in range(2):
+        timer(bench, work)
+    bench.start()
+    assert begun.wait(DEADLINE)
+    for _ in range(200):  # until the other one waits for the thread
+        if bench.executor._pool._work_queue.qsize():
+            break
+        bench.release.wait(0.01)
+    assert not bench.executor.shutdown(0.1)
+    bench._thread.join(2.0)
+    assert not bench._thread.is_alive()

@@ -74,11 +74,12 @@ def test_what_a_node_has_begun_is_wound_down_while_it_still_spins(start, number)
             self.ticks = 0
             self.create_timer(0.05, self.tick)
             self.before = None
-            print("up")
         """,
         """
         def tick(self):
             self.ticks += 1
+            if self.ticks == 1:
+                print("up")
 
         def wind_down(self):
             if self.before is None:
@@ -103,7 +104,7 @@ def test_what_a_node_has_begun_is_wound_down_while_it_still_spins(start, number)
 def test_a_node_that_cannot_wind_down_ends_all_the_same(start):
     process = start(
         """
-            print("up")
+            self.create_timer(0.05, lambda: print("up"))
         """,
         """
         def wind_down(self):
