@@ -289,7 +289,10 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
         events: list[tuple[float, object, tuple]] = []
         first = None
         seen = np.concatenate(
-            [np.linspace(0, REST, LYING_FRAMES + 1)[:-1] / POSE_PERIOD, np.linspace(begin / POSE_PERIOD, len(poses) - 1, DEMONSTRATION_FRAMES)]
+            [
+                np.linspace(0, REST, LYING_FRAMES + 1)[:-1] / POSE_PERIOD,
+                np.linspace(begin / POSE_PERIOD, len(poses) - 1, DEMONSTRATION_FRAMES),
+            ]
         )
         for index, k in enumerate(seen.round().astype(int)):
             t, tool_pose, target_pose = poses[k]
