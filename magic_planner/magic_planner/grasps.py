@@ -48,7 +48,7 @@ class GraspSettings:
     angles: int = 16
     clearance: float = 0.0015
     margin: float = 0.003
-    away: float = 0.035
+    away: float = 0.025
     force: float = 5.0
     density: float = 600.0
     grip_force: float = 60.0

@@ -77,7 +77,7 @@ class PlannerNode(Node):
             clearance=parameter(self, "grasp.clearance", 0.0015, "Metres between hand and table.", low=0.0, high=0.1),
             grip_force=parameter(self, "grasp.grip_force", 60.0, "Newtons of each finger, for the ranking by slip.", low=1.0, high=1000.0),
             friction=parameter(self, "grasp.friction", 0.6, "Friction between pad and tool, for the ranking by slip.", low=0.05, high=3.0),
-            away=parameter(self, "grasp.away", 0.035, "Metres around the contact in which no finger is placed.", low=0.0, high=1.0),
+            away=parameter(self, "grasp.away", 0.025, "Metres around the contact in which no finger is placed.", low=0.0, high=1.0),
         )
         settings = ArmSettings(
             standoff=parameter(self, "standoff", 0.08, "Metres of straight way to the grasp.", low=0.01, high=0.5),
