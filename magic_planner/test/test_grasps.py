@@ -90,7 +90,9 @@ def test_a_hand_stays_above_the_table_and_out_of_the_tool(arm):
     for grasp in grasps:
         low = transforms.apply(tool.world_from_object @ grasp.tool_from_tcp, corners)[:, 2].min()
         assert low > 0.0014
-        assert np.linalg.norm(grasp.tool_from_tcp[:3, 3] - tool_contact.object_from_contact[:3, 3]) > 0.025
+        # Where the pads' middle is moved over what they touch the hand may come a little nearer.
+        away = np.linalg.norm(grasp.tool_from_tcp[:3, 3] - tool_contact.object_from_contact[:3, 3])
+        assert away > GraspSettings().away - 0.01
     free = list(itertools.islice(collision_free(arm.robot, grasps, tool, [], {}, Budget()), 20))
     hand, held = arm.robot.hand_body(), Body("tool", tool.pieces)
     assert free
