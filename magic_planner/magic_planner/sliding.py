@@ -9,6 +9,7 @@ keeps its attitude: the target is met further out on the same surface.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,12 +52,17 @@ def slid_contacts(
     there; where no slide does, it keeps the one of the pose before.
     """
     frames = np.repeat(tool_from_contact[None], len(world_from_contact), axis=0)
-    search = _Search(tool, tool_from_contact, world_from_contact, obstacles, plane, clearance, gap)
-    if search.clear.all():
+    poses = world_from_contact @ transforms.inverse(tool_from_contact)
+    pieces = solid_pieces(tool)
+    body, walls = Body(tool.id, grown(pieces, gap) if gap > GAP else pieces), [Body.from_object(item) for item in obstacles]
+    heights = lowest(plane, poses, outer_points(tool)) - clearance
+    clear = (heights >= 0) & ~hits(poses, body, walls)
+    search = _Search(poses, world_from_contact[:, :3, :2], heights, plane[:3], body, walls, clear)
+    if clear.all():
         return frames
     way = way_along(world_from_contact)
     sides = outline(tool, tool_from_contact)
-    first = [search.outwards(int(search.clear.argmin()), side) for side in sides]
+    first = [search.outwards(int(clear.argmin()), side) for side in sides]
     # To the side on which there is room after the shorter way; the path keeps to it.
     _, points = min(((n, side) for n, side in zip(first, sides, strict=True) if n is not None), key=lambda c: c[0], default=(0, None))
     if points is not None:
@@ -72,26 +78,21 @@ def lowest(plane: Array, world_from_tool: Array, points: Array) -> Array:
     return np.asarray((in_tool @ points.T).min(axis=1) + world_from_tool[:, :3, 3] @ plane[:3] + plane[3])
 
 
+@dataclass(frozen=True)
 class _Search:
-    """The least slide for each pose of a path."""
+    """The least slide for each pose of a path.
 
-    def __init__(
-        self,
-        tool: SceneObject,
-        tool_from_contact: Array,
-        world_from_contact: Array,
-        obstacles: Sequence[SceneObject],
-        plane: Array,
-        clearance: float,
-        gap: float,
-    ) -> None:
-        pieces = solid_pieces(tool)
-        self.poses = world_from_contact @ transforms.inverse(tool_from_contact)
-        self.axes, self.up = world_from_contact[:, :3, :2], plane[:3]
-        self.heights = lowest(plane, self.poses, outer_points(tool)) - clearance
-        self.body = Body(tool.id, grown(pieces, gap) if gap > GAP else pieces)
-        self.walls = [Body.from_object(item) for item in obstacles]
-        self.clear = (self.heights >= 0) & ~hits(self.poses, self.body, self.walls)
+    poses (T, 4, 4) of the tool with the contact at its own place, axes (T, 3, 2): the contact's normal and tangent, heights (T,): of
+    the tool's lowest point above where it may be, up (3,): the table's normal; clear (T,): whether there is room as it is.
+    """
+
+    poses: Array
+    axes: Array
+    heights: Array
+    up: Array
+    body: Body
+    walls: list[Body]
+    clear: NDArray[np.bool_]
 
     def least(self, points: Array) -> NDArray[np.int64]:
         """(T,) the smallest of the steps along an outline (N, 2) that fit; where none does, as many as before."""

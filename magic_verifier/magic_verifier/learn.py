@@ -9,7 +9,6 @@ motion of the tool: stamped poses of any frame that is fixed to it (a marker, a 
 from __future__ import annotations
 
 import argparse
-import importlib
 import re
 import sys
 from dataclasses import replace
@@ -27,6 +26,8 @@ from magic_core.strategy import MODES, Goal, Physics, save
 
 Array = NDArray[np.float64]
 COLOR, DEPTH, INFO = "color/image_raw", "aligned_depth_to_color/image_raw", "aligned_depth_to_color/camera_info"
+#: So many pictures of a topic are read: the first colour and the depth that goes with it are among them.
+PICTURES = 5
 #: The tool's track and the tool as it was first seen belong together if they are so near each other (m).
 NEAR = 0.10
 #: A pose that came so long (s) before or after the pictures does not tell where the tool was in them.
@@ -36,30 +37,23 @@ HIDDEN = 0.1
 
 
 class Recorded:
-    """The messages of a bag that a demonstration is read from, by topic, with their stamps of recording in seconds."""
+    """The messages of a bag that a demonstration is read from, by topic."""
 
     def __init__(self, path: Path) -> None:
-        from rclpy.serialization import deserialize_message
-
-        from magic_bringup.bag_file import open_bag, topics_of
+        from magic_bringup import bag_file, bag_messages
 
         self.path = path
-        self._messages: dict[str, list[tuple[float, Any]]] = {}
-        with open_bag(path) as reader:
-            self.topics = {topic.name: topic.type_name for topic in topics_of(reader)}
-            for connection, stamp, data in reader.messages():
-                # Of the pictures the first are enough.
-                known = self._messages.setdefault(connection.topic, [])
-                if connection.msgtype == "sensor_msgs/msg/Image" and len(known) >= 5:
-                    continue
-                package, _, kind = connection.msgtype.split("/")
-                try:
-                    message_class = getattr(importlib.import_module(f"{package}.msg"), kind)
-                except (ImportError, AttributeError):
-                    continue  # a type that is not installed here is none of those that are needed
-                known.append((stamp * 1e-9, deserialize_message(data, message_class)))
+        self.topics = {topic.name for topic in bag_file.info(path).topics}
+        self._messages: dict[str, list[Any]] = {topic: [] for topic in self.topics}
 
-    def of(self, topic: str) -> list[tuple[float, Any]]:
+        def wanted(topic: str, type_name: str) -> bool:
+            # Of the pictures the first are enough.
+            return type_name != "sensor_msgs/msg/Image" or len(self._messages[topic]) < PICTURES
+
+        for topic, _, message in bag_messages.messages(path, wanted):
+            self._messages[topic].append(message)
+
+    def of(self, topic: str) -> list[Any]:
         """The messages of a topic; NO_FRAMES where there are none."""
         found = self._messages.get(topic, [])
         if not found:
@@ -68,16 +62,17 @@ class Recorded:
 
     def transforms(self) -> tuple[Any, list[float]]:
         """All of /tf and /tf_static in a buffer, and the stamps (s) of what moves."""
+        from magic_core.conversions import time_from_msg
         from magic_perception.conversions import remember_transform
         from magic_perception.tf import TransformBuffer
 
         buffer, stamps = TransformBuffer(memory=float("inf")), []
         for topic in ("/tf_static", "/tf"):
-            for _, message in self._messages.get(topic, []):
+            for message in self._messages.get(topic, []):
                 for transform in message.transforms:
                     remember_transform(buffer, transform, topic == "/tf_static")
                     if topic == "/tf":
-                        stamps.append(transform.header.stamp.sec + 1e-9 * transform.header.stamp.nanosec)
+                        stamps.append(time_from_msg(transform.header.stamp))
         return buffer, sorted(set(stamps))
 
 
@@ -91,10 +86,10 @@ def frames_of(bag: Recorded, world: str) -> list[RgbdFrame]:
         raise MagicError(Code.NO_FRAMES, f"cameras in {bag.path}", sorted(bag.topics), f"topics .../{COLOR} and .../{DEPTH}")
     frames = []
     for camera in cameras:
-        _, color = bag.of(f"{camera}/{COLOR}")[0]
+        color = bag.of(f"{camera}/{COLOR}")[0]
         stamp = conversions.time_from_msg(color.header.stamp)
-        depth = min((m for _, m in bag.of(f"{camera}/{DEPTH}")), key=lambda m: abs(conversions.time_from_msg(m.header.stamp) - stamp))
-        _, info = bag.of(f"{camera}/{INFO}")[0]
+        depth = min(bag.of(f"{camera}/{DEPTH}"), key=lambda m: abs(conversions.time_from_msg(m.header.stamp) - stamp))
+        info = bag.of(f"{camera}/{INFO}")[0]
         frames.append(
             RgbdFrame(
                 conversions.color_from_msg(color),
@@ -116,7 +111,7 @@ def track_of(bag: Recorded, world: str, topic: str, frame: str) -> tuple[Array, 
     if frame:
         stamps, poses = _where_known(buffer, world, frame, stamps)
     else:
-        messages = [m for _, m in bag.of(topic)]
+        messages = bag.of(topic)
         stamps = [conversions.time_from_msg(m.header.stamp) for m in messages]
         poses = [conversions.pose_from_msg(m.pose) for m in messages]
         away = {m.header.frame_id for m in messages} - {world}
@@ -219,7 +214,7 @@ def _learn(given: argparse.Namespace) -> int:
         raise MagicError(Code.BAD_REQUEST, "folder of the new strategy", str(given.out), "a new or an empty folder")
     bag = Recorded(given.bag)
     frames = frames_of(bag, given.world)
-    known = conversions.scene_from_msg(bag.of("/known_objects")[-1][1]).objects if "/known_objects" in bag.topics else ()
+    known = conversions.scene_from_msg(bag.of("/known_objects")[-1]).objects if "/known_objects" in bag.topics else ()
     scene = perceive(frames, tuple(known))
     print(f"objects: {', '.join(item.id for item in scene.objects)}")
     times, poses = track_of(bag, given.world, given.tool_pose, given.tool_frame)

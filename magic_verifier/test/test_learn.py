@@ -85,7 +85,7 @@ def test_a_strategy_that_is_there_is_not_written_over(learned, capsys):
 
 def pose_message(stamp, frame, pose):
     header = conversions.header(frame, stamp)
-    return stamp, SimpleNamespace(header=header, pose=conversions.pose_to_msg(pose))
+    return SimpleNamespace(header=header, pose=conversions.pose_to_msg(pose))
 
 
 class FakeBag:

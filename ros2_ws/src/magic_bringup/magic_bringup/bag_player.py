@@ -21,6 +21,7 @@ from rosgraph_msgs.msg import Clock
 
 from magic_bringup import bag_qos
 from magic_bringup.bag_file import open_bag, topics_of
+from magic_bringup.bag_messages import message_class
 from magic_core.errors import Code, MagicError
 
 #: After the last message: how long reliable subscribers have to acknowledge, s.
@@ -52,17 +53,6 @@ class PlayOptions:
         for name in ("clock_hz", "start_offset", "duration", "delay"):
             if not getattr(self, name) >= 0:
                 raise MagicError(Code.BAD_REQUEST, name, getattr(self, name), "0 or more")
-
-
-def message_class(type_name: str) -> Any | None:
-    """The Python class of a message type such as ``sensor_msgs/msg/Image``, None where it is not installed."""
-    import importlib
-
-    package, _, kind = type_name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)
-    except (ImportError, AttributeError, ValueError):
-        return None
 
 
 class Player:

@@ -21,7 +21,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from magic_bringup import bag_qos
 from magic_bringup.bag_file import BagWriter
-from magic_bringup.bag_player import interrupt, message_class
+from magic_bringup.bag_messages import message_class
+from magic_bringup.bag_player import interrupt
 from magic_core.errors import Code, MagicError
 
 #: How often the graph is asked for new topics, s (``ros2 bag record`` does the same).

@@ -112,19 +112,15 @@ def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
 
 def first_images(bag: Path) -> dict[str, Any]:
     """The first image of each camera topic of a bag, as messages: what the report shows.  Raises BAD_BAG."""
-    from rclpy.serialization import deserialize_message
-    from sensor_msgs.msg import Image
+    from magic_bringup import bag_messages
 
-    from magic_bringup import bag_file
-
+    missing = {topic for topic in look_into(bag)[0] if topic.endswith("/image_raw")}
     found: dict[str, Any] = {}
-    with bag_file.open_bag(bag) as reader:
-        connections = [c for c in reader.connections if c.msgcount and c.topic.endswith("/image_raw") and CAMERA_TOPIC.match(c.topic)]
-        for connection, _, data in reader.messages(connections) if connections else ():
-            if connection.topic not in found:
-                found[connection.topic] = deserialize_message(bytes(data), Image)
-            if len(found) == len(connections):
-                break
+    for topic, _, message in bag_messages.messages(bag, lambda topic, _: topic in missing) if missing else ():
+        found[topic] = message
+        missing.remove(topic)
+        if not missing:
+            break
     return found
 
 

@@ -15,10 +15,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 
-from magic_bringup import bag_file
-from magic_bringup.bag_player import message_class
+from magic_bringup import bag_messages
 from magic_bringup.demo import Options, Watcher, look_into
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph
@@ -130,13 +128,8 @@ def started(
 def first_messages(bag: Path) -> dict[str, Any]:
     """The first message of every topic of a bag, decoded."""
     found: dict[str, Any] = {}
-    with bag_file.open_bag(bag) as reader:
-        count = len({c.topic for c in reader.connections if c.msgcount})
-        for connection, _, data in reader.messages():
-            if connection.topic not in found:
-                found[connection.topic] = deserialize_message(bytes(data), message_class(connection.msgtype))
-            if len(found) == count:
-                break
+    for topic, _, message in bag_messages.messages(bag, lambda topic, _: topic not in found):
+        found[topic] = message
     return found
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
+from magic_bringup import bag_messages
 from magic_bringup.bag_file import info as read_info
-from magic_bringup.bag_file import open_bag
 from magic_core import conversions as convert
 from magic_core import transforms
 from magic_core.shapes import make
@@ -41,19 +41,11 @@ def recorder() -> ModuleType:
     return module
 
 
-def message_class(name: str) -> type:
-    package, _, kind = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), kind)
-
-
 def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """(stamp in ns, message) by topic."""
-    from rclpy.serialization import deserialize_message
-
     result = defaultdict(list)
-    with open_bag(path) as reader:
-        for connection, stamp, data in reader.messages():
-            result[connection.topic].append((stamp, deserialize_message(data, message_class(connection.msgtype))))
+    for topic, stamp, message in bag_messages.messages(path):
+        result[topic].append((stamp, message))
     return result
 
 
