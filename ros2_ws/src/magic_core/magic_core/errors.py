@@ -71,6 +71,7 @@ class Code(IntEnum):
     BAD_SCENE = 408
     LIMIT_EXCEEDED = 409
     UNKNOWN_GOAL = 410
+    NOT_SURE_ENOUGH = 411
 
     # Execution
     SERVER_UNAVAILABLE = 500
