@@ -1,10 +1,10 @@
-"""Messages that only perception knows: transforms, markers, diagnostics.  Everything else is in :mod:`magic_core.conversions`."""
+"""Messages that only perception knows: markers, diagnostics.  Everything else is in :mod:`magic_core.conversions`."""
 
 from __future__ import annotations
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, TransformStamped, Vector3
+from geometry_msgs.msg import Point, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -12,15 +12,9 @@ from magic_core import conversions as cv
 from magic_core import transforms
 from magic_core.errors import Code
 from magic_core.scene import Scene
-from magic_perception.tf import TransformBuffer
 
 #: Distinct colours for objects, RGB 0..1.
 PALETTE = ((0.90, 0.35, 0.25), (0.25, 0.60, 0.90), (0.30, 0.75, 0.35), (0.95, 0.75, 0.20), (0.65, 0.40, 0.85), (0.25, 0.80, 0.80))
-
-
-def remember_transform(buffer: TransformBuffer, msg: TransformStamped, static: bool) -> None:
-    """Put one TransformStamped into the buffer; raises BAD_REQUEST or NO_TRANSFORM for what is not one."""
-    buffer.set(msg.header.frame_id, msg.child_frame_id, cv.transform_from_msg(msg.transform), cv.time_from_msg(msg.header.stamp), static)
 
 
 def markers(scene: Scene) -> MarkerArray:

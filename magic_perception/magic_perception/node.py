@@ -24,6 +24,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene, SceneObject
+from magic_core.tf import TransformBuffer
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception.averaging import average
@@ -32,7 +33,6 @@ from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
 from magic_perception.segmentation import SEGMENTERS, make_segmenter
 from magic_perception.stream import Pair, Stream
-from magic_perception.tf import TransformBuffer
 from magic_perception.tracking import Tracker
 
 
@@ -244,7 +244,7 @@ class Perception(Node):
         with self.lock:
             for transform in msg.transforms:  # type: ignore[attr-defined]
                 try:
-                    pc.remember_transform(self.buffer, transform, static)
+                    cv.remember_transform(self.buffer, transform, static)
                 except Exception as error:
                     self.get_logger().warning(f"transform left out: {describe(self, error)[1]}", throttle_duration_sec=5.0)
 

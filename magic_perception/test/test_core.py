@@ -13,6 +13,7 @@ from magic_core import shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_core.tf import TransformBuffer
 from magic_perception import clusters, polygons, primitives
 from magic_perception.averaging import average
 from magic_perception.parameters import Parameters
@@ -22,7 +23,6 @@ from magic_perception.registration import register_depth
 from magic_perception.segmentation import make_segmenter
 from magic_perception.stream import Stream
 from magic_perception.table import camera_over_table, fit_plane
-from magic_perception.tf import TransformBuffer
 from magic_perception.tracking import Tracker
 
 

@@ -62,9 +62,8 @@ class Recorded:
 
     def transforms(self) -> tuple[Any, list[float]]:
         """All of /tf and /tf_static in a buffer, and the stamps (s) of what moves."""
-        from magic_core.conversions import time_from_msg
-        from magic_perception.conversions import remember_transform
-        from magic_perception.tf import TransformBuffer
+        from magic_core.conversions import remember_transform, time_from_msg
+        from magic_core.tf import TransformBuffer
 
         buffer, stamps = TransformBuffer(memory=float("inf")), []
         for topic in ("/tf_static", "/tf"):

@@ -94,7 +94,7 @@ class FakeBag:
     path = Path("fake")
 
     def __init__(self):
-        from magic_perception.tf import TransformBuffer
+        from magic_core.tf import TransformBuffer
 
         self.buffer = TransformBuffer(memory=float("inf"))
         self.world_from_camera = transforms.from_rpy(0.1, 0.2, 0.3, [1, 2, 3])

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
-from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh as MeshMsg
@@ -30,6 +30,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.tf import TransformBuffer
 from magic_interfaces import msg as mi
 
 # ---------------------------------------------------------------- time and header
@@ -84,6 +85,11 @@ def transform_from_msg(msg: Transform) -> NDArray[np.float64]:
     """Transform to 4x4 transform."""
     t, q = msg.translation, msg.rotation
     return _transform([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+
+
+def remember_transform(buffer: TransformBuffer, msg: TransformStamped, static: bool) -> None:
+    """Put one TransformStamped into the buffer; raises BAD_REQUEST or NO_TRANSFORM for what is not one."""
+    buffer.set(msg.header.frame_id, msg.child_frame_id, transform_from_msg(msg.transform), time_from_msg(msg.header.stamp), static)
 
 
 def _transform(translation: list[float], xyzw: list[float]) -> NDArray[np.float64]:
