@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
-from magic_verifier.robot_pictures import shape_mesh
+from magic_core.robot_pictures import shape_mesh
 from magic_verifier.simulation import World, from_pose
 
 ARM = "arm"

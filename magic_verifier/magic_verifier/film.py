@@ -11,10 +11,10 @@ from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh, concatenate
 from magic_core.rendering import Raycaster, shade
 from magic_core.robot import Description
+from magic_core.robot_pictures import RobotPictures
 from magic_core.scene import SceneObject
 from magic_verifier.articulation import panda
 from magic_verifier.floating import TARGET, TOOL
-from magic_verifier.robot_pictures import RobotPictures
 from magic_verifier.verification import Recording
 
 TOOL_COLOR = (222, 150, 62)

@@ -1,4 +1,4 @@
-"""Pictures of an arm: the visual shapes of its links, and COLLADA files of them."""
+"""Meshes of an arm's links where its joints put them, from visual and collision shapes, and COLLADA files of them."""
 
 from __future__ import annotations
 
@@ -25,16 +25,18 @@ class RobotPictures:
 
     def __init__(self, robot: Description) -> None:
         self._robot = robot
-        self._meshes = {link: _link_mesh(robot, link) for link in robot.links}
+        self._meshes = {link: link_mesh(robot, link) for link in robot.links}
 
-    def at(self, joints: NDArray[np.float64]) -> list[Mesh]:
-        """The meshes in world coordinates for (J + 2,): the arm's joints, then the fingers."""
+    def at(self, joints: NDArray[np.float64], world_from_base: NDArray[np.float64] | None = None) -> list[Mesh]:
+        """The meshes in world coordinates for (J + 2,): the arm's joints, then the fingers; the base stands in the world's origin by default."""
         poses = self._robot.poses(self._robot.arm_positions(joints))
-        return [mesh.transformed(poses[link]) for link, mesh in self._meshes.items() if mesh is not None]
+        base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
+        return [mesh.transformed(base @ poses[link]) for link, mesh in self._meshes.items() if mesh is not None]
 
 
-def _link_mesh(robot: Description, link: str) -> Mesh | None:
-    for what in ("visual", "collision"):
+def link_mesh(robot: Description, link: str, kinds: Sequence[str] = ("visual", "collision")) -> Mesh | None:
+    """The shapes of the first of ``kinds`` that a link has and that can be read, as one mesh in the link's frame; ``None``: it has none."""
+    for what in kinds:
         try:
             parts = [shape_mesh(shape) for shape in robot.shapes(link, what)]
         except MagicError:  # a picture in another format, or a file that is not installed

@@ -1,0 +1,183 @@
+"""The robot in a camera's picture: which pixels show it, and so say nothing of what is behind.
+
+From the URDF and the joints' positions follows where every link is; rays through the pixels on which a link can fall tell at
+which depth it begins.  The collision shapes are what is drawn: planning holds them to be the robot, they come with every
+description that can plan, and they enclose what is seen (the Panda's visual meshes stick out of them by 1 mm at most).  A link
+without collision shapes is drawn by its visual ones.
+
+What is drawn is widened before it is compared with a picture:
+
+edge    The stereo window of a depth camera sees both sides of an edge, so that pixels beside it take a depth of either, or of
+        something between: some pixels, wherever the edge is.
+space   Camera and base are calibrated to some millimetres, and shapes are not exact: metres, hence more pixels the nearer.
+time    A moving arm is elsewhere by the time that the stamps of picture and joint state may differ by: all positions that are
+        possible are drawn, and their union is cut.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.mesh import Mesh
+from magic_core.robot import Description
+from magic_core.robot_pictures import link_mesh
+
+#: Rays start here, metres: what encloses the lens (a wrist camera's own housing) is not in its picture.
+NEAR = 0.05
+#: Rays go through every so many pixels.
+STEP = 2
+#: Standard deviation of the depth, metres at one metre, growing with its square (a D435: magic_core.sensor).
+NOISE = 0.0042
+#: A robot that is drawn but looked through: depth farther than this behind its front, metres, in more than this share of at least so many pixels.
+BEHIND, SHARE, PIXELS = 0.15, 0.5, 300
+#: Drawn pictures kept: some cameras, some frames each.
+KEPT = 12
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How much wider than drawn the robot is cut: ``edge`` in pixels, ``space`` in metres (see the module)."""
+
+    edge: int = 4
+    space: float = 0.010
+
+
+@dataclass(frozen=True)
+class Cut:
+    """The robot in one picture.
+
+    robot (H, W) bool: what is seen there is the robot, or may be.  It is no object, and nothing is known of what it hides.
+    drawn (H, W) float32: where its front was expected, metres, NaN where it is not, without margins.
+    through: share of the pixels well inside what was drawn at which depth lies far behind it; NaN where too few have depth.
+    """
+
+    robot: NDArray[np.bool_]
+    drawn: NDArray[np.float32]
+    through: float
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the camera looks through where the robot was expected: it is not there."""
+        return self.through > SHARE
+
+
+@dataclass(frozen=True)
+class _Link:
+    """The shapes of one link, in its frame: vertices (V, 3) and Open3D's scene of rays."""
+
+    vertices: NDArray[np.float64]
+    scene: object
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Depths at every ``STEP``-th pixel, metres, inf where the robot is not: as drawn, and widened by the margins."""
+
+    front: NDArray[np.float32]
+    widened: NDArray[np.float32]
+
+
+class SelfFilter:
+    """Cuts a robot out of the pictures of any camera; the last drawings are kept, so that an arm at rest is drawn once for each camera."""
+
+    def __init__(self, robot: Description, margins: Margins | None = None) -> None:
+        import open3d as o3d
+
+        self.robot, self.margins, self._o3d = robot, margins or Margins(), o3d
+        self._links: dict[str, _Link] = {}
+        for name in robot.links:
+            mesh = link_mesh(robot, name, ("collision", "visual"))
+            if mesh is not None and len(mesh.faces):
+                self._links[name] = _Link(np.unique(mesh.vertices, axis=0), self._scene(mesh))
+        self._kept: OrderedDict[tuple, _Drawing] = OrderedDict()
+
+    def _scene(self, mesh: Mesh) -> object:
+        scene = self._o3d.t.geometry.RaycastingScene()
+        tensor = self._o3d.core.Tensor
+        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+        return scene
+
+    def cut(self, frame: RgbdFrame, positions: Sequence[Mapping[str, float]], world_from_base: NDArray[np.float64] | None = None) -> Cut:
+        """Where the robot is in a frame.
+
+        positions: all that the joints' positions (rad, m, by name) may have been when it was taken; joints not named are at zero.
+        world_from_base: the pose of the URDF's root in the frame's world.
+        """
+        base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
+        drawing = self._drawing(frame.intrinsics, transforms.inverse(frame.world_from_camera) @ base, positions)
+        size = (frame.intrinsics.width, frame.intrinsics.height)
+        widened = _enlarged(drawing.widened, size)
+        front = _enlarged(drawing.front, size)
+        depth = frame.depth
+        tolerance = self.margins.space + 3 * NOISE * np.minimum(widened, 5.0) ** 2
+        drawn = np.isfinite(front)
+        with np.errstate(invalid="ignore"):
+            # What is measured before the robot hides it.  All else in the widened outline is the robot, its smear, or cannot be told from it.
+            robot = np.isfinite(widened) & ~(depth < widened - tolerance)
+            inner = cv2.erode(drawn.view(np.uint8), np.ones((2 * self.margins.edge + 1,) * 2, np.uint8)).view(bool) & np.isfinite(depth)
+            count = np.count_nonzero(inner)
+            through = np.count_nonzero(inner & (depth > front + BEHIND)) / count if count >= PIXELS else float("nan")
+        return Cut(robot, np.where(drawn, front, np.float32(np.nan)), through)
+
+    def _drawing(self, intrinsics: Intrinsics, camera_from_base: NDArray[np.float64], positions: Sequence[Mapping[str, float]]) -> _Drawing:
+        # A ten-thousandth of a radian or of a metre moves nothing by a pixel.
+        states = tuple(sorted({tuple(sorted((name, round(float(q), 4)) for name, q in state.items())) for state in positions}))
+        key = (intrinsics, camera_from_base.round(5).tobytes(), states)
+        found = self._kept.pop(key, None)
+        if found is None:
+            shape = (-(-intrinsics.height // STEP), -(-intrinsics.width // STEP))
+            found = _Drawing(np.full(shape, np.inf, np.float32), np.full(shape, np.inf, np.float32))
+            for state in states:
+                poses = self.robot.poses(dict(state))
+                for name, link in self._links.items():
+                    self._draw(link, camera_from_base @ poses[name], intrinsics, found)
+        self._kept[key] = found
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return found
+
+    def _draw(self, link: _Link, camera_from_link: NDArray[np.float64], k: Intrinsics, drawing: _Drawing) -> None:
+        """Draw one link into a drawing, in the window on which it can fall."""
+        corners = transforms.apply(camera_from_link, link.vertices)
+        nearest, farthest = corners[:, 2].min(), corners[:, 2].max()
+        if farthest <= NEAR:
+            return
+        height, width = drawing.front.shape
+        nearest = max(float(nearest), NEAR)
+        pad = -(-(self.margins.edge + int(np.ceil(max(k.fx, k.fy) * self.margins.space / nearest))) // STEP)
+        if corners[:, 2].min() <= NEAR:
+            c0, c1, r0, r1 = 0, width, 0, height
+        else:
+            low, high = (edge(k.project(corners), axis=0) / STEP for edge in (np.min, np.max))
+            c0, r0 = (max(int(np.floor(x)) - pad - 1, 0) for x in low)
+            c1, r1 = (min(int(np.ceil(x)) + pad + 2, most) for x, most in zip(high, (width, height), strict=True))
+        if c0 >= c1 or r0 >= r1:
+            return
+        # The middle of each block of pixels; rays are one long in depth, so that their length to the hit is the depth.
+        u, v = ((np.arange(*span) + 0.5) * STEP - 0.5 for span in ((c0, c1), (r0, r1)))
+        link_from_camera = transforms.inverse(camera_from_link)
+        rays = np.empty((len(v), len(u), 6), np.float32)
+        rays[..., 3:] = (
+            ((u - k.cx) / k.fx)[None, :, None] * link_from_camera[:3, 0]
+            + ((v - k.cy) / k.fy)[:, None, None] * link_from_camera[:3, 1]
+            + link_from_camera[:3, 2]
+        )
+        rays[..., :3] = link_from_camera[:3, 3] + NEAR * rays[..., 3:]
+        depth = link.scene.cast_rays(self._o3d.core.Tensor(rays))["t_hit"].numpy() + np.float32(NEAR)  # type: ignore[attr-defined]
+        window = (slice(r0, r1), slice(c0, c1))
+        np.minimum(drawing.front[window], depth, out=drawing.front[window])
+        wide = cv2.erode(depth, np.ones((2 * pad + 1,) * 2, np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=float("inf"))
+        np.minimum(drawing.widened[window], wide, out=drawing.widened[window])
+
+
+def _enlarged(small: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Each value of a drawing (h, w) for its block of pixels: (H, W) for a picture of ``size`` (W, H)."""
+    return np.repeat(np.repeat(small, STEP, axis=0), STEP, axis=1)[: size[1], : size[0]]
