@@ -24,7 +24,7 @@ from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
-from magic_core.sensor import D435, capture, looking_at, scene_raycaster
+from magic_core.sensor import D435, STATION, capture, looking_at, scene_raycaster
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures, pose_data
 from magic_core.strategy import Strategy
@@ -44,11 +44,8 @@ PICKED_UP_FROM = {"hooking": (0.44, -0.24, 0.3), "hanging": (0.44, -0.26, 0.2), 
 LYING_FRAMES = 2
 REST, TAKE = 0.6, 3.4
 
-#: Where the cameras stand: left and right in front of the robot, looking back and down at the table.
-CAMERAS = {
-    "left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]),
-    "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04]),
-}
+#: Where the cameras stand.
+CAMERAS = STATION
 #: The hanging scene goes further up.
 HIGH_CAMERAS = {
     "left": looking_at([0.98, 0.42, 0.74], [0.50, 0.0, 0.12]),

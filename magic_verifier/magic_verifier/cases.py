@@ -28,6 +28,18 @@ HOOKS = (("scissors", 1), ("hanger", 1), ("caliper", 1), ("watch", 1))
 BALLS = (0.015, 0.035, 0.045)
 CYLINDERS = (0.015, 0.020, 0.025, 0.030, 0.035)
 MUGS = 134
+#: Families that the unseen tools of a task are drawn from, in turn, with seeds from ``UNSEEN_SEEDS`` up: nothing was ever set by them.
+UNSEEN = {
+    "scooping": ("spoon", "ladle", "measuring_cup"),
+    "hanging": ("mug", "mug", "mug", "hanger", "s_hook", "j_hook"),
+    "hooking": ("caliper", "hanger", "scissors", "hammer", "j_hook", "s_hook"),
+}
+UNSEEN_SEEDS = 50_000
+#: Unseen cases that there are for a seed of the evaluation.
+UNSEEN_COUNT = 60
+#: What the tools of an evaluation are taken for: ``meshes`` as they are, ``images`` as two cameras see them (:mod:`magic_verifier.captured`).
+SOURCES = ("meshes", "images")
+SETS = ("own", "unseen")
 #: Sets of targets that ``--targets`` takes by name instead of a folder: seeds of the family.
 TARGET_SETS = {"mug_tree": tuple(range(3))}
 #: How far (m) from the post of a mug tree things are hung on its first peg, at least.
@@ -61,6 +73,8 @@ class Options:
     noise: float | None = None
     strategies: str = ""
     scale: float = 1.0
+    source: str = "meshes"
+    set: str = "own"
 
 
 def tool_names(options: Options) -> list[str]:
@@ -102,6 +116,8 @@ def _meshes(folder: str, scale: float = 1.0) -> list[str]:
 
 def all_cases(options: Options) -> list[Case]:
     """All cases of an evaluation, in their order."""
+    if options.set == "unseen" and not options.objects:
+        return unseen_cases(options)
     tools, targets = tool_names(options), target_names(options)
     if options.task == "hooking" and options.variant == "fg":
         return [Case(short_name(target), tuple(tools), target) for target in targets]
@@ -110,6 +126,19 @@ def all_cases(options: Options) -> list[Case]:
         for tool in tools
         for target in targets
     ]
+
+
+def unseen_cases(options: Options) -> list[Case]:
+    """One tool and one target each: the families in turn, every object met once, the targets in turn."""
+    families, targets = UNSEEN[options.task], target_names(options)
+    first = UNSEEN_SEEDS + UNSEEN_COUNT * options.seed
+    cases = []
+    for number in range(UNSEEN_COUNT):
+        tool = f"{families[number % len(families)]}:{first + number}"
+        # So that a family meets all targets, however many there are of both.
+        target = targets[(number + number // len(families)) % len(targets)]
+        cases.append(Case(f"{tool} {short_name(target)}", (tool,), target))
+    return cases
 
 
 def short_name(name: str) -> str:

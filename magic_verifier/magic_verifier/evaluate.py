@@ -15,7 +15,7 @@ import math
 import sys
 import time
 from collections import Counter
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,28 @@ from numpy.typing import NDArray
 
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
+from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
-from magic_verifier.cases import METHODS, TARGET_SETS, TASKS, VARIANTS, Case, Options, all_cases, met_at, scene_for, short_name, tool_object
+from magic_verifier import captured
+from magic_verifier.cases import (
+    METHODS,
+    SETS,
+    SOURCES,
+    TARGET_SETS,
+    TASKS,
+    VARIANTS,
+    Case,
+    Meeting,
+    Options,
+    all_cases,
+    met_at,
+    scene_for,
+    short_name,
+    tool_object,
+)
 from magic_verifier.floating import settled
+from magic_verifier.verification import Verdict
 
 #: Sideways velocity noise of hooking in target radii, the released code's own test.
 HOOK_NOISE = 1.0
@@ -93,6 +111,58 @@ def _ready(variant: str) -> None:
     one_thread()
 
 
+@dataclass(frozen=True)
+class _Tried:
+    """One motion that was planned: with which tool, what it was, and the verdict on it."""
+
+    name: str
+    tool: SceneObject
+    plan: MotionPlan
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What a case gives the matcher, planner and verifier to work on; ``layout`` is the truth behind it, where that is another."""
+
+    tools: list[SceneObject]
+    names: list[str]
+    target: SceneObject
+    obstacles: dict[str, tuple[SceneObject, ...]]
+    table: NDArray[np.float64]
+    meeting: Meeting | None
+    layout: captured.Layout | None = None
+
+
+def _as_given(options: Options, strategy: Strategy, case: Case) -> _Problem:
+    """The meshes themselves, each tool where all tools lie."""
+    tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
+    if options.variant == "arm":
+        # The arm takes the tool as it lies by itself: a spoon set on the bottom of its bowl tips on to its handle.
+        tools = [settled(tool, TABLE, strategy.physics) for tool in tools]
+    target, obstacles, meeting = scene_for(strategy, case.target)
+    return _Problem(tools, list(case.tools), target, {tool.id: obstacles for tool in tools}, TABLE, meeting)
+
+
+def _as_seen(options: Options, strategy: Strategy, case: Case, seconds: dict[str, float], film: Path | None) -> _Problem:
+    """What two cameras see of the true objects.  Raises ``UNKNOWN_OBJECT`` where tool or target are not among it."""
+    layout = captured.lay_out(strategy, case, options.seed)
+    frames = captured.capture(layout, case, options.seed)
+    started = time.perf_counter()
+    scene = captured.perceive(layout, frames, strategy.physics)
+    seconds["perceive"] = time.perf_counter() - started
+    if film is not None:
+        film.parent.mkdir(parents=True, exist_ok=True)
+        captured.sheet(frames, scene, film.with_suffix(".scene.png"))
+    tools, target = captured.pair(layout, scene)
+    seen = [(tool, name) for tool, name in zip(tools, case.tools, strict=True) if tool is not None]
+    if not seen or target is None:
+        what = "the target" if target is None else "a tool"
+        raise MagicError(Code.UNKNOWN_OBJECT, f"reconstruction of {what}", [o.id for o in scene.objects], "one where it truly stands")
+    obstacles = {tool.id: tuple(o for o in scene.objects if o.id not in (tool.id, target.id)) for tool, _ in seen}
+    return _Problem([tool for tool, _ in seen], [name for _, name in seen], target, obstacles, scene.table, layout.meeting, layout)
+
+
 def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str, Any]:
     """Match, plan and verify one case; the answer is plain data for ``results.json``."""
     import torch
@@ -102,7 +172,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
 
     _ready(options.variant)
     torch.set_num_threads(1)
-    seconds = {"match": 0.0, "plan": 0.0, "verify": 0.0}
+    seconds = {"perceive": 0.0, "match": 0.0, "plan": 0.0, "verify": 0.0}
     tried: list[dict[str, Any]] = []
     answer: dict[str, Any] = {
         "object": case.name,
@@ -112,17 +182,16 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         "simulations": 0,
         "seconds": seconds,
     }
+    runs: list[_Tried] = []
+    problem = None
     try:
         strategy = _strategy(options)
-        tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
-        if options.variant == "arm":
-            # The arm takes the tool as it lies by itself: a spoon set on the bottom of its bowl tips on to its handle.
-            tools = [settled(tool, TABLE, strategy.physics) for tool in tools]
-        target, obstacles, meeting = scene_for(strategy, case.target)
+        problem = _as_seen(options, strategy, case, seconds, film) if options.source == "images" else _as_given(options, strategy, case)
+        tools, target = problem.tools, problem.target
         matcher = _matcher(options.features, options.weights, options.method)
         reference = _reference(strategy)
         matcher.prepare(reference)
-        met = met_at(meeting, target, strategy.view) if meeting is not None else None
+        met = met_at(problem.meeting, target, strategy.view) if problem.meeting is not None else None
         top_k = 1 if options.method == "no_verification" else options.top_k
         started = time.perf_counter()
         if met is None:
@@ -132,8 +201,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
             found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.radius, started)
         seconds["match"] = time.perf_counter() - started
         answer["features"] = found.features
-        by_id = {tool.id: (tool, name) for tool, name in zip(tools, case.tools, strict=True)}
-        last = None
+        by_id = {tool.id: (tool, name) for tool, name in zip(tools, problem.names, strict=True)}
         only_best = options.method == "no_verification"
         attempts = ARM_ATTEMPTS if options.variant == "arm" and not only_best else 1
         agenda = Agenda(found.candidates[: 1 if only_best else None], strategy.reflections[: 1 if only_best else None], attempts)
@@ -141,8 +209,9 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         while not answer["success"] and (following := agenda.next()) is not None:
             promise, trial = following
             tool, name = by_id[trial.candidate.tool_id]
-            entry, tested_run = _try(options, _strategy(options, name), trial, tool, target, obstacles, seconds, answer)
-            last = tested_run or last
+            entry, run = _try(options, _strategy(options, name), trial, tool, name, problem, seconds, answer)
+            if run is not None:
+                runs.append(run)
             key = trial.index, trial.reflection
             if key not in entries:
                 entries[key] = {"tool": short_name(name), "score": float(trial.candidate.score), "reflection": trial.reflection, **entry}
@@ -157,13 +226,29 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         else:
             # The reason of a failure is that of the best-scored candidate.
             answer["reason"] = "OK" if answer["success"] else tried[0]["code"]
-        if film is not None and last is not None:
-            _draw(film, last, target, obstacles)
     except MagicError as error:
         answer["reason"] = error.code.name
         tried.append({"code": error.code.name, "message": error.message})
+    if options.source == "images":
+        _judge(options, case, problem, runs, answer)
+    if film is not None and runs and problem is not None:
+        _draw(film, runs[-1], problem)
     seconds["total"] = sum(seconds.values())
     return answer
+
+
+def _judge(options: Options, case: Case, problem: _Problem | None, runs: list[_Tried], answer: dict[str, Any]) -> None:
+    """What would truly have come of the motions: of the verified one; else of each that was refused, until one succeeds."""
+    answer["true"], answer["true_success"] = [], False
+    if problem is None or problem.layout is None:
+        return
+    for run in runs[-1:] if answer["success"] else runs:
+        strategy, deadline = _strategy(options, run.name), time.monotonic() + 120.0
+        verdict = captured.judge(strategy, problem.layout, case.tools.index(run.name), run.tool, run.plan, options.seed, deadline)
+        answer["true"].append({"code": verdict.code.name, "message": verdict.message})
+        if verdict.success:
+            answer["true_success"] = True
+            return
 
 
 def _reference(strategy: Strategy) -> Any:
@@ -177,13 +262,12 @@ def _try(
     strategy: Strategy,
     trial: Any,
     tool: SceneObject,
-    target: SceneObject,
-    obstacles: tuple[SceneObject, ...],
+    name: str,
+    problem: _Problem,
     seconds: dict[str, float],
     answer: dict[str, Any],
-) -> tuple[dict[str, Any], Any]:
-    """Plan and verify one trial: what is stored of it, and, if it was simulated, its verdict and tool."""
-    from magic_core.motion import MotionPlan
+) -> tuple[dict[str, Any], _Tried | None]:
+    """Plan and verify one trial: what is stored of it, and the motion if there was one."""
     from magic_planner.budget import Budget
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
@@ -191,11 +275,12 @@ def _try(
 
     started = time.perf_counter()
     candidate, reflection = trial.candidate, trial.reflection
+    target, obstacles, table = problem.target, problem.obstacles[tool.id], problem.table
     try:
         gap = GAP_IN_HAND if options.variant == "arm" else GAP
-        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, TABLE, obstacles, gap)
+        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap)
         if options.variant == "arm":
-            given = (strategy, tool, target, candidate, reflection, motion, TABLE, obstacles)
+            given = (strategy, tool, target, candidate, reflection, motion, table, obstacles)
             plan = _arm_planner().plan(*given, attempt=trial.attempt, seed=options.seed, budget=Budget(PLANNING_TIME))
         else:
             plan = MotionPlan("fg", motion)
@@ -203,23 +288,24 @@ def _try(
         return {"code": error.code.name, "message": error.message, "stage": "plan"}, None
     finally:
         seconds["plan"] += time.perf_counter() - started
-    verdict = verify(strategy, tool, target, obstacles, TABLE, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0)
+    verdict = verify(strategy, tool, target, obstacles, table, candidate, plan, seed=options.seed, deadline=time.monotonic() + 60.0)
     seconds["verify"] += verdict.seconds
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}
-    return {"code": verdict.code.name, "message": verdict.message, "stage": "verify", "metrics": metrics}, (verdict, tool)
+    entry = {"code": verdict.code.name, "message": verdict.message, "stage": "verify", "metrics": metrics}
+    return entry, _Tried(name, tool, plan, verdict)
 
 
-def _draw(path: Path, last: Any, target: SceneObject, obstacles: tuple[SceneObject, ...]) -> None:
+def _draw(path: Path, run: _Tried, problem: _Problem) -> None:
     """Three moments of the last simulation, for the contact sheet."""
     import cv2
 
     from magic_verifier.film import film_strip
 
-    verdict, tool = last
-    if verdict.recording is None:
+    if run.verdict.recording is None:
         return
-    strip = film_strip(verdict.recording, tool, target, obstacles, TABLE, frames=3, columns=3, size=(220, 165))
+    obstacles = problem.obstacles[run.tool.id]
+    strip = film_strip(run.verdict.recording, run.tool, problem.target, obstacles, problem.table, frames=3, columns=3, size=(220, 165))
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), strip[:, :, ::-1])
 
@@ -239,8 +325,8 @@ def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
     """Success rate with its interval, reasons and mean times."""
     good = sum(bool(c["success"]) for c in done)
     low, high = wilson(good, len(done))
-    stages = ("match", "plan", "verify", "total")
-    return {
+    stages = ("perceive", "match", "plan", "verify", "total")
+    summary = {
         "task": options.task,
         "variant": options.variant,
         "method": options.method,
@@ -255,6 +341,23 @@ def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
         "reasons": dict(Counter(c["reason"] for c in done if not c["success"])),
         "simulations": sum(c["simulations"] for c in done),
         "mean_seconds": {s: float(np.mean([c["seconds"].get(s, 0.0) for c in done])) if done else 0.0 for s in stages},
+    }
+    if options.source == "images":
+        summary["truth"] = truths(done)
+    return summary
+
+
+def truths(done: list[dict[str, Any]]) -> dict[str, Any]:
+    """What was verified against what is true: the four counts, and the share of the verified that truly succeeds with its interval."""
+    counts = Counter((bool(c["success"]), bool(c["true_success"])) for c in done)
+    verified = counts[True, True] + counts[True, False]
+    return {
+        "verified_and_succeeds": counts[True, True],
+        "verified_but_fails": counts[True, False],
+        "refused_but_would_succeed": counts[False, True],
+        "refused_and_fails": counts[False, False],
+        "verified_is_true": counts[True, True] / verified if verified else None,
+        "verified_is_true_interval_95": list(wilson(counts[True, True], verified)),
     }
 
 
@@ -347,9 +450,18 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
     text = (
         f"{options.task} {options.variant} {options.method} ({options.features}): {summary['successes']} of {summary['cases']} = "
         f"{100 * summary['success_rate']:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)\n"
-        f"mean seconds: match {times['match']:.3f}, plan {times['plan']:.3f}, verify {times['verify']:.3f}, total {times['total']:.3f}; "
+        f"mean seconds: perceive {times['perceive']:.3f}, match {times['match']:.3f}, plan {times['plan']:.3f}, verify {times['verify']:.3f}, total {times['total']:.3f}; "
         f"{summary['simulations']} simulations\nreasons: {summary['reasons']}\n"
     )
+    if "truth" in summary:
+        truth = summary["truth"]
+        verified = truth["verified_and_succeeds"] + truth["verified_but_fails"]
+        low, high = truth["verified_is_true_interval_95"]
+        share = f" = {100 * truth['verified_is_true']:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)" if verified else ""
+        text += (
+            f"on the true objects: {truth['verified_and_succeeds']} of {verified} verified motions succeed{share}; of those refused "
+            f"{truth['refused_but_would_succeed']} would have succeeded, {truth['refused_and_fails']} not\n"
+        )
     (out / "summary.txt").write_text(text)
     if films:
         contact_sheet(out / "films", done, True, out / "successes.png")
@@ -364,6 +476,11 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--task", required=True, choices=TASKS)
     parser.add_argument("--variant", default="fg", choices=VARIANTS)
     parser.add_argument("--method", default="magic", choices=METHODS, help="magic, or an ablation of it")
+    parser.add_argument(
+        "--from", dest="source", default="meshes", choices=SOURCES,
+        help="what tools and target are taken for: their meshes, or what perception makes of two cameras' images (then judged on the meshes)",
+    )  # fmt: skip
+    parser.add_argument("--set", default="own", choices=SETS, help="the paper's set sizes, or unseen tools drawn by the seed")
     parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded or dinov2")
     parser.add_argument("--weights", default="", help="hub name or folder of the backend's weights")
     parser.add_argument("--objects", default="", help="folder of tool meshes, with or without poses.yaml, instead of the project's own set")

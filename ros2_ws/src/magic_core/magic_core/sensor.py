@@ -91,6 +91,13 @@ def looking_at(eye: NDArray | Sequence[float], target: NDArray | Sequence[float]
     return transforms.make(np.column_stack([x, np.cross(z, x), z]), eye)
 
 
+#: Where the project's two cameras stand: left and right in front of the robot, looking back and down at the table (world_from_camera).
+STATION = {
+    "left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]),
+    "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04]),
+}
+
+
 def degrade(
     depth: NDArray[np.float32],
     cosine: NDArray[np.float32],

@@ -1,0 +1,206 @@
+"""A case as the robot meets it: true objects before two cameras, what perception makes of them, and the truth to judge by.
+
+:func:`lay_out` puts the true objects on the table: the target and its fixtures where
+the demonstration had them, each tool in a turn drawn by the seed, where nothing else
+stands, as it comes to rest.  :func:`capture` looks at them with the model of two
+D435 (:mod:`magic_core.sensor`), :func:`perceive` reconstructs them as the perception
+node does, and :func:`pair` says which reconstruction is which thing.  Everything after that
+(match, plan, verify) sees the reconstructions alone.  :func:`judge` carries the motion
+out once more, on the true meshes, with a friction and densities that the strategy
+does not know: what came of the motion, not what was thought of it.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.camera import RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_core.motion import MotionPlan
+from magic_core.scene import Scene, SceneObject
+from magic_core.sensor import D435, STATION, scene_raycaster
+from magic_core.sensor import capture as photograph
+from magic_core.strategy import Physics, Strategy
+from magic_verifier.cases import TOOL_PLACE, Case, Meeting, scene_for, tool_object
+from magic_verifier.floating import settled
+
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+#: Frames of each camera that are averaged, and the workspace: the perception node's defaults.
+FRAMES = 3
+REGION = (0.15, -0.6, -0.05), (0.95, 0.6, 0.5)
+#: Where tools may lie: x and y in metres from the arm's base, within its reach and in the sight of both cameras.
+PLACES = (0.30, 0.62), (-0.42, 0.42)
+#: Clear way round a tool that lies on the table (m), and places looked at.
+CLEARANCE, TRIES = 0.03, 2000
+#: A reconstruction belongs to a thing when its middle is nearer than this share of the thing's longest side.
+NEAR = 0.35
+#: What is truly the case, as factors on the strategy's own numbers: half range of friction, and densities from 1/x to x.
+TRUE_FRICTION, TRUE_DENSITY = 0.25, 2.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What truly stands there: tools in the order of the case, the target, fixtures, and the true physics."""
+
+    tools: tuple[SceneObject, ...]
+    target: SceneObject
+    fixtures: tuple[SceneObject, ...]
+    meeting: Meeting | None
+    physics: Physics
+
+
+def _seed(case: Case, seed: int) -> list[int]:
+    """A seed of the case's own, whatever other cases there are."""
+    return [int(seed), zlib.crc32(case.name.encode())]
+
+
+def lay_out(strategy: Strategy, case: Case, seed: int) -> Layout:
+    """The true scene of a case; the same seed gives the same.  Raises ``BAD_SCENE`` where there is no room for a tool."""
+    rng = np.random.default_rng(_seed(case, seed))
+    target, fixtures, meeting = scene_for(strategy, case.target)
+    physics = replace(
+        strategy.physics,
+        friction=strategy.physics.friction * float(rng.uniform(1 - TRUE_FRICTION, 1 + TRUE_FRICTION)),
+        tool_density=strategy.physics.tool_density * float(TRUE_DENSITY ** rng.uniform(-1, 1)),
+        target_density=strategy.physics.target_density * float(TRUE_DENSITY ** rng.uniform(-1, 1)),
+    )
+    tools = []
+    for index, name in enumerate(case.tools):
+        tool = tool_object(name, index, strategy.view)
+        tools.append(settled(_turned(tool, float(rng.uniform(-np.pi, np.pi))), TABLE, strategy.physics))
+    taken = [_footprint(item) for item in (target, *fixtures)]
+    placed = {}
+    for tool in sorted(tools, key=lambda tool: -_footprint(tool).area):  # the small ones still find room between the large ones
+        placed[tool.id] = _placed(tool, taken, rng)
+        taken.append(_footprint(placed[tool.id]))
+    return Layout(tuple(placed[tool.id] for tool in tools), target, fixtures, meeting, physics)
+
+
+def _moved(item: SceneObject, world_from_world: NDArray[np.float64]) -> SceneObject:
+    return replace(item, world_from_object=world_from_world @ item.world_from_object, world_from_box=world_from_world @ item.world_from_box)
+
+
+def _turned(item: SceneObject, yaw: float) -> SceneObject:
+    x, y = TOOL_PLACE
+    about = transforms.make(translation=[x, y, 0]) @ transforms.from_rpy(0, 0, yaw) @ transforms.make(translation=[-x, -y, 0])
+    return _moved(item, about)
+
+
+def _footprint(item: SceneObject) -> Any:
+    """What an object covers of the table, as a polygon in metres."""
+    import shapely
+
+    corners = transforms.apply(item.world_from_object, item.mesh.vertices)[:, :2]
+    return shapely.MultiPoint(corners).convex_hull
+
+
+def _placed(item: SceneObject, taken: Sequence[Any], rng: np.random.Generator) -> SceneObject:
+    """The object moved to a place where nothing else is near and both cameras see all of it."""
+    import shapely
+    from shapely.affinity import translate
+
+    region = shapely.box(*np.add(REGION[0][:2], 0.01), *np.subtract(REGION[1][:2], 0.01))
+    covered = _footprint(item)
+    middle = covered.envelope.centroid
+    for x, y in np.column_stack([rng.uniform(*PLACES[0], TRIES), rng.uniform(*PLACES[1], TRIES)]):
+        shift = x - middle.x, y - middle.y
+        there = translate(covered, *shift)
+        if region.contains(there) and all(there.distance(other) >= CLEARANCE for other in taken):
+            moved = _moved(item, transforms.make(translation=[*shift, 0.0]))
+            if _in_sight(moved):
+                return moved
+    raise MagicError(Code.BAD_SCENE, f"place for {item.id}", f"none of {TRIES} free", "a tool that finds room on the table")
+
+
+def _in_sight(item: SceneObject) -> bool:
+    corners = transforms.apply(item.world_from_object, item.mesh.vertices)
+    for world_from_camera in STATION.values():
+        pixels = D435.project(transforms.apply(transforms.inverse(world_from_camera), corners))
+        if np.any(pixels < 5) or np.any(pixels > [D435.width - 6, D435.height - 6]):
+            return False
+    return True
+
+
+def capture(layout: Layout, case: Case, seed: int) -> list[RgbdFrame]:
+    """One frame of each camera, averaged as the perception node averages."""
+    from magic_perception.averaging import average
+
+    meshes = [item.mesh.transformed(item.world_from_object) for item in (*layout.tools, layout.target, *layout.fixtures)]
+    caster = scene_raycaster(meshes)
+    frames = []
+    for number, (name, pose) in enumerate(STATION.items()):
+        shots = [photograph([], D435, pose, [*_seed(case, seed), number, k], camera=name, raycaster=caster) for k in range(FRAMES)]
+        frames.append(average(shots))
+    return frames
+
+
+def perceive(layout: Layout, frames: list[RgbdFrame], physics: Physics) -> Scene:
+    """What perception makes of the frames; fixtures, and a target that is one, are known to it."""
+    from magic_perception.parameters import Parameters
+    from magic_perception.pipeline import perceive as reconstruct
+
+    known = layout.fixtures + ((layout.target,) if physics.target_is_fixed else ())
+    return reconstruct(frames, known, Parameters(region_low=REGION[0], region_high=REGION[1]))
+
+
+def pair(layout: Layout, scene: Scene) -> tuple[list[SceneObject | None], SceneObject | None]:
+    """The reconstruction of each tool and of the target, as a person would point at them; ``None`` where there is none."""
+    left = {item.id: item for item in scene.objects if item.source != "known"}
+
+    def nearest(true: SceneObject) -> SceneObject | None:
+        middle = transforms.apply(true.world_from_object, true.mesh.bounds.mean(axis=0))
+        near = NEAR * float(true.mesh.extents.max())
+        found = min(left.values(), key=lambda o: float(np.linalg.norm(_middle(o) - middle)), default=None)
+        if found is None or np.linalg.norm(_middle(found) - middle) > near:
+            return None
+        return left.pop(found.id)
+
+    known = next((item for item in scene.objects if item.source == "known" and item.id == layout.target.id), None)
+    target = known if known is not None else nearest(layout.target)
+    return [nearest(tool) for tool in layout.tools], target
+
+
+def _middle(item: SceneObject) -> NDArray[np.float64]:
+    return transforms.apply(item.world_from_object, item.mesh.bounds.mean(axis=0))
+
+
+def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, plan: MotionPlan, seed: int, deadline: float) -> Any:
+    """The verdict of one run with the true tool ``index``, target and fixtures, where ``seen`` is what the plan took the tool for.
+
+    The motion of whatever holds the tool stays as it was planned, so that the true tool is held where it truly is.
+    """
+    from magic_verifier.verification import verify
+
+    true = replace(layout.tools[index], id=seen.id)
+    seen_from_true = transforms.inverse(seen.world_from_object) @ true.world_from_object
+    motion = replace(plan.tool_motion, world_from_tool=plan.tool_motion.world_from_tool @ seen_from_true)
+    arm = plan.arm_motion
+    if arm is not None:
+        arm = replace(arm, tool_from_tcp=transforms.inverse(seen_from_true) @ arm.tool_from_tcp)
+    others = tuple(tool for k, tool in enumerate(layout.tools) if k != index)
+    truth = replace(strategy, physics=layout.physics)
+    plan = MotionPlan(plan.variant, motion, arm)
+    return verify(truth, true, layout.target, (*layout.fixtures, *others), TABLE, None, plan, seed=seed, repetitions=1, deadline=deadline)
+
+
+def sheet(frames: list[RgbdFrame], scene: Scene, path: Any) -> None:
+    """A picture of what the first camera saw, the reconstructions drawn on it."""
+    frame = frames[0]
+    image = frame.color[:, :, ::-1].copy()
+    camera_from_world = transforms.inverse(frame.world_from_camera)
+    for item in scene.objects:
+        corners = transforms.apply(camera_from_world @ item.world_from_object, item.mesh.vertices)
+        pixels = np.round(frame.intrinsics.project(corners)).astype(np.int32)
+        shade = (0, 200, 80) if item.source != "known" else (200, 160, 0)
+        for triangle in item.mesh.faces[:: max(1, len(item.mesh.faces) // 1500)]:
+            cv2.polylines(image, [pixels[triangle]], True, shade, 1, cv2.LINE_AA)
+        cv2.putText(image, item.id, tuple(int(v) for v in pixels.min(axis=0)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (30, 30, 220), 1, cv2.LINE_AA)
+    cv2.imwrite(str(path), image)
