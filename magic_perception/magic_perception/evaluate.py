@@ -35,7 +35,8 @@ from magic_core.views import find_view, holes_of
 from magic_perception import speed
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
-from magic_perception.segmentation import Segmenter, _frame_on, find_table, look, make_segmenter
+from magic_perception.segmentation import Segmenter, _frame_on, find_table, look
+from magic_perception.segmenters import make_segmenter
 from magic_perception.table import camera_over_table
 
 #: Longest, middle and shortest side in mm, read from the images: silhouette edges carried to the tangent planes, highest

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -22,18 +23,29 @@ from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
-from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
+from magic_core.qos import LATCHED, RELIABLE, SENSOR
 from magic_core.scene import Scene, SceneObject
-from magic_core.tf import TransformBuffer
+from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception.averaging import average
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
-from magic_perception.segmentation import SEGMENTERS, make_segmenter
-from magic_perception.stream import Pair, Stream
+from magic_perception.segmenters import SEGMENTERS, make_segmenter
+from magic_perception.stream import WAITING, Pair, Stream, next_scene
 from magic_perception.tracking import Tracker
+
+#: After so long without a new pair of images, s, none of those that were taken together is still on its way.
+SETTLED = 0.5
+
+
+class Placed(NamedTuple):
+    """A pair and where its camera was at its stamp: world_from_camera (4, 4), and where depth is not registered color_from_depth (4, 4)."""
+
+    pair: Pair
+    world_from_camera: np.ndarray
+    color_from_depth: np.ndarray | None
 
 
 class Perception(Node):
@@ -64,6 +76,13 @@ class Perception(Node):
         self.max_age = p("max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0)
         self.aligned = p("aligned", True, "depth is registered to colour by the driver")
         self.count = p("average", 3, "frames of a camera at rest that are averaged", low=1, high=30)
+        self.transform_timeout = p(
+            "transform_timeout",
+            1.0,
+            "how long the transform at an image's stamp is waited for, s; no other pose is taken",
+            low=0.0,
+            high=10.0,
+        )
         tolerance = p("pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0)
         self.period = 1.0 / p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0)
         name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS)
@@ -74,14 +93,14 @@ class Perception(Node):
         self.segmenter = make_segmenter(name, weights, device)
         self.warm_up()
 
-        self.streams = {camera: Stream(camera, tolerance, self.count) for camera in self.cameras}
-        self.buffer = TransformBuffer()
+        self.streams = {camera: Stream(camera, tolerance, self.count + WAITING) for camera in self.cameras}
         self.tracker = Tracker()
         self.known: tuple[SceneObject, ...] = ()
         self.known_problem: tuple[Code, str] | None = None
         self.unheard: dict[str, str] = {}
         self.distortion: dict[str, float] = {}
         self.done_stamp = self.last_run = -math.inf
+        self.again = False  # the newest frames are to be looked at once more
         self.done = 0
         self.outcome: tuple[bytes, Code, str, dict[str, object]] = (DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
         self.lock = threading.Lock()
@@ -94,7 +113,7 @@ class Perception(Node):
         self.diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
         self.topics = {camera: self._subscribe(camera, inputs) for camera in self.cameras}
-        self._subscribe_to_transforms(inputs)
+        self.transforms = TransformListener(self, inputs, self.lock)
         self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
         self.create_timer(min(0.05, self.period / 4), self.on_work, callback_group=work)
         self.create_timer(1.0, self.on_report, callback_group=report)
@@ -143,15 +162,6 @@ class Perception(Node):
             else:
                 self.create_subscription(Image, topic, partial(self.on_image, camera, what), SENSOR, callback_group=group)
         return topics
-
-    def _subscribe_to_transforms(self, group: MutuallyExclusiveCallbackGroup) -> None:
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            self.get_logger().error("tf2_msgs is not installed: poses of cameras must be given as parameters extrinsics.NAME")
-            return
-        self.listen(TFMessage, "/tf", partial(self.on_tf, False), RELIABLE, group)
-        self.listen(TFMessage, "/tf_static", partial(self.on_tf, True), STATIC_TF, group)
 
     def warm_up(self) -> None:
         """Look at a small made-up scene, so that the first real one does not pay for loading the libraries."""
@@ -239,15 +249,6 @@ class Perception(Node):
                 code, message = describe(self, error)
                 stream.wrong(what, Code(code), f"{self.topics[camera][what]}: {message}", now)
 
-    def on_tf(self, static: bool, msg: object) -> None:
-        """Transforms; a bad one is named in the log and left out."""
-        with self.lock:
-            for transform in msg.transforms:  # type: ignore[attr-defined]
-                try:
-                    cv.remember_transform(self.buffer, transform, static)
-                except Exception as error:
-                    self.get_logger().warning(f"transform left out: {describe(self, error)[1]}", throttle_duration_sec=5.0)
-
     def on_known(self, msg: SceneObjectArray) -> None:
         """Calibrated fixtures."""
         try:
@@ -256,7 +257,7 @@ class Perception(Node):
             known = cv.scene_from_msg(msg).objects
             with self.lock:
                 self.known, self.known_problem = known, None
-                self.done_stamp = -math.inf  # look again at the newest frames
+                self.again = True
         except Exception as error:
             code, message = describe(self, error)
             self.known_problem = (Code(code), f"known_objects: {message}")
@@ -316,88 +317,130 @@ class Perception(Node):
     def gather(self, now: float) -> tuple[list[RgbdFrame], list[str]]:
         """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for."""
         notes: list[str] = []
-        taken: list[tuple[Stream, list[Pair]]] = []
         with self.lock:
-            newest = max((s.pairs[-1].stamp for s in self.streams.values() if s.pairs), default=None)
-            if newest is None:
+            streams = self.speaking(now, notes)
+            if streams is None:
                 return [], notes
-            if newest < self.done_stamp - 1.0:
-                self.done_stamp = -math.inf  # a bag began again
-            if newest <= self.done_stamp:
-                return [], notes
-            for camera, stream in self.streams.items():
-                silent = now - max(stream.last.get("pair", -math.inf), self.resumed)
-                if silent < self.patience and (stream.intrinsics is None or len(stream.pairs) < self.count):
-                    # The first frames of a camera that speaks, or the wait for one that has not spoken yet.
-                    first = stream.pairs[0].arrived if stream.pairs else self.resumed
-                    if now - first < self.patience:
-                        return [], notes
-                if stream.intrinsics is None:
-                    if stream.pairs or stream.counts["color"]:
-                        stream.wrong(
-                            "camera_info", Code.NO_CAMERA_INFO, f"no camera_info received on {self.topics[camera]['camera_info']}", now
-                        )
-                    notes.append(f"camera {camera} left out: no camera_info")
-                elif not stream.pairs:
-                    notes.append(f"camera {camera} left out: no frames")
-                elif newest - stream.pairs[-1].stamp > self.skew:
-                    message = (
-                        f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.skew} s)"
-                    )
-                    stream.wrong("stamps", Code.STALE_DATA, f"{self.topics[camera]['color']}: {message}", now)
-                    notes.append(f"camera {camera} left out: {message}")
+            newest = max(s.pairs[-1].stamp for s in self.streams.values() if s.pairs)
+            placed: dict[str, list[Placed]] = {}
+            limit = math.inf
+            for stream in streams:
+                found, pending, error = self.place(stream, now)
+                if error is not None and (not found or newest - found[-1].pair.stamp > self.skew):
+                    self.leave_out(stream, error, notes, now)
                 else:
-                    if "stamps" in stream.problems and now - stream.problems["stamps"].when > 3.0:
-                        stream.clear("stamps")
-                    taken.append((stream, list(stream.pairs)))
+                    placed[stream.name], limit = found, min(limit, pending)
+            stamps = {camera: [p.pair.stamp for p in found] for camera, found in placed.items()}
+            done, period = (math.nextafter(self.done_stamp, -math.inf), 0.0) if self.again else (self.done_stamp, self.period)
+            settled = now - max(s.pairs[-1].arrived for s in streams) > SETTLED if streams else False
+            stamp = next_scene(stamps, self.count, done, period, self.skew, limit, settled)
+            if stamp is not None:
+                # Whatever comes of it: frames that are no good must not be in the way of the next.
+                self.done_stamp, self.again = stamp, False
+                placed = {camera: [p for p in found if p.pair.stamp <= stamp][-self.count :] for camera, found in placed.items()}
+            elif placed:
+                return [], notes
         frames = []
-        for stream, pairs in taken:
+        for camera, found in placed.items():
             try:
-                frames.append(self.frame_of(stream, pairs))
-                stream.clear("frames")
+                frames.append(self.frame_of(self.streams[camera], found))
+                self.streams[camera].clear("frames")
             except MagicError as error:
-                stream.wrong("frames", error.code, f"camera {stream.name}: {error.message}", now)
-                notes.append(f"camera {stream.name} left out: {error.message}")
-        if not frames and taken:
-            worst = next(iter(s.problems["frames"] for s, _ in taken))
+                self.leave_out(self.streams[camera], error, notes, now)
+        if not frames and streams:
+            worst = next(s.problems["frames"] for s in streams if "frames" in s.problems)
             raise MagicError(worst.code, worst.message)
-        if frames:
-            self.done_stamp = newest
         return frames, notes
 
-    def frame_of(self, stream: Stream, pairs: list[Pair]) -> RgbdFrame:
+    @staticmethod
+    def leave_out(stream: Stream, error: MagicError, notes: list[str], now: float) -> None:
+        """A camera whose frames cannot be used now."""
+        stream.wrong("frames", error.code, f"camera {stream.name}: {error.message}", now)
+        notes.append(f"camera {stream.name} left out: {error.message}")
+
+    def speaking(self, now: float, notes: list[str]) -> list[Stream] | None:
+        """The cameras whose frames there are, the others in the notes; ``None`` where nothing is new or a camera is waited for."""
+        newest = max((s.pairs[-1].stamp for s in self.streams.values() if s.pairs), default=None)
+        if newest is None:
+            return None
+        if newest < self.done_stamp - 1.0:
+            self.done_stamp = -math.inf  # a bag began again
+        if newest <= self.done_stamp and not self.again:
+            return None
+        streams = []
+        for camera, stream in self.streams.items():
+            silent = now - max(stream.last.get("pair", -math.inf), self.resumed)
+            if silent < self.patience and (stream.intrinsics is None or len(stream.pairs) < self.count):
+                # The first frames of a camera that speaks, or the wait for one that has not spoken yet.
+                first = stream.pairs[0].arrived if stream.pairs else self.resumed
+                if now - first < self.patience:
+                    return None
+            if stream.intrinsics is None:
+                if (stream.pairs or stream.counts["color"]) and "camera_info" not in stream.problems:
+                    stream.wrong(
+                        "camera_info", Code.NO_CAMERA_INFO, f"no camera_info received on {self.topics[camera]['camera_info']}", now
+                    )
+                notes.append(f"camera {camera} left out: no camera_info")
+            elif not stream.pairs:
+                notes.append(f"camera {camera} left out: no frames")
+            elif newest - stream.pairs[-1].stamp > self.skew:
+                message = f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.skew} s)"
+                stream.wrong("stamps", Code.STALE_DATA, f"{self.topics[camera]['color']}: {message}", now)
+                notes.append(f"camera {camera} left out: {message}")
+            else:
+                if "stamps" in stream.problems and now - stream.problems["stamps"].when > 3.0:
+                    stream.clear("stamps")
+                streams.append(stream)
+        return streams
+
+    def place(self, stream: Stream, now: float) -> tuple[list[Placed], float, MagicError | None]:
+        """A camera's pairs with where it was at their stamps; the first stamp whose transform may still come (infinite: none); why it no longer may for a later pair than these."""
+        found: list[Placed] = []
+        pending, wrong = math.inf, None
+        for pair in stream.pairs:
+            try:
+                pose = self.given.get(stream.name)
+                if pose is None:
+                    pose = self.transforms.buffer.lookup(self.frame, pair.frame_id, pair.stamp)
+                moved = None if self.aligned else self.transforms.buffer.lookup(pair.frame_id, pair.depth_frame_id, pair.stamp)
+            except MagicError as error:
+                if now - pair.arrived < self.transform_timeout:
+                    pending = min(pending, pair.stamp)
+                else:
+                    wrong = error
+                continue
+            found.append(Placed(pair, pose, moved))
+            wrong = None
+        return found, pending, self.transforms.explain(wrong) if wrong is not None else None
+
+    def frame_of(self, stream: Stream, placed: list[Placed]) -> RgbdFrame:
         """The average of a camera's frames at rest, with its pose."""
         intrinsics = stream.intrinsics
         assert intrinsics is not None
-        with self.lock:
-            if stream.name in self.given:
-                poses = [self.given[stream.name]] * len(pairs)
-            else:
-                poses = [self.buffer.lookup(self.frame, p.frame_id, p.stamp) for p in pairs]
-            frames = []
-            for pair, pose in zip(pairs, poses, strict=True):
-                # Averaging is for a camera that stands still.
-                if np.linalg.norm(pose[:3, 3] - poses[-1][:3, 3]) > 0.001 or transforms.rotation_angle(pose, poses[-1]) > 0.002:
-                    continue
-                depth = pair.depth
-                if not self.aligned:
-                    if stream.depth_intrinsics is None:
-                        raise MagicError(
-                            Code.NO_CAMERA_INFO,
-                            f"camera_info of {stream.name}'s depth",
-                            "none received",
-                            self.topics[stream.name]["depth_camera_info"],
-                        )
-                    color_from_depth = self.buffer.lookup(pair.frame_id, pair.depth_frame_id, pair.stamp)
-                    depth = register_depth(depth, stream.depth_intrinsics, intrinsics, color_from_depth)
-                elif pair.depth_frame_id.lstrip("/") != pair.frame_id.lstrip("/"):
+        last = placed[-1].world_from_camera
+        frames = []
+        for pair, pose, color_from_depth in placed:
+            # Averaging is for a camera that stands still.
+            if np.linalg.norm(pose[:3, 3] - last[:3, 3]) > 0.001 or transforms.rotation_angle(pose, last) > 0.002:
+                continue
+            depth = pair.depth
+            if color_from_depth is not None:
+                if stream.depth_intrinsics is None:
                     raise MagicError(
-                        Code.NO_TRANSFORM,
-                        f"frame of {self.topics[stream.name]['depth']}",
-                        pair.depth_frame_id,
-                        f"{pair.frame_id}, that of colour; else set aligned to false",
+                        Code.NO_CAMERA_INFO,
+                        f"camera_info of {stream.name}'s depth",
+                        "none received",
+                        self.topics[stream.name]["depth_camera_info"],
                     )
-                frames.append(RgbdFrame(pair.color, depth, intrinsics, poses[-1], stream.name, pair.stamp))
+                depth = register_depth(depth, stream.depth_intrinsics, intrinsics, color_from_depth)
+            elif pair.depth_frame_id.lstrip("/") != pair.frame_id.lstrip("/"):
+                raise MagicError(
+                    Code.NO_TRANSFORM,
+                    f"frame of {self.topics[stream.name]['depth']}",
+                    pair.depth_frame_id,
+                    f"{pair.frame_id}, that of colour; else set aligned to false",
+                )
+            frames.append(RgbdFrame(pair.color, depth, intrinsics, last, stream.name, pair.stamp))
         result = average(frames)
         if np.isfinite(result.depth).sum() < 100:
             raise MagicError(

@@ -16,7 +16,7 @@ from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
-from magic_perception.segmentation import SEGMENTERS, make_segmenter
+from magic_perception.segmenters import SEGMENTERS, make_segmenter
 from magic_perception.table import camera_over_table
 
 

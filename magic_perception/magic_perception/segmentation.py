@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.camera import RgbdFrame
-from magic_core.errors import Code, MagicError
+from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters, convexity
 from magic_perception.parameters import Parameters
 from magic_perception.table import Plane, fit_plane
-
-SEGMENTERS = ("depth", "sam2", "sam")
 
 T, R = TypeVar("T"), TypeVar("R")
 
@@ -495,14 +493,3 @@ def _sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: 
     for new, (_, old) in enumerate(keep[: parameters.max_objects]):
         table[old] = new + 1
     return [table[image] for image in labels]
-
-
-def make_segmenter(name: str, weights: str = "", device: str = "cpu") -> Segmenter:
-    """The segmenter of that name; raises ``UNKNOWN_SEGMENTER``, or ``SEGMENTER_WEIGHTS`` where its weights cannot be loaded."""
-    if name == "depth":
-        return DepthSegmenter()
-    if name in ("sam", "sam2"):
-        from magic_perception.sam import SamSegmenter
-
-        return SamSegmenter(name, weights, device)
-    raise MagicError(Code.UNKNOWN_SEGMENTER, "segmenter", name, SEGMENTERS)

@@ -5,13 +5,16 @@ Colour and depth come by themselves, in any order; a pair has stamps within the 
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core.camera import Intrinsics, RgbdFrame
-from magic_core.errors import Code, MagicError
+from magic_core.camera import Intrinsics
+from magic_core.errors import Code
 
 
 @dataclass
@@ -35,11 +38,15 @@ class Pair:
     arrived: float
 
 
+#: Pairs that are kept beyond those that are averaged: for as long as their transform may still come, and until they are looked at.
+WAITING = 9
+
+
 @dataclass
 class Stream:
     """The state of one camera.
 
-    tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept for averaging.
+    tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept, in the order of their stamps.
     Times called ``now`` are monotonic seconds.
     """
 
@@ -125,13 +132,44 @@ class Stream:
             del self._depths[: j + 1]
             self.clear("pairing")
             self.last["pair"] = now
+            # Of a bag that is played again what comes later in it is dropped: it comes again, too.
+            self.pairs = [p for p in self.pairs if p.stamp < stamp][-self.keep + 1 :]
             self.pairs.append(Pair(color, depth, frame_id, depth_frame_id, stamp, now))
-            del self.pairs[: -self.keep]
 
-    def frames(self, world_from_camera: NDArray[np.float64]) -> list[RgbdFrame]:
-        """The collected pairs as frames; raises ``NO_CAMERA_INFO``, or ``BAD_IMAGE`` where sizes disagree."""
-        if self.intrinsics is None:
-            raise MagicError(
-                Code.NO_CAMERA_INFO, f"camera_info of {self.name}", "none received", "one message before the first image is used"
-            )
-        return [RgbdFrame(p.color, p.depth, self.intrinsics, world_from_camera, self.name, p.stamp) for p in self.pairs]
+
+def next_scene(
+    stamps: Mapping[str, Sequence[float]],
+    count: int,
+    done: float = -math.inf,
+    period: float = 0.0,
+    skew: float = math.inf,
+    limit: float = math.inf,
+    settled: bool = False,
+) -> float | None:
+    """The stamp of the next scene, ``None`` where there is nothing new: it is made of the last ``count`` frames of each camera up to it.
+
+    stamps: of each camera's frames, rising.  A scene has the first stamp at which every camera has ``count`` frames (fewer where no
+    more are known), the last of them at most ``skew`` seconds old, that is ``period`` later than the scene before (``done``) and
+    before ``limit``.  A camera's next frame is waited for where it may still come before that stamp, unless all is ``settled``:
+    nothing is under way.  Where more than a period is waiting, whole periods are passed over.  So which frames are averaged depends on
+    their stamps, and not on when each came or when this is asked.
+    """
+    if not stamps or not all(stamps.values()):
+        return None
+    gaps = {camera: float(np.median(np.diff(each))) if len(each) > 1 else math.inf for camera, each in stamps.items()}
+
+    def whole(stamp: float) -> bool:
+        for camera, each in stamps.items():
+            n = bisect_right(each, stamp)
+            if n < min(count, len(each)) or stamp - each[n - 1] > skew:
+                return False
+            if n == len(each) and not settled and stamp - each[-1] > 0.75 * gaps[camera]:
+                return False
+        return True
+
+    best, passed = None, -1
+    for stamp in sorted({s for each in stamps.values() for s in each if done < s < limit}):
+        periods = math.floor((stamp - done) / period + 1e-6) if period > 0 and done > -math.inf else 1
+        if periods >= 1 and periods > passed and whole(stamp):
+            best, passed = stamp, periods
+    return best

@@ -13,15 +13,14 @@ from magic_core import shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.tf import TransformBuffer
 from magic_perception import clusters, polygons, primitives
 from magic_perception.averaging import average
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.reconstruction import as_in_paper
 from magic_perception.registration import register_depth
-from magic_perception.segmentation import make_segmenter
-from magic_perception.stream import Stream
+from magic_perception.segmenters import make_segmenter
+from magic_perception.stream import Stream, next_scene
 from magic_perception.table import camera_over_table, fit_plane
 from magic_perception.tracking import Tracker
 
@@ -591,22 +590,31 @@ def test_pairs_within_the_tolerance():
     assert len(stream.pairs) == 3 and stream.problems["pairing"].code is Code.STALE_DATA
     stream.depth(-50.0, depth, "c", 6.0)
     assert not stream.pairs and stream.problems["stamps"].code is Code.STALE_DATA
-    with pytest.raises(MagicError) as error:
-        stream.frames(np.eye(4))
-    assert error.value.code is Code.NO_CAMERA_INFO
 
 
-def test_transform_buffer():
-    buffer = TransformBuffer()
-    buffer.set("base", "hand", transforms.make(None, [0, 0, 0]), 1.0)
-    buffer.set("base", "hand", transforms.make(None, [0.1, 0, 0]), 2.0)
-    buffer.set("/hand", "camera", transforms.from_rpy(0, 0, np.pi / 2, [0, 0, 0.5]), static=True)
-    np.testing.assert_allclose(buffer.lookup("base", "camera", 1.5)[:3, 3], [0.05, 0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(buffer.lookup("camera", "base", 2.0) @ buffer.lookup("base", "camera", 2.0), np.eye(4), atol=1e-12)
-    for target, source, stamp in (("base", "nowhere", None), ("base", "camera", 9.0)):
-        with pytest.raises(MagicError) as error:
-            buffer.lookup(target, source, stamp)
-        assert error.value.code is Code.NO_TRANSFORM
+def test_which_frames_are_averaged_depends_on_their_stamps_alone():
+    """In whatever order the cameras' frames come, and however often it is asked, the scenes are the same."""
+    stamps = {"left": [round(0.1 + 0.2 * k, 3) for k in range(20)], "right": [round(0.28 + 0.2 * k, 3) for k in range(20)]}
+    rng = np.random.default_rng(0)
+
+    def run():
+        came, done, found = {"left": 0, "right": 0}, -np.inf, []
+        while min(came.values()) < 20:
+            camera = rng.choice([c for c in came if came[c] < 20 and came[c] - min(came.values()) < 3])
+            came[camera] += 1
+            if min(came.values()) < 3 or rng.random() < 0.5:
+                continue
+            while (at := next_scene({c: stamps[c][:n] for c, n in came.items()}, 3, done, 1.0, 0.5)) is not None:
+                found.append(at)
+                done = at
+        return found
+
+    assert all(run()[:3] == [0.68, 1.68, 2.68] for _ in range(50))
+    # Two whole periods that were slept through are passed over; what may still change waits; nothing is under way any more.
+    assert next_scene(stamps, 3, 0.68, 1.0, 0.5) == pytest.approx(3.68)
+    assert next_scene({"left": [0.1, 0.3, 0.5], "right": [0.28, 0.48, 0.68]}, 3) is None
+    assert next_scene({"left": [0.1, 0.3, 0.5], "right": [0.28, 0.48, 0.68]}, 3, settled=True) == 0.68
+    assert next_scene(stamps, 3, limit=0.68) is None and next_scene({"left": [], "right": [1.0]}, 1) is None
 
 
 def test_ids_stay(hooking):

@@ -32,8 +32,6 @@ PICTURES = 5
 NEAR = 0.10
 #: A pose that came so long (s) before or after the pictures does not tell where the tool was in them.
 APART = 0.5
-#: So long (s) beyond what /tf told of a frame it is taken to be still where it was.
-HIDDEN = 0.1
 
 
 class Recorded:
@@ -129,7 +127,7 @@ def _where_known(buffer: Any, world: str, frame: str, stamps: list[float]) -> tu
     found, why = [], None
     for stamp in stamps:
         try:
-            found.append((stamp, buffer.lookup(world, frame, stamp, reach=HIDDEN)))
+            found.append((stamp, buffer.lookup(world, frame, stamp)))
         except MagicError as error:
             why = error
     if not found and why is not None:

@@ -61,6 +61,9 @@ def header(frame_id: str, stamp: float = 0.0) -> Header:
 
 # ---------------------------------------------------------------- poses
 
+#: By how much a quaternion's length may differ from 1 and be normalised: numbers rounded to one decimal do; more is another rotation or none.
+UNIT = 0.1
+
 
 def pose_to_msg(transform: NDArray[np.float64]) -> Pose:
     """4x4 transform to Pose."""
@@ -88,15 +91,24 @@ def transform_from_msg(msg: Transform) -> NDArray[np.float64]:
 
 
 def remember_transform(buffer: TransformBuffer, msg: TransformStamped, static: bool) -> None:
-    """Put one TransformStamped into the buffer; raises BAD_REQUEST or NO_TRANSFORM for what is not one."""
-    buffer.set(msg.header.frame_id, msg.child_frame_id, transform_from_msg(msg.transform), time_from_msg(msg.header.stamp), static)
+    """Put one TransformStamped into the buffer; raises NO_TRANSFORM, which the buffer remembers, for what is not one."""
+    try:
+        pose = transform_from_msg(msg.transform)
+        buffer.set(msg.header.frame_id, msg.child_frame_id, pose, time_from_msg(msg.header.stamp), static)
+    except MagicError as error:
+        why = f"transform {msg.header.frame_id} -> {msg.child_frame_id}: {error.message}"
+        buffer.refuse(msg.child_frame_id, why)
+        raise MagicError(Code.NO_TRANSFORM, why) from error
 
 
 def _transform(translation: list[float], xyzw: list[float]) -> NDArray[np.float64]:
     norm = float(np.linalg.norm(xyzw))
-    if not np.all(np.isfinite(translation)) or not 0.9 < norm < 1.1:
+    if not np.all(np.isfinite(translation)) or not 1 - UNIT < norm < 1 + UNIT:
         raise MagicError(
-            Code.BAD_REQUEST, "pose", f"position {translation}, orientation {xyzw}", "finite numbers and a unit quaternion (x, y, z, w)"
+            Code.BAD_REQUEST,
+            "pose",
+            f"position {translation}, orientation {xyzw} of length {norm:.4g}",
+            f"finite numbers and a quaternion (x, y, z, w) whose length differs from 1 by less than {UNIT:g}",
         )
     return transforms.from_quaternion(translation, xyzw)
 
