@@ -330,9 +330,13 @@ def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id:
 
     No tool: every object that was seen by the cameras, but the target; where there is
     none of them, every other object.  No target: the one most like the demonstration's
-    among the objects not named as tools.
+    among the objects not named as tools.  What was seen in part is no tool: left out where
+    tools are chosen; ``OBJECT_CUT_OFF`` where one is named, or none is left.
     """
     named = [scene.find(name) for name in tool_ids]
+    for item in named:
+        if item.cut_off:
+            raise _cut_off([item])
     if target_id:
         target = scene.find(target_id)
     else:
@@ -350,7 +354,16 @@ def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id:
     tools = [item for item in others if item.source != "known"] or others
     if not tools:
         raise MagicError(Code.UNKNOWN_OBJECT, "objects to use as the tool", 0, f"at least one besides the target {target.id}")
-    return tools, target
+    whole = [item for item in tools if not item.cut_off]
+    if not whole:
+        raise _cut_off(tools)
+    return whole, target
+
+
+def _cut_off(tools: Sequence[SceneObject]) -> MagicError:
+    """Why these cannot be tools."""
+    told = "; ".join(f"{item.id}, cut off by {' and '.join(item.cut_off)}" for item in tools)
+    return MagicError(Code.OBJECT_CUT_OFF, "tool seen in part only", told, "a thing that is seen whole: move it, or what hides it")
 
 
 __all__ = [

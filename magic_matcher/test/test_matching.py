@@ -1,5 +1,7 @@
 """Both stages together with the embedded features."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -165,6 +167,17 @@ def test_target_and_tools_are_chosen_where_none_is_named(demonstration):
         assert caught.value.code == code
     result = matching.match(found, tools, target, features.load("embedded"))
     assert result.target_id == "cylinder" and result.candidates[0].target.radius > 0
+    # What is seen in part is no tool: not chosen, and refused by name.
+    part = Scene((replace(items[0], cut_off=("picture", "l_hook")), *items[1:]), scene.table)
+    tools, _ = matching.select(part, found, [], "cylinder")
+    assert [t.id for t in tools] == ["l_hook"]
+    for ids in (["caliper"], ["l_hook", "caliper"]):
+        with pytest.raises(MagicError, match="caliper, cut off by picture and l_hook") as caught:
+            matching.select(part, found, ids, "cylinder")
+        assert caught.value.code == Code.OBJECT_CUT_OFF
+    with pytest.raises(MagicError, match="caliper") as caught:
+        matching.select(Scene((part.objects[0], items[1]), scene.table), found, [], "cylinder")
+    assert caught.value.code == Code.OBJECT_CUT_OFF
 
 
 def test_codes_of_bad_views(matcher):

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -279,7 +280,7 @@ class Perception(Node):
                 known = self.known
             report = Report(notes=notes)
             scene = perceive(frames, known, self.parameters, self.segmenter, report)
-            scene = self.tracker.update(Scene(scene.objects, scene.table, scene.stamp, self.frame))
+            scene = self.tracker.update(replace(scene, frame_id=self.frame))
             self.publish(scene)
             seconds = time.monotonic() - now
             self.done += 1

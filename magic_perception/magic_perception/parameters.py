@@ -15,7 +15,8 @@ METHODS = ("completed", "paper")
 class Parameters:
     """What :func:`magic_perception.pipeline.perceive` may be told; lengths in metres.
 
-    region_low, region_high (3,): the workspace box in the world frame; what is outside is not looked at.
+    region_low, region_high (3,): the workspace box; x and y in the world frame, z above the table that was found; what is
+    outside is not looked at.  A table farther than -region_low[2] from the world's z = 0 is used and said.
     table_tilt: largest angle in degrees between the table's normal and the world's up.
     table_band: points this near to a plane hypothesis agree with it.
     snap_height, snap_tilt: a table found this near (metres, degrees) to the plane z = 0 is taken to be that plane,

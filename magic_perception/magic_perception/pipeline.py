@@ -17,7 +17,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import Scene, SceneObject
 from magic_core.views import find_view
-from magic_perception import clusters
+from magic_perception import cameras, clusters
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
@@ -27,7 +27,7 @@ from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _fr
 class Report:
     """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of all processors.
 
-    Stages: ``table``, ``masks``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
+    cameras: how far each pair of cameras disagrees.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -36,6 +36,7 @@ class Report:
     labels: list[NDArray[np.int32]] = field(default_factory=list)
     shapes: dict[str, str] = field(default_factory=dict)
     pixels: dict[str, int] = field(default_factory=dict)
+    cameras: list[cameras.Disagreement] = field(default_factory=list)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -58,7 +59,8 @@ def perceive(
     taken over into the scene; what belongs to them is left out of the segmentation.  Objects are numbered by size
     (``object_1``, ...); :class:`magic_perception.tracking.Tracker` makes the numbers stable from call to call.
 
-    Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has depth in the region of interest, ``NO_TABLE``.
+    Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has depth in the region of interest, ``NO_TABLE``,
+    ``CAMERAS_DISAGREE`` where the cameras' poses contradict each other by more than may be corrected.
     An empty table is a scene without objects.
     """
     report = report if report is not None else Report()
@@ -77,7 +79,7 @@ def perceive(
         )
     frames = seeing
     with report.stage("table"):
-        table, own = find_table(frames, parameters)
+        table, own = find_table(frames, parameters, report.notes)
         world_from_table = _frame_on(table, np.eye(4))
         if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and abs(table.heights(np.zeros(3))) < parameters.snap_height:
             world_from_table = np.eye(4)
@@ -86,6 +88,24 @@ def perceive(
     with report.stage("masks"):
         fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
         labels = segmenter.segment(looks, fixtures, parameters)
+
+    with report.stage("cameras"):
+        pairs = cameras.measure(looks, labels, [frame.world_from_camera for frame in frames], world_from_table, parameters.seed)
+        report.cameras = pairs
+        worst = max(pairs, key=lambda pair: (pair.beyond, pair.offset), default=None)
+        if worst is not None and worst.beyond:
+            raise MagicError(
+                Code.CAMERAS_DISAGREE,
+                "poses of the cameras",
+                str(worst),
+                f"up to {1000 * cameras.MOST_OFFSET:.0f} mm and {np.degrees(cameras.MOST_ANGLE):.1f} degrees; calibrate them again",
+            )
+        for pair in pairs:
+            if pair.certain:
+                report.notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if len(looks) == 2 else ""))
+        if len(looks) == 2 and worst is not None and worst.certain:
+            looks = cameras.brought_together(looks, worst, world_from_table)
+            labels = segmenter.segment(looks, fixtures, parameters)
         report.labels = labels
 
     def build(label: int) -> _Built | MagicError:
@@ -113,7 +133,8 @@ def perceive(
             objects.append(item)
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
     stamp = max(frame.stamp for frame in frames)
-    return Scene((*objects, *known), plane, stamp)
+    offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
+    return Scene((*objects, *known), plane, stamp, camera_offset=offset, camera_angle=angle, notes=tuple(report.notes))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import cv2
@@ -22,7 +22,7 @@ from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters, convexity
 from magic_perception.parameters import Parameters
-from magic_perception.table import Plane, fit_plane
+from magic_perception.table import Plane, fit_plane, supports
 
 T, R = TypeVar("T"), TypeVar("R")
 
@@ -32,8 +32,9 @@ class Looked:
     """One frame over the table.
 
     heights (H, W) float32 metres above the table, the camera's own small error of calibration taken out, lightly
-    smoothed; raw heights are unsmoothed; NaN without depth.  inside (H, W): in the region of interest.
-    sigma (H, W): standard deviation of ``heights``, measured on the table.
+    smoothed; raw heights are unsmoothed; NaN without depth.  inside (H, W): in the region of interest, whose
+    z counts from the table.
+    sigma (H, W): standard deviation of ``heights``, measured on the table.  normal (3,): of the table, in the world.
     """
 
     frame: RgbdFrame
@@ -41,6 +42,7 @@ class Looked:
     heights: NDArray[np.float32]
     inside: NDArray[np.bool_]
     sigma: NDArray[np.float32]
+    normal: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     def points(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         """World points (..., 3) in metres at pixels, row and column (...) each; NaN without depth."""
@@ -87,14 +89,19 @@ def masked_mean_at(
     return total / np.maximum(share, np.float32(1e-6))[:, None], share
 
 
-def find_table(frames: list[RgbdFrame], parameters: Parameters) -> tuple[Plane, list[Plane]]:
+#: Metres and degrees within which a camera's own plane is looked for around the common one.
+APART, TILTED = 0.06, 5.0
+
+
+def find_table(frames: list[RgbdFrame], parameters: Parameters, notes: list[str] | None = None) -> tuple[Plane, list[Plane]]:
     """The table in world coordinates, and as each camera sees it (which takes small errors of calibration out).
 
-    A camera whose own plane is off by more than 20 mm or 2 degrees, or that sees no plane, uses the common one.
+    The table is looked for at any height within the region's x and y; ``notes`` gets a sentence where its height is not
+    expected, or another level has the same claim.  A camera that sees no plane near the common one uses that.
     """
     clouds = []
-    low, high = np.asarray(parameters.region_low) - [0, 0, 0.05], np.asarray(parameters.region_high)
-    bounded = [axis for axis in range(3) if np.isfinite(low[axis]) or np.isfinite(high[axis])]
+    low, high = np.asarray(parameters.region_low, float), np.asarray(parameters.region_high, float)
+    bounded = [axis for axis in range(2) if np.isfinite(low[axis]) or np.isfinite(high[axis])]
     for frame in frames:
         k = frame.intrinsics
         z = frame.depth[::4, ::4]
@@ -106,17 +113,33 @@ def find_table(frames: list[RgbdFrame], parameters: Parameters) -> tuple[Plane, 
             keep &= (points[:, axis] > low[axis]) & (points[:, axis] < high[axis])
         clouds.append(points[keep])
     up = (0.0, 0.0, 1.0)
-    both = fit_plane(np.concatenate(clouds), up, parameters.table_tilt, parameters.table_band, seed=parameters.seed)
+    everything = np.concatenate(clouds)
+    both = fit_plane(everything, up, parameters.table_tilt, parameters.table_band, seed=parameters.seed)
+    found = supports(everything, both, parameters.table_band)
+    if found[0].plane is not both and found[0].plane.coefficients[3] != both.coefficients[3]:
+        near = everything[np.abs(found[0].plane.heights(everything)) < 2 * parameters.table_band]
+        both = fit_plane(near, found[0].plane.normal, 5.0, parameters.table_band, seed=parameters.seed)
+    centre = np.median(everything[np.abs(both.heights(everything)) < 0.02], axis=0)
+    if notes is not None:
+        for other in found[1:]:
+            if other.things >= found[0].things > 0:
+                notes.append(
+                    f"table ambiguous: {other.things} things stand {1000 * -other.plane.heights(centre):.0f} mm above the plane taken, as many as on it"
+                )
+        if not low[2] <= centre[2] <= max(-low[2], 0.0):
+            notes.append(
+                f"table found {1000 * centre[2]:.0f} mm from the base's height (region_low z: {1000 * low[2]:.0f} mm): heights are taken from the table found"
+            )
     own = []
     for cloud in clouds:
         plane = both
-        near = cloud[np.abs(both.heights(cloud)) < 0.025]
+        heights = np.abs(both.heights(cloud))
+        # Far from the common plane only where little lies near it: a tray's plane is not to be lost to the table's below it.
+        close = np.count_nonzero(heights < parameters.table_band) > 0.3 * both.inliers * len(cloud)
+        near = cloud[heights < (parameters.table_band if close else APART)]
         if len(near) > 300:
             try:
-                found = fit_plane(near, both.normal, 3.0, parameters.table_band, iterations=80, seed=parameters.seed)
-                centre = near.mean(axis=0)
-                if found.tilt(both.normal) < 2.0 and abs(found.heights(centre) - both.heights(centre)) < 0.02:
-                    plane = found
+                plane = fit_plane(near, both.normal, TILTED, parameters.table_band, iterations=80, seed=parameters.seed)
             except MagicError:
                 pass
         own.append(plane)
@@ -149,7 +172,7 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
     reach = np.float32(-row[3]) / np.minimum(fall, np.float32(-1e-3))
     inside = reach < 5.0
     distance = None
-    for axis in range(3):
+    for axis in range(2):
         low, high = np.float32(parameters.region_low[axis]), np.float32(parameters.region_high[axis])
         if np.isfinite(low) or np.isfinite(high):
             distance = np.where(valid, z, reach) if distance is None else distance
@@ -159,6 +182,8 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
             inside &= where > low
             inside &= where < high
     raw[~valid] = np.nan
+    with np.errstate(invalid="ignore"):
+        inside &= ~((raw < np.float32(parameters.region_low[2])) | (raw > np.float32(parameters.region_high[2])))
     zero = np.where(valid, raw, np.float32(0))
     # Bias of depth over the table, which varies slowly over the picture: a quarter of its resolution will do.
     near = (valid & (np.abs(zero) < 0.008)).astype(np.float32)
@@ -183,7 +208,7 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
     else:
         sigma *= np.float32(1.4826 * 0.002)
     sigma[~valid] = 0.002
-    return Looked(frame, raw, heights, inside, np.maximum(sigma, np.float32(3e-4)))
+    return Looked(frame, raw, heights, inside, np.maximum(sigma, np.float32(3e-4)), world_from_table[:3, 2].copy())
 
 
 def _frame_on(plane: Plane, world_from_table: NDArray[np.float64]) -> NDArray[np.float64]:

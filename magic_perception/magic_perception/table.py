@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -94,6 +95,94 @@ def fit_plane(
     return plane
 
 
+#: Of a support that lies on another (a tray, a board, a mat): its largest height, its least edge and its least area, m and m^2.
+RAISED, EDGE, AREA = 0.045, 0.16, 0.04
+
+
+@dataclass(frozen=True)
+class Support:
+    """A plane that may be the table: how many things stand on it, and the share of the points that lie on it."""
+
+    plane: Plane
+    things: int
+    share: float
+
+
+def standing(
+    heights: NDArray[np.floating], xy: NDArray[np.floating], level: float, band: float = 0.008, cell: float = 0.01
+) -> tuple[int, float]:
+    """How many things stand on a level, and its area in m^2.
+
+    heights (N,) and xy (N, 2) metres in a frame with z up.  A thing is a connected region of at most half a metre that rises from the
+    level by more than 12 mm, and around which at least six tenths of what is seen is the level.
+    """
+    low = xy.min(axis=0) - 4 * cell
+    index = np.floor((xy - low) / cell).astype(int)
+    size = index.max(axis=0) + 5
+    if size.max() > 1000:
+        return 0, 0.0
+    flat = index[:, 0] * size[1] + index[:, 1]
+    top = np.full(int(size.prod()), -np.inf)
+    np.maximum.at(top, flat, heights)
+    count = np.bincount(flat[np.abs(heights - level) < band], minlength=len(top)).reshape(size)
+    top = top.reshape(size)
+    on = (count > 0) & (top < level + 0.012)
+    above = (top >= level + 0.012).astype(np.uint8)
+    above = cv2.morphologyEx(above, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(above, connectivity=8)
+    things = 0
+    for i in range(1, n):
+        x, y, w, h, area = stats[i]
+        if area < 4 or max(w, h) * cell > 0.5:
+            continue
+        cut = (slice(max(y - 3, 0), y + h + 3), slice(max(x - 3, 0), x + w + 3))
+        mine = (labels[cut] == i).astype(np.uint8)
+        ring = (cv2.dilate(mine, np.ones((5, 5), np.uint8)) > 0) & (mine == 0)
+        known = ring & np.isfinite(top[cut])
+        things += int(known.sum() >= 0.25 * ring.sum() and on[cut][known].mean() >= 0.6)
+    return things, float(on.sum()) * cell * cell
+
+
+def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> list[Support]:
+    """The level ``plane`` and those parallel to it that hold many points (N, 3), the likeliest table first.
+
+    The table is the level that most things stand on; of equals the one that more points lie on.  A level a little above another
+    counts where it is as wide as a tray, a board or a mat; one high above another where it is as wide as a table: the top
+    of a box is none, though things may stand on it.
+    """
+    frame = world_from_plane(plane)
+    local = transforms.apply(transforms.inverse(frame), points)
+    heights, xy = local[:, 2], local[:, :2]
+    step = 0.004
+    low = float(heights.min()) - step
+    histogram = np.bincount(((heights - low) / step).astype(int))
+    smooth = np.convolve(histogram, [1, 1, 1], mode="same")
+    levels = [0.0]
+    order = np.argsort(smooth)[::-1]
+    for i in order[: np.count_nonzero(smooth >= max(0.03 * len(points), 80))]:
+        level = low + (i + 0.5) * step
+        if all(abs(level - other) > 2.0 * band for other in levels):
+            levels.append(level)
+    found = []
+    for level in levels:
+        near = np.abs(heights - level) < band
+        if level != 0.0:
+            level = float(np.median(heights[near]))
+        things, area = standing(heights, xy, level, band)
+        share = float(near.mean())
+        if level != 0.0:
+            size = np.sort(np.subtract(*np.percentile(xy[near], [95, 5], axis=0)))
+            below = [other for other in levels if other < level - 2 * band]
+            tray = any(level - other <= RAISED for other in below) and size[0] >= EDGE and area >= AREA
+            wide = size[0] >= 0.35 and area >= 0.12
+            if below and not (tray or wide):
+                continue
+        coefficients = plane.coefficients.copy()
+        coefficients[3] -= level
+        found.append(Support(Plane(coefficients, share), things, share))
+    return sorted(found, key=lambda s: (s.things, s.share), reverse=True)
+
+
 def world_from_plane(plane: Plane) -> NDArray[np.float64]:
     """The frame on the plane below the origin, z along its normal, x the origin frame's x (or y) made level."""
     z = plane.normal
@@ -102,13 +191,87 @@ def world_from_plane(plane: Plane) -> NDArray[np.float64]:
     return transforms.make(np.column_stack([x, np.cross(z, x), z]), -plane.coefficients[3] * z)
 
 
-def camera_over_table(points: NDArray[np.float64], band: float = 0.008, seed: int = 0) -> NDArray[np.float64]:
-    """world_from_camera (4, 4) of a camera whose pose is not known, from the table that it sees.
+#: Cosine between a plane's normal and the picture's down beyond which the plane is upright: a wall, seen by a camera that looks down by 15 degrees.
+UPRIGHT = 0.26
+
+
+def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 0, notes: list[str] | None = None) -> Plane:
+    """The table among the planes that a camera sees whose pose is not known; points (..., 3) in the optical frame, NaN allowed.
+
+    Nothing but the picture's own up, which a camera on its tripod or in a hand keeps roughly, tells a wall from a table: a plane whose
+    normal points down in the picture is upright, and of two at right angles the one that faces up less.  Of the others the one that
+    most things stand on is the table.
+    ``notes`` gets a sentence where another plane has the same claim.  Raises ``NO_TABLE``; ``TABLE_AMBIGUOUS`` where all planes are upright.
+    """
+    points = np.asarray(points, dtype=float).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    first = fit_plane(points, band=band, seed=seed)
+    rest, planes = points, [first]
+    while len(planes) < 4:
+        rest = rest[np.abs(planes[-1].heights(rest)) > 2 * band]
+        if len(rest) < max(0.12 * len(points), 400):
+            break
+        try:
+            planes.append(fit_plane(rest, band=band, seed=seed))
+        except MagicError:
+            break
+    level = [
+        plane
+        for plane in planes
+        if plane.normal[1] <= UPRIGHT
+        and not any(abs(plane.normal @ other.normal) < 0.35 and other.normal[1] < plane.normal[1] - 0.3 for other in planes)
+    ]
+    if not level:
+        down = float(np.degrees(np.arcsin(np.clip(first.normal[1], -1, 1))))
+        raise MagicError(
+            Code.TABLE_AMBIGUOUS,
+            "largest plane",
+            f"upright in the picture (its normal points down in it by {down:.0f} degrees), {first.inliers:.0%} of the depth",
+            f"a table in view: a plane that faces up in the picture and holds at least 12 % of the depth, of {len(planes)} planes found",
+        )
+    found: list[Support] = []
+    for plane in level:
+        # Parallel ones are levels of one family: each family is judged once.
+        if not any(plane.normal @ other.plane.normal > 0.98 and _listed(plane, found, band) for other in found):
+            found += supports(points, plane, band)
+    found.sort(key=lambda s: (s.things, s.share), reverse=True)
+    best = found[0]
+    plane = best.plane
+    near = points[np.abs(plane.heights(points)) < 2 * band]
+    if plane is not first and len(near) > 300:
+        plane = fit_plane(near, plane.normal, 5.0, band, seed=seed)
+    if notes is not None:
+        if all(plane is not first for plane in level):
+            notes.append(f"the largest plane ({first.inliers:.0%} of the depth) is upright in the picture: not the table")
+        for other in found[1:]:
+            if other.things >= best.things > 0 and other.share > 0.1:
+                notes.append(
+                    f"table ambiguous: as many things ({other.things}) stand on a plane {_between(plane, other.plane)}; "
+                    f"taken was the one with {best.share:.0%} of the depth, not {other.share:.0%}"
+                )
+    return plane
+
+
+def _listed(plane: Plane, found: list[Support], band: float) -> bool:
+    return any(abs(plane.coefficients[3] - other.plane.coefficients[3]) < 2 * band for other in found)
+
+
+def _between(one: Plane, other: Plane) -> str:
+    angle = one.tilt(other.normal)
+    if angle > 5:
+        return f"{angle:.0f} degrees inclined to it"
+    return f"{1000 * abs(one.coefficients[3] - other.coefficients[3]):.0f} mm from it"
+
+
+def camera_over_table(
+    points: NDArray[np.float64], band: float = 0.008, seed: int = 0, notes: list[str] | None = None
+) -> NDArray[np.float64]:
+    """world_from_camera (4, 4) of a camera whose pose is not known, from the table that it sees (:func:`table_in_view`).
 
     points (..., 3) in the optical frame.  The world's origin lies on the table below the camera,
     z up, x level in the direction that the camera looks.
     """
-    plane = fit_plane(np.asarray(points).reshape(-1, 3), band=band, seed=seed)
+    plane = table_in_view(points, band, seed, notes)
     z = plane.normal
     forward = np.array([0.0, 0.0, 1.0])
     x = forward - (forward @ z) * z

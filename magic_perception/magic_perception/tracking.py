@@ -44,6 +44,8 @@ class Tracker:
                 if candidate not in taken:
                     names[i] = candidate
             renamed.append(replace(item, id=names[i]))
+        new = {old.id: item.id for old, item in zip(seen, renamed, strict=True)}
+        renamed = [replace(item, cut_off=tuple(new.get(by, by) for by in item.cut_off)) for item in renamed]
         self._last = {n: (c, e, age + 1) for n, (c, e, age) in self._last.items() if age + 1 < self.memory}
         for item in renamed:
             self._last[item.id] = (item.world_from_object[:3, 3].copy(), item.box_extents.copy(), 0)

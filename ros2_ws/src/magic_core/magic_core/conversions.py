@@ -291,6 +291,8 @@ def view_from_msg(msg: mi.CanonicalView) -> CanonicalView:
 def object_to_msg(item: SceneObject, header: Header) -> mi.SceneObject:
     """SceneObject to its message; ``header`` is that of the array it goes into."""
     msg = mi.SceneObject(id=item.id, source=item.source, camera=item.camera, confidence=float(item.confidence))
+    msg.seen_share = float(item.seen_share)
+    msg.cut_off = list(item.cut_off)
     msg.pose = pose_to_msg(item.world_from_object)
     msg.mesh = mesh_to_msg(item.mesh)
     msg.pieces = [mesh_to_msg(piece) for piece in item.pieces]
@@ -333,6 +335,8 @@ def object_from_msg(msg: mi.SceneObject) -> SceneObject:
         box_extents=np.array([msg.box_size.x, msg.box_size.y, msg.box_size.z]),
         confidence=float(msg.confidence),
         source=msg.source,
+        seen_share=float(msg.seen_share),
+        cut_off=tuple(msg.cut_off),
     )
 
 
@@ -354,7 +358,14 @@ def plane_from_msg(msg: Plane) -> NDArray[np.float64]:
 def scene_to_msg(scene: Scene) -> mi.SceneObjectArray:
     """Scene to SceneObjectArray."""
     head = header(scene.frame_id, scene.stamp)
-    return mi.SceneObjectArray(header=head, objects=[object_to_msg(item, head) for item in scene.objects], table=plane_to_msg(scene.table))
+    return mi.SceneObjectArray(
+        header=head,
+        objects=[object_to_msg(item, head) for item in scene.objects],
+        table=plane_to_msg(scene.table),
+        camera_offset=float(scene.camera_offset),
+        camera_angle=float(scene.camera_angle),
+        notes=list(scene.notes),
+    )
 
 
 def scene_from_msg(msg: mi.SceneObjectArray) -> Scene:
@@ -364,6 +375,9 @@ def scene_from_msg(msg: mi.SceneObjectArray) -> Scene:
         plane_from_msg(msg.table),
         time_from_msg(msg.header.stamp),
         msg.header.frame_id,
+        float(msg.camera_offset),
+        float(msg.camera_angle),
+        tuple(msg.notes),
     )
 
 

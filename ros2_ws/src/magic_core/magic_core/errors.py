@@ -32,6 +32,8 @@ class Code(IntEnum):
     BAD_BAG = 111
     UNKNOWN_SEGMENTER = 112
     SEGMENTER_WEIGHTS = 113
+    CAMERAS_DISAGREE = 114
+    TABLE_AMBIGUOUS = 115
 
     # Matching
     UNKNOWN_STRATEGY = 200
@@ -44,6 +46,7 @@ class Code(IntEnum):
     FEATURE_WEIGHTS = 207
     NO_CURVATURE = 208
     BAD_STRATEGY = 209
+    OBJECT_CUT_OFF = 210
 
     # Planning
     BAD_MOTION = 300

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+
+#: What besides an object's id may stand in SceneObject.cut_off: the border of the pictures, of the region of interest, a known object or the robot.
+PICTURE, REGION, FIXTURE = "picture", "region", "fixture"
 
 VIEW_KINDS = ("top", "side", "section")
 
@@ -78,6 +82,11 @@ class SceneObject:
     metres with colors (N, 3) uint8 are the cleaned cloud.  mask (H, W) bool in the
     image of ``camera``.  box_extents (3,) metres along the axes of world_from_box.
     ``source`` is ``camera``, or ``known`` for a calibrated fixture or a given mesh.
+    ``confidence`` 0..1 is the chance, as measured on known scenes, that mask and solid
+    overlap the truth by more than 0.8; ``seen_share`` 0..1 how much of the mesh's surface,
+    what rests on the table left out, a camera saw.  ``cut_off`` names what keeps a part out
+    of sight: ``picture``, ``region``, ``fixture``, or ids of objects in front; such a
+    thing is no whole tool.
     """
 
     id: str
@@ -93,6 +102,8 @@ class SceneObject:
     box_extents: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     confidence: float = 1.0
     source: str = "camera"
+    seen_share: float = 1.0
+    cut_off: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -100,12 +111,17 @@ class Scene:
     """What is on the table at one moment.
 
     table (4,): the plane a x + b y + c z + d = 0 in world coordinates, unit normal up.
+    camera_offset (metres) and camera_angle (radians): how far the cameras' poses disagree,
+    the worst pair; NaN where it could not be measured.  notes: what there is to say of the scene.
     """
 
     objects: tuple[SceneObject, ...]
     table: NDArray[np.float64]
     stamp: float = 0.0
     frame_id: str = "panda_link0"
+    camera_offset: float = math.nan
+    camera_angle: float = math.nan
+    notes: tuple[str, ...] = ()
 
     def find(self, object_id: str) -> SceneObject:
         """The object of that id; raises ``UNKNOWN_OBJECT`` naming the ids there are."""

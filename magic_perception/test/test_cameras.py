@@ -1,0 +1,139 @@
+"""Cameras that disagree, the table among planes, and what is seen in part, on ray-cast scenes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from magic_core import sensor, shapes, transforms
+from magic_core.camera import Intrinsics
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.table import camera_over_table, table_in_view
+
+REGION = Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    meshes = [
+        scenes.shape("l_hook", 1, 0.5, -0.1, 0.4),
+        scenes.shape("cylinder", 1, 0.62, 0.12),
+        scenes.shape("scissors", 1, 0.6, -0.27, 0.2),
+    ]
+    caster = sensor.scene_raycaster(meshes)
+    return [
+        sensor.capture([], scenes.INTRINSICS, pose, [5, i], camera=name, raycaster=caster)
+        for i, (name, pose) in enumerate(scenes.POSES.items())
+    ]
+
+
+def moved(frames, motion):
+    """The second camera's extrinsics off by a motion (4, 4) of the world."""
+    return [frames[0], replace(frames[1], world_from_camera=motion @ frames[1].world_from_camera)]
+
+
+def test_good_cameras_agree(pair):
+    report = Report()
+    scene = perceive(pair, parameters=REGION, report=report)
+    assert len(scene.objects) == 3 and scene.camera_offset < 0.004 and not report.notes and not scene.notes
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        transforms.make(translation=[0.018, -0.012, 0]),
+        transforms.make(translation=[0, 0, 0.03]),
+        scenes.POSES["right"] @ transforms.from_rpy(0, np.radians(2), 0) @ transforms.inverse(scenes.POSES["right"]),
+    ],
+    ids=["beside", "above", "turned"],
+)
+def test_cameras_far_apart_are_refused_with_how_far(pair, motion):
+    with pytest.raises(MagicError, match="right sees the scene") as caught:
+        perceive(moved(pair, motion), parameters=REGION)
+    assert caught.value.code == Code.CAMERAS_DISAGREE
+    told = float(str(caught.value).split("sees the scene ")[1].split(" mm")[0])
+    middle = np.array([0.57, -0.1, 0.02])
+    assert told == pytest.approx(1000 * np.linalg.norm(transforms.apply(motion, middle) - middle), abs=5)
+
+
+def test_cameras_a_little_apart_are_brought_together(pair):
+    motion = transforms.make(translation=[0.0065, 0.004, 0])
+    report = Report()
+    scene = perceive(moved(pair, motion), parameters=REGION, report=report)
+    assert scene.camera_offset == pytest.approx(0.0076, abs=0.003) and "cameras disagree" in scene.notes[0]
+    # Each is moved half way, so that a tin is as round and as large as where they agree.
+    tins = [
+        min(s.objects, key=lambda o: np.linalg.norm(o.world_from_object[:2, 3] - [0.62, 0.12]))
+        for s in (scene, perceive(pair, parameters=REGION))
+    ]
+    np.testing.assert_allclose(tins[0].box_extents, tins[1].box_extents, atol=0.003)
+    np.testing.assert_allclose(tins[0].world_from_object[:2, 3] - tins[1].world_from_object[:2, 3], motion[:2, 3] / 2, atol=0.003)
+
+
+def test_a_table_below_the_base_is_used_and_said(pair):
+    motion = transforms.make(translation=[0, 0, -0.09])
+    low = [replace(frame, world_from_camera=motion @ frame.world_from_camera) for frame in pair]
+    scene = perceive(low, parameters=REGION)
+    assert len(scene.objects) == 3 and scene.table_height == pytest.approx(-0.09, abs=0.002)
+    assert "-90 mm" in scene.notes[0] and "region_low" in scene.notes[0]
+
+
+def slab(size, centre, color):
+    import trimesh
+
+    box = trimesh.creation.box(size)
+    return Mesh(np.asarray(box.vertices) + centre, np.asarray(box.faces)).painted(color)
+
+
+def test_things_on_a_tray_stand_on_the_tray():
+    tray = slab([0.36, 0.44, 0.018], [0.55, 0.0, 0.009], (60, 90, 120))
+    things = [scenes.shape("l_hook", 1, 0.5, -0.08, 0.4), scenes.shape("cylinder", 1, 0.6, 0.1)]
+    lifted = [mesh.transformed(transforms.make(translation=[0, 0, 0.018])) for mesh in things]
+    caster = sensor.scene_raycaster([tray, *lifted])
+    frames = [
+        sensor.capture([], scenes.INTRINSICS, pose, [6, i], camera=name, raycaster=caster)
+        for i, (name, pose) in enumerate(scenes.POSES.items())
+    ]
+    scene = perceive(frames, parameters=REGION)
+    assert len(scene.objects) == 2 and scene.table_height == pytest.approx(0.018, abs=0.002)
+    for mesh in lifted:
+        found = min(scene.objects, key=lambda o: np.linalg.norm(o.world_from_object[:3, 3] - mesh.bounds.mean(axis=0)))
+        assert found.mesh.transformed(found.world_from_object).bounds[0, 2] == pytest.approx(0.018, abs=0.003)
+        np.testing.assert_allclose(np.sort(found.box_extents)[-1], np.sort(mesh.extents)[-1], rtol=0.25)
+
+
+def wall_scene(elevation, wall):
+    """Depth points (H, W, 3) and world_from_camera of a table of 0.25 m depth before a high wall, with two things on it."""
+    k = Intrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
+    table = Mesh([[-0.6, -0.25, 0], [0.6, -0.25, 0], [0.6, 0.2, 0], [-0.6, 0.2, 0]], [[0, 1, 2], [0, 2, 3]]).painted((150, 120, 90))
+    meshes = [scenes.placed(shapes.make("mug", 3).mesh, -0.12, 0.0, 0.5), scenes.placed(shapes.make("cylinder", 2).mesh, 0.15, 0.02)]
+    if wall:
+        meshes.append(slab([2.4, 0.01, 1.6], [0, 0.205, 0.8], (200, 200, 205)))
+    at, away = np.array([0, 0.1, 0.12]), 0.8
+    pose = sensor.looking_at(at + away * np.array([0, -np.cos(elevation), np.sin(elevation)]), at)
+    frame = sensor.capture(meshes, k, pose, 3, table=table)
+    return k.unproject(frame.depth), pose
+
+
+@pytest.mark.parametrize("degrees", [15, 25, 40])
+def test_a_wall_is_no_table(degrees):
+    points, pose = wall_scene(np.radians(degrees), wall=True)
+    notes = []
+    found = camera_over_table(points, notes=notes)
+    assert found[2, 3] == pytest.approx(pose[2, 3], abs=0.01)
+    assert np.degrees(np.arccos(np.clip(found[2, :3] @ pose[2, :3], -1, 1))) < 1.5
+    assert any("upright in the picture" in note for note in notes)
+
+
+def test_a_wall_alone_is_refused():
+    k = Intrinsics(160, 120, 150.0, 150.0, 79.5, 59.5)
+    wall = slab([4, 0.01, 4], [0, 0.5, 0], (200, 200, 205))
+    pose = sensor.looking_at([0, -0.5, 0.6], [0, 0.5, 0.1])
+    frame = sensor.capture([wall], k, pose, 3, table=Mesh([[0, 9, -9], [1, 9, -9], [0, 9.1, -9]], [[0, 1, 2]]).painted((9, 9, 9)))
+    with pytest.raises(MagicError, match="upright in the picture") as caught:
+        table_in_view(k.unproject(frame.depth))
+    assert caught.value.code == Code.TABLE_AMBIGUOUS
