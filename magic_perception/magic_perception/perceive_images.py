@@ -71,6 +71,8 @@ def write(scene_dir: Path, frame: RgbdFrame, scene, report: Report, seconds: flo
                     "confidence": item.view.confidence,
                 },
                 "confidence": item.confidence,
+                "seen_share": item.seen_share,
+                "cut_off": list(item.cut_off),
             }
         )
     cv2.imwrite(str(scene_dir / "labels.png"), labels if labels.max() > 255 else labels.astype(np.uint8))
@@ -104,6 +106,7 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--no-split", action="store_true", help="do not part touching objects at concave seams")
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
     given = parser.parse_args(args)
+    report = Report()
     try:
         start = time.perf_counter()
         color, depth, intrinsics = read_frame(given.color, given.depth, given.intrinsics, given.depth_unit)
@@ -118,7 +121,7 @@ def main(args: list[str] | None = None) -> None:
             except ValueError:
                 raise MagicError(Code.NO_TRANSFORM, "--camera-pose", given.camera_pose, "x,y,z,qx,qy,qz,qw") from None
         else:
-            pose = camera_over_table(intrinsics.unproject(depth)[::3, ::3])
+            pose = camera_over_table(intrinsics.unproject(depth)[::3, ::3], notes=report.notes)
         frame = RgbdFrame(color, depth, intrinsics, pose, "camera")
         reach = given.max_distance
         parameters = Parameters(
@@ -127,7 +130,6 @@ def main(args: list[str] | None = None) -> None:
             method=given.method,
             split=not given.no_split,
         )
-        report = Report()
         scene = perceive(
             [frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report
         )
@@ -139,7 +141,10 @@ def main(args: list[str] | None = None) -> None:
         size = " x ".join(f"{1000 * x:.0f}" for x in item.box_extents)
         print(
             f"{item.id}: {size} mm, {report.pixels.get(item.id, 0)} pixels, {report.shapes.get(item.id, '')}, view {item.view.kind}, confidence {item.confidence:.2f}"
+            + (f", cut off by {' and '.join(item.cut_off)}" if item.cut_off else "")
         )
+    for note in report.notes:
+        print(f"note: {note}")
     print(f"{len(scene.objects)} objects in {given.out}")
     sys.exit(0)
 
