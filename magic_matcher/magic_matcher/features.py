@@ -159,11 +159,10 @@ def make_reference(
 
 
 def from_strategy(strategy: Strategy) -> Reference:
-    """The reference of a strategy: its tool's view and contact, and the target's radius at p_O."""
-    radius = strategy.target_contact.radius / strategy.tool_view.metres_per_pixel
-    return make_reference(
-        strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius if np.isfinite(radius) else None
-    )
+    """The reference of a strategy: its tool's view and contact, and the target's radius at p_O where it is round there."""
+    target = strategy.target_contact
+    radius = target.radius / strategy.tool_view.metres_per_pixel if np.isfinite(target.radius) and not target.concave else None
+    return make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
 
 
 def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: Any) -> Features:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from magic_core.contact import Contact, ContactCandidate, contact_frame, turned_
 from magic_core.errors import Code, MagicError
 from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.shapes import section_view
 from magic_core.strategy import Strategy
 from magic_matcher import contour as contours
 from magic_matcher import curvature, features, score
@@ -31,6 +32,8 @@ from magic_matcher.features import Features, GlobalMatch, Proposal, Reference
 OVERSAMPLING = 2
 #: Two candidates nearer than this share of the tool's size are the same place.
 SAME_PLACE = 0.06
+#: What faces a direction does so within this angle (rad); narrower ways across (share of the object's size) are the raster's.
+FACING, LEAST_ACROSS = np.deg2rad(30.0), 0.03
 
 
 @dataclass(frozen=True)
@@ -78,11 +81,16 @@ def tool_view(item: SceneObject, kind: str) -> CanonicalView:
 
 
 def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
-    """The target as seen along the strategy's direction, world up (world x where it looks down) at the top of the picture."""
+    """The target as seen along the strategy's direction, world up (world x where it looks down) at the top of the picture.
+
+    Where the strategy's contact is on the target's outline as cut through its middle, the cut is what is drawn.
+    """
     object_from_world = transforms.inverse(item.world_from_object)
     direction = strategy.target_view_direction
     up = np.array([0.0, 0.0, 1.0]) if abs(direction[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     rotation = object_from_world[:3, :3]
+    if strategy.target_outline == "cut":
+        return replace(section_view(item.mesh, rotation @ direction, rotation @ up), kind=strategy.view)
     return canonical_view(item.mesh, rotation @ direction, rotation @ up, strategy.view)
 
 
@@ -98,17 +106,49 @@ def to_contact(view: CanonicalView, found: curvature.Estimate) -> Contact:
 
 def support_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
     """Index of the contour point farthest along a picture direction (2,); in the middle of a flat side."""
-    outer = np.nonzero(contour.loop == 0)[0]
-    height = contour.points @ direction
-    top = float(height[outer].max())
-    level = outer[height[outer] >= top - tolerance]
+    return _middle_of_highest(contour, np.nonzero(contour.loop == 0)[0], direction, tolerance)
+
+
+def inner_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
+    """Index of the contour point that a tool meets which is led against a picture direction (2,) inside the object.
+
+    Inside is where, going from the object along ``direction``, one comes to the object again: a hole, a notch.  Of several the one
+    with the widest way across is taken, in it the point that lies farthest against ``direction``, in the middle of a flat side.
+    Raises ``NO_MATCH`` where the outline has no such place.
+    """
+    facing = np.nonzero(contour.normals @ direction > np.cos(FACING))[0]
+    way = np.arange(2.0, contour.size + 2.0)
+    ahead = (contour.points[facing, None] + way[:, None] * direction).astype(np.float32)
+    solid = contour.sample(ahead[..., 0], ahead[..., 1]) > 0.5
+    across = np.where(solid.any(axis=1), way[np.argmax(solid, axis=1)], 0.0)
+    facing, across = facing[across > LEAST_ACROSS * contour.size], across[across > LEAST_ACROSS * contour.size]
+    if not len(facing):
+        raise MagicError(
+            Code.NO_MATCH,
+            "places inside the target's outline that face the tool",
+            0,
+            "a hole or a notch that is open towards the strategy's target normal",
+        )
+    # Stretches: neighbours on one loop.  A loop that begins within a stretch cuts it in two, which changes nothing that counts.
+    stretch = np.concatenate([[0], np.cumsum((np.diff(facing) > 3) | (np.diff(contour.loop[facing]) != 0))])
+    widest = stretch[int(np.argmax(across))]
+    return _middle_of_highest(contour, facing[stretch == widest], -direction, tolerance)
+
+
+def _middle_of_highest(contour: Contour, among: NDArray[np.int64], direction: NDArray[np.float64], tolerance: float) -> int:
+    """Index of the point farthest along a direction (2,) of those ``among`` (K,) the contour's; in the middle of a flat side."""
+    height = contour.points[among] @ direction
+    level = among[height >= float(height.max()) - tolerance]
     across = contour.points[level] @ np.array([-direction[1], direction[0]])
     middle = 0.5 * (float(across.min()) + float(across.max()))
     return int(level[np.argmin(np.abs(across - middle))])
 
 
 def target_contact(strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64]) -> Contact:
-    """p_O': where the target's silhouette reaches farthest along the strategy's target normal, with the curvature there."""
+    """p_O': where the target's silhouette reaches farthest along the strategy's target normal, with the curvature there.
+
+    For a strategy that meets its target inside, the place inside that faces that normal (:func:`inner_point`).
+    """
     normal = world_from_object[:3, :3].T @ strategy.target_normal
     picture = normal @ view.object_from_view[:3, :2]
     if np.linalg.norm(picture) < 0.1:
@@ -117,7 +157,8 @@ def target_contact(strategy: Strategy, view: CanonicalView, world_from_object: N
         )
     direction = picture / np.linalg.norm(picture)
     contour = contours.extract(view.mask)
-    found = curvature.estimate(contour, support_point(contour, direction))
+    place = support_point if strategy.target_outline == "outer" else inner_point
+    found = curvature.estimate(contour, place(contour, direction))
     contact = to_contact(view, found)
     # The normal asked for is the one acted along; the picture's own differs from it by raster noise only.
     if float(contact.normal @ direction) > np.cos(np.deg2rad(20)):
@@ -155,7 +196,14 @@ def choose_target(strategy: Strategy, objects: Sequence[SceneObject]) -> SceneOb
     """The object that looks most like the demonstration's target, seen as the target is, in shape and size."""
     if not objects:
         raise MagicError(Code.UNKNOWN_OBJECT, "objects to choose the target from", 0, "at least one")
-    return max(objects, key=lambda item: likeness(strategy.target_view, target_view(item, strategy)))
+
+    def alike(item: SceneObject) -> float:
+        try:
+            return likeness(strategy.target_view, target_view(item, strategy))
+        except MagicError:  # what cannot be drawn as the target was (a mesh that is not closed has no cut) is not like it
+            return -1.0
+
+    return max(objects, key=alike)
 
 
 # ---------------------------------------------------------------- the matcher
@@ -236,14 +284,15 @@ class Matcher:
         if not tools:
             raise MagicError(Code.UNKNOWN_OBJECT, "tools", "none", "at least one object besides the target")
         prepared = self.prepare(reference)
-        use_target = target is not None and reference_target_radius is not None
+        # The radius of the disc that the tool is to hold; what is flat or is met inside is no disc.
+        round_target = target is not None and np.isfinite(target.contact.radius) and not target.contact.concave
+        use_target = round_target and reference_target_radius is not None and np.isfinite(reference_target_radius)
         found: list[tuple[ContactCandidate, NDArray[np.float32] | None]] = []
         failures: list[MagicError] = []
         for tool in tools:
             try:
                 contour = contours.extract(tool.view.mask)
-                radius = target.contact.radius / tool.view.metres_per_pixel if target is not None else None
-                radius = radius if radius is not None and np.isfinite(radius) else None
+                radius = target.contact.radius / tool.view.metres_per_pixel if round_target else None
                 proposals = self.backend.propose(prepared, tool.view, contour, radius, OVERSAMPLING * top_k, heatmap)
                 reference_scale = reference_target_radius if use_target else reference.contour.size * reference.view.metres_per_pixel
                 scale = target.contact.radius if use_target else contour.size * tool.view.metres_per_pixel

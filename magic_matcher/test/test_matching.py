@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy import ndimage
 
 from magic_core import shapes, transforms
 from magic_core.contact import turned_over
 from magic_core.errors import Code, MagicError
-from magic_core.scene import CanonicalView, Scene
+from magic_core.mesh import from_trimesh
+from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_matcher import contour, features, jobs, matching
 from magic_matcher.cache import Cache
 from magic_matcher.features import make_reference
@@ -144,6 +146,53 @@ def test_support_point_is_in_the_middle_of_a_flat_side():
     mask[30:70, 20:180] = True
     c = contour.extract(mask)
     assert c.points[matching.support_point(c, np.array([0.0, -1.0]))] == pytest.approx([99.5, 29.5], abs=1.0)
+
+
+@pytest.mark.parametrize("angle", np.deg2rad([0.0, 37.0, 90.0, 200.0]))
+def test_a_tool_meets_a_ring_at_the_side_of_its_hole_against_which_it_is_led(angle):
+    v, u = np.mgrid[0:240, 0:240] - 119.5
+    ring = (np.hypot(u, v) <= 100) & (np.hypot(u - 20, v) > 60)
+    ring &= np.hypot(u + 75, v) > 8  # a small hole beside the wide one
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    c = contour.extract(ring)
+    at = matching.inner_point(c, direction)
+    assert c.points[at] == pytest.approx(np.array([139.5, 119.5]) - 60 * direction, abs=1.5)
+    assert c.normals[at] @ direction > 0.99
+
+
+def test_what_is_open_has_an_inner_side_and_what_is_full_has_none():
+    cup = np.zeros((120, 160), bool)
+    cup[20:100, 20:140] = True
+    cup[20:90, 40:120] = False
+    c = contour.extract(cup)
+    assert c.points[matching.inner_point(c, np.array([1.0, 0.0]))] == pytest.approx([39.5, 54.5], abs=2.0)
+    with pytest.raises(MagicError) as error:
+        matching.inner_point(c, np.array([0.0, -1.0]))  # from its bottom one comes into the open
+    assert error.value.code == Code.NO_MATCH
+
+
+def test_a_contact_inside_is_found_in_the_silhouette_or_in_the_cut(demonstration):
+    # A ring on the table: from above its hole is seen, from the side only the cut shows it.
+    mesh = from_trimesh(trimesh.creation.annulus(0.03, 0.045, 0.02))
+    item = SceneObject("ring", mesh, (mesh,), transforms.from_rpy(0, 0, 0.8, (0.5, 0.1, 0.01)), demonstration.target_view)
+    for outline, looked in (("inner", [0, 0, -1.0]), ("cut", [0, 1.0, 0])):
+        strategy = replace(demonstration, target_outline=outline, target_view_direction=np.array(looked))
+        contact = matching.target_contact(strategy, matching.target_view(item, strategy), item.world_from_object)
+        world = item.world_from_object @ contact.object_from_contact
+        assert world[:3, 3] == pytest.approx([0.47, 0.1, 0.01], abs=0.0015)
+        assert world[:3, 0] == pytest.approx([1, 0, 0], abs=0.05)
+
+
+def test_a_flat_target_and_one_met_inside_have_no_radius_to_compare(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    tool = matching.Tool("c", jobs.example("hooking", "caliper", 4).view)
+    target = jobs.disc_target(0.02, "top")
+    plain = matcher.match_views(reference, contact, [tool], None, 3)
+    for change in ({"radius": np.inf}, {"concave": True}):
+        met = replace(target, contact=replace(target.contact, **change))
+        result = matcher.match_views(reference, contact, [tool], met, 3, reference_target_radius=float("inf"))
+        assert [c.score for c in result.candidates] == pytest.approx([c.score for c in plain.candidates])
+        assert all(np.isfinite(c.score) for c in result.candidates)
 
 
 def test_target_and_tools_are_chosen_where_none_is_named(demonstration):

@@ -23,7 +23,10 @@ from magic_core.scene import CanonicalView, SceneObject
 from magic_core.strategy import Physics
 from magic_verifier.floating import TARGET, TOOL, FloatingRun, make_setup
 from magic_verifier.goals import TOUCH
-from magic_verifier.simulation import Settings
+from magic_verifier.simulation import DYNAMIC, Settings
+
+#: Of a target that is held where it is, kg/m^3.
+HELD_DENSITY = 5e4
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ def replay(
     them is what is averaged over (the paper's is the goal phase; where the target rolls in the tool,
     as in scooping, ``contact`` is the phase in which they meet as they were shown to); without
     phases the second half of the motion is.  A fixed target's contacts are read after the release:
-    the tool, let go, hangs from its contact points.  Raises ``LOST_CONTACT`` where tool and target
-    never press on each other.
+    the tool, let go, hangs from its contact points; of a tool that is not let go, while it presses, the target held where it is.
+    Raises ``LOST_CONTACT`` where tool and target never press on each other.
     """
     settings = settings or Settings(frequency=480.0)
     table = np.array([0.0, 0.0, 1.0, 0.0]) if table is None else table
@@ -105,6 +108,10 @@ def replay(
     if not releases:
         # A few millimetres are what is asked for: the flats of convex pieces would be seen in them.
         setup = replace(setup, tool=replace(setup.tool, mesh=tool.mesh))
+    held = strategy.physics.target_is_fixed and not releases
+    if held:
+        # PhysX tells of no contact between a led and a static body: the target is a free one, heavy, and put back after each step.
+        setup = replace(setup, target_kind=DYNAMIC, physics=replace(setup.physics, target_density=HELD_DENSITY))
     run = FloatingRun(setup, MotionPlan("fg", ToolMotion(times, world_from_tool, phases)))
     watched = "release" if releases else watched
     if watched not in {p.name for p in phases}:
@@ -116,6 +123,8 @@ def replay(
     moments: list[float] = []
     while run.time < run.duration:
         run.advance()
+        if held:
+            run.world.place(TARGET, target.world_from_object)
         run.world.check((TOOL,) if releases else (TOOL, TARGET))
         if run.phase != watched:
             continue

@@ -4,13 +4,21 @@ How to record one: tool and target lie apart on the table, both cameras see them
 The bag holds the cameras' topics, the static transforms, calibrated fixtures on ``known_objects`` if there are any, and the
 motion of the tool: stamped poses of any frame that is fixed to it (a marker, a motion capture body) on a topic, or a frame of
 /tf (a marker's, or the hand's, with robot_state_publisher running, where the arm is led by hand with the tool in the gripper).
+
+The folder is written when all of it is known to be a strategy, trial included, and not before.  Exit status: 0 it is; 1 the strategy
+does not do its own task, with what to change (--keep-failed leaves it as OUT.failed); 2 nothing could be learned, with what is wrong.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import re
+import shutil
 import sys
+import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,16 +30,33 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.scene import VIEW_KINDS, Scene, SceneObject
-from magic_core.strategy import MODES, Goal, Physics, save
+from magic_core.strategy import MODES, Goal, Physics, Strategy, load, save
+from magic_verifier import track
+from magic_verifier.track import Track
 
 Array = NDArray[np.float64]
 COLOR, DEPTH, INFO = "color/image_raw", "aligned_depth_to_color/image_raw", "aligned_depth_to_color/camera_info"
 #: So many pictures of a topic are read: the first colour and the depth that goes with it are among them.
 PICTURES = 5
-#: The tool's track and the tool as it was first seen belong together if they are so near each other (m).
-NEAR = 0.10
+#: Of the depth pictures after them every tenth, and of these no more than so many, evenly over the bag.
+EVERY, LATER = 10, 60
+#: The tool's track and the tool as it was first seen belong together if they are so near each other (m); so far where the tool is named.
+NEAR, FAR = 0.10, 0.30
 #: A pose that came so long (s) before or after the pictures does not tell where the tool was in them.
 APART = 0.5
+#: What may be given: name: (what it is, least, greatest); least itself is allowed.
+RANGES = {
+    "friction": ("friction coefficient", 0.01, 5.0),
+    "tool_density": ("density of the tool, kg/m^3", 5.0, 25000.0),
+    "target_density": ("density of the target, kg/m^3", 5.0, 25000.0),
+}
+#: The greatest number of a goal (m, m/s, s, degrees, or a factor).
+LARGEST = 100.0
+#: Numbers of a goal that mean nothing at zero.
+ABOVE_ZERO = ("distance", "height", "drift", "max_speed")
+#: What a strategy's folder may be called, and topics and frames.
+NAME, TOPIC, FRAME = r"[A-Za-z0-9][A-Za-z0-9_.-]*", r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", r"/?[A-Za-z_][\w/.-]*"
+TOOL_POSE = "/demonstration/tool_pose"
 
 
 class Recorded:
@@ -41,48 +66,84 @@ class Recorded:
         from magic_bringup import bag_file, bag_messages
 
         self.path = path
-        self.topics = {topic.name for topic in bag_file.info(path).topics}
-        self._messages: dict[str, list[Any]] = {topic: [] for topic in self.topics}
+        self.types = {topic.name: topic.type_name for topic in bag_file.info(path).topics}
+        self._messages: dict[str, list[Any]] = {topic: [] for topic in self.types}
+        self._later: dict[str, list[Any]] = {}
+        counts = dict.fromkeys(self.types, 0)
+        strides = dict.fromkeys(self.types, EVERY)
 
         def wanted(topic: str, type_name: str) -> bool:
-            # Of the pictures the first are enough.
-            return type_name != "sensor_msgs/msg/Image" or len(self._messages[topic]) < PICTURES
+            counts[topic] += 1
+            if type_name != "sensor_msgs/msg/Image" or counts[topic] <= PICTURES:
+                return True
+            return topic.endswith(DEPTH) and counts[topic] % strides[topic] == 0
 
         for topic, _, message in bag_messages.messages(path, wanted):
-            self._messages[topic].append(message)
+            if self.types[topic] != "sensor_msgs/msg/Image" or counts[topic] <= PICTURES:
+                self._messages[topic].append(message)
+                continue
+            later = self._later.setdefault(topic, [])
+            later.append(message)
+            if len(later) > LATER:
+                later[:] = later[::2]
+                strides[topic] *= 2
+
+    @property
+    def topics(self) -> set[str]:
+        """The names of its topics."""
+        return set(self.types)
 
     def of(self, topic: str) -> list[Any]:
-        """The messages of a topic; NO_FRAMES where there are none."""
+        """The messages of a topic (of pictures the first); NO_FRAMES where there are none."""
         found = self._messages.get(topic, [])
         if not found:
             raise MagicError(Code.NO_FRAMES, f"messages of {topic} in {self.path}", 0, f"one of the bag's topics: {sorted(self.topics)}")
         return found
 
-    def transforms(self) -> tuple[Any, list[float]]:
-        """All of /tf and /tf_static in a buffer, and the stamps (s) of what moves."""
+    def depths(self, topic: str) -> list[Any]:
+        """Depth pictures of a topic all over the bag."""
+        return [*self._messages.get(topic, []), *self._later.get(topic, [])]
+
+    def transforms(self) -> tuple[Any, dict[str, str], dict[str, Track]]:
+        """All of /tf and /tf_static in a buffer; the parent of each frame; and what /tf told of each frame that it moves."""
         from magic_core.conversions import remember_transform, time_from_msg
         from magic_core.tf import TransformBuffer
 
-        buffer, stamps = TransformBuffer(memory=float("inf")), []
+        buffer, parents = TransformBuffer(memory=float("inf")), {}
+        raw: dict[str, list[tuple[float, list[float], list[float]]]] = {}
         for topic in ("/tf_static", "/tf"):
             for message in self._messages.get(topic, []):
                 for transform in message.transforms:
-                    remember_transform(buffer, transform, topic == "/tf_static")
+                    child = transform.child_frame_id.lstrip("/")
+                    parents[child] = transform.header.frame_id.lstrip("/")
                     if topic == "/tf":
-                        stamps.append(time_from_msg(transform.header.stamp))
-        return buffer, sorted(set(stamps))
+                        t, q = transform.transform.translation, transform.transform.rotation
+                        raw.setdefault(child, []).append((time_from_msg(transform.header.stamp), [t.x, t.y, t.z], [q.x, q.y, q.z, q.w]))
+                    # What is wrong with a frame that moves is said where it is needed: another marker's does not matter here.
+                    with contextlib.suppress(MagicError) if topic == "/tf" else contextlib.nullcontext():
+                        remember_transform(buffer, transform, topic == "/tf_static")
+        return buffer, parents, {child: _track(f"frame {child}", rows) for child, rows in raw.items()}
+
+
+def _track(what: str, rows: list[tuple[float, list[float], list[float]]]) -> Track:
+    stamps, positions, quaternions = zip(*rows, strict=True) if rows else ((), np.zeros((0, 3)), np.zeros((0, 4)))
+    return Track(what, np.array(stamps), np.array(positions, dtype=float), np.array(quaternions, dtype=float))
+
+
+def _cameras(bag: Recorded) -> list[str]:
+    found = sorted(m[1] for t in bag.topics if (m := re.fullmatch(rf"(.*)/{COLOR}", t)) and f"{m[1]}/{DEPTH}" in bag.topics)
+    if not found:
+        raise MagicError(Code.NO_FRAMES, f"cameras in {bag.path}", sorted(bag.topics), f"topics .../{COLOR} and .../{DEPTH}")
+    return found
 
 
 def frames_of(bag: Recorded, world: str) -> list[RgbdFrame]:
     """The first colour and depth image of each camera, with its pose in the world."""
     from magic_core import conversions
 
-    buffer, _ = bag.transforms()
-    cameras = sorted(m[1] for t in bag.topics if (m := re.fullmatch(rf"(.*)/{COLOR}", t)) and f"{m[1]}/{DEPTH}" in bag.topics)
-    if not cameras:
-        raise MagicError(Code.NO_FRAMES, f"cameras in {bag.path}", sorted(bag.topics), f"topics .../{COLOR} and .../{DEPTH}")
+    buffer, _, _ = bag.transforms()
     frames = []
-    for camera in cameras:
+    for camera in _cameras(bag):
         color = bag.of(f"{camera}/{COLOR}")[0]
         stamp = conversions.time_from_msg(color.header.stamp)
         depth = min(bag.of(f"{camera}/{DEPTH}"), key=lambda m: abs(conversions.time_from_msg(m.header.stamp) - stamp))
@@ -100,39 +161,94 @@ def frames_of(bag: Recorded, world: str) -> list[RgbdFrame]:
     return frames
 
 
-def track_of(bag: Recorded, world: str, topic: str, frame: str) -> tuple[Array, Array]:
-    """Times (T,) in seconds and world_from_frame (T, 4, 4) of what is fixed to the tool: a frame of /tf, else the poses of a topic."""
+def later_frames(bag: Recorded, world: str) -> list[RgbdFrame]:
+    """Depth pictures all over the bag, with the camera's pose; their colour is black."""
     from magic_core import conversions
 
-    buffer, stamps = bag.transforms()
+    buffer, _, _ = bag.transforms()
+    frames = []
+    for camera in _cameras(bag):
+        intrinsics = conversions.intrinsics_from_msg(bag.of(f"{camera}/{INFO}")[0])
+        blank = np.zeros((intrinsics.height, intrinsics.width, 3), np.uint8)
+        for message in bag.depths(f"{camera}/{DEPTH}"):
+            stamp = conversions.time_from_msg(message.header.stamp)
+            try:
+                pose = buffer.lookup(world, message.header.frame_id, stamp)
+            except MagicError:  # a camera that moves, later than what /tf tells
+                continue
+            frames.append(RgbdFrame(blank, conversions.depth_from_msg(message), intrinsics, pose, camera, stamp))
+    return frames
+
+
+def track_of(bag: Recorded, world: str, topic: str, frame: str, since: float = -np.inf) -> tuple[Array, Array]:
+    """Times (T,) in seconds and world_from_frame (T, 4, 4) of what is fixed to the tool: a frame of /tf, else the poses of a topic.
+
+    Checked is what came from ``since`` on (seconds), see :mod:`magic_verifier.track`; raises BAD_MOTION, NO_TRANSFORM, NO_FRAMES.
+    """
+    buffer, parents, moving = bag.transforms()
     if frame:
-        stamps, poses = _where_known(buffer, world, frame, stamps)
-    else:
-        messages = bag.of(topic)
-        stamps = [conversions.time_from_msg(m.header.stamp) for m in messages]
-        poses = [conversions.pose_from_msg(m.pose) for m in messages]
-        away = {m.header.frame_id for m in messages} - {world}
-        if away:
-            poses = [buffer.lookup(world, m.header.frame_id, s) @ p for m, s, p in zip(messages, stamps, poses, strict=True)]
-    times, first = np.unique(stamps, return_index=True)
-    if len(times) < 2:
-        raise MagicError(Code.BAD_MOTION, "poses of the tool", len(times), "two or more at different times")
-    return times, np.stack([poses[k] for k in first])
+        return _frames_track(buffer, parents, moving, world, frame.lstrip("/"), since)
+    messages = bag.of(topic)
+    if not (hasattr(messages[0], "header") and hasattr(getattr(messages[0], "pose", None), "position")):
+        raise MagicError(Code.BAD_REQUEST, f"messages of {topic}", bag.types[topic], "geometry_msgs/msg/PoseStamped")
+    from magic_core import conversions
+
+    rows = [
+        (
+            conversions.time_from_msg(m.header.stamp),
+            [m.pose.position.x, m.pose.position.y, m.pose.position.z],
+            [m.pose.orientation.x, m.pose.orientation.y, m.pose.orientation.z, m.pose.orientation.w],
+        )
+        for m in messages
+    ]
+    raw = _track(topic, rows)
+    track.check_raw(raw)
+    poses = [conversions.pose_from_msg(m.pose) for m in messages]
+    poses = [
+        p if m.header.frame_id.lstrip("/") == world else buffer.lookup(world, m.header.frame_id, s) @ p
+        for m, s, p in zip(messages, raw.stamps, poses, strict=True)
+    ]
+    return _checked_motion(topic, raw.stamps, np.stack(poses), since)
 
 
-def _where_known(buffer: Any, world: str, frame: str, stamps: list[float]) -> tuple[list[float], list[Array]]:
-    """The stamps at which the frame's pose in the world is known, and the poses: a marker may be hidden for a while."""
+def _frames_track(
+    buffer: Any, parents: dict[str, str], moving: dict[str, Track], world: str, frame: str, since: float
+) -> tuple[Array, Array]:
+    """The track of a frame of /tf, at the stamps of all that moves between it and the world."""
     if frame not in buffer.frames():
         raise MagicError(Code.NO_TRANSFORM, "frame of the tool", frame, buffer.frames())
-    found, why = [], None
-    for stamp in stamps:
-        try:
-            found.append((stamp, buffer.lookup(world, frame, stamp)))
-        except MagicError as error:
-            why = error
-    if not found and why is not None:
-        raise why
-    return [stamp for stamp, _ in found], [pose for _, pose in found]
+    chain = [name for name in dict.fromkeys([*_up(parents, frame), *_up(parents, world)]) if name in moving]
+    if not chain:
+        raise MagicError(Code.BAD_MOTION, f"frame {frame}", "never moves: /tf tells nothing of it", "a frame fixed to the tool in use")
+    for name in chain:
+        track.check_raw(moving[name], tracker=len(chain) == 1)
+        stamps = moving[name].stamps
+        track.check_gaps(f"frame {name}", stamps[_from(stamps, since) :] - stamps[0])
+    first, last = max(moving[name].stamps[0] for name in chain), min(moving[name].stamps[-1] for name in chain)
+    times = np.unique(np.concatenate([moving[name].stamps for name in chain]))
+    times = times[(times >= first) & (times <= last)]
+    poses = [buffer.lookup(world, frame, float(stamp)) for stamp in times]
+    return _checked_motion(f"frame {frame}", times, np.stack(poses), since)
+
+
+def _up(parents: dict[str, str], frame: str) -> Iterator[str]:
+    """A frame and all above it."""
+    seen: set[str] = set()
+    while frame and frame not in seen:
+        seen.add(frame)
+        yield frame
+        frame = parents.get(frame, "")
+
+
+def _from(stamps: Array, since: float) -> int:
+    """Index of the last stamp up to ``since``."""
+    return max(0, int(np.searchsorted(stamps, since, side="right")) - 1)
+
+
+def _checked_motion(what: str, times: Array, poses: Array, since: float) -> tuple[Array, Array]:
+    first = _from(times, since)
+    track.check_motion(what, times[first:], poses[first:])
+    return times, poses
 
 
 def choose(scene: Scene, tool: str, target: str, origin: Array) -> tuple[SceneObject, SceneObject]:
@@ -143,21 +259,28 @@ def choose(scene: Scene, tool: str, target: str, origin: Array) -> tuple[SceneOb
         if name and name not in by_id:
             raise MagicError(Code.UNKNOWN_OBJECT, what, name, list(by_id))
     seen = [item for item in scene.objects if item.source == "camera"]
+    if not tool and not seen:
+        raise MagicError(Code.NO_OBJECTS, "objects that the cameras see", 0, "the tool and the target on the table, apart")
+    away = {
+        item.id: float(np.linalg.norm(transforms.apply(item.world_from_object, item.mesh.vertices) - origin, axis=1).min())
+        for item in scene.objects
+    }
     if not tool:
-        if not seen:
-            raise MagicError(Code.NO_OBJECTS, "objects that the cameras see", 0, "the tool and the target on the table, apart")
-        away = {
-            item.id: float(np.linalg.norm(transforms.apply(item.world_from_object, item.mesh.vertices) - origin, axis=1).min())
-            for item in seen
-        }
-        tool = min(away, key=lambda name: away[name])
+        tool = min((item.id for item in seen), key=lambda name: away[name])
         if away[tool] > NEAR:
             raise MagicError(
                 Code.BAD_REQUEST,
                 "distance of the tool's track from the nearest object",
                 f"{away[tool]:.3f} m to {tool}",
-                f"at most {NEAR:g} m, or name the tool: {sorted(away)}",
+                f"at most {NEAR:g} m, or name the tool: {sorted(item.id for item in seen)}",
             )
+    if away[tool] > FAR:
+        raise MagicError(
+            Code.BAD_REQUEST,
+            f"distance of the tool's track from {tool}",
+            f"{away[tool]:.3f} m",
+            f"at most {FAR:g} m: a body that is fixed to the tool, in the world of the cameras",
+        )
     if not target:
         others = [item for item in seen if item.id != tool] or [item for item in scene.objects if item.id != tool]
         if len(others) != 1:
@@ -168,13 +291,15 @@ def choose(scene: Scene, tool: str, target: str, origin: Array) -> tuple[SceneOb
 
 def main(arguments: list[str] | None = None) -> int:
     """The command; errors are one line on stderr and exit status 2, a strategy that does not do its own task 1."""
-    parser = argparse.ArgumentParser(prog="learn", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="learn", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("--bag", type=Path, required=True, help="the recorded demonstration")
     parser.add_argument("--out", type=Path, required=True, help="the new strategy's folder; its name is the strategy's")
     parser.add_argument("--goal", required=True, help="goal test (hook, hang, scoop), or 'none': simulation cannot judge it")
     parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal test")
-    parser.add_argument("--tool-pose", default="/demonstration/tool_pose", help="topic with the poses of a frame fixed to the tool")
-    parser.add_argument("--tool-frame", default="", help="a frame of /tf fixed to the tool, instead")
+    parser.add_argument("--tool-pose", help=f"topic with the poses of a frame fixed to the tool (default {TOOL_POSE})")
+    parser.add_argument("--tool-frame", help="a frame of /tf fixed to the tool, instead")
     parser.add_argument("--world", default="panda_link0", help="the arm's base frame")
     parser.add_argument("--tool", default="", help="id of the tool among the objects; by default the one that the track begins at")
     parser.add_argument("--target", default="", help="id of the target; by default the only other object")
@@ -187,35 +312,97 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tool-density", type=float, default=physics.tool_density, help="kg/m^3")
     parser.add_argument("--target-density", type=float, default=physics.target_density, help="kg/m^3")
     parser.add_argument("--description", default="", help="a sentence for strategy.yaml")
+    parser.add_argument("--keep-failed", action="store_true", help="leave a strategy that fails its trial as OUT.failed, to look at")
     given = parser.parse_args(arguments)
     try:
         return _learn(given)
-    except MagicError as error:
+    except (MagicError, OSError) as error:
         print(f"learn: {error}", file=sys.stderr)
         return 2
 
 
-def _learn(given: argparse.Namespace) -> int:
-    import cv2
-
-    from magic_core import conversions
-    from magic_matcher import drawing
-    from magic_perception.pipeline import perceive
+def goal_of(given: argparse.Namespace) -> Goal:
+    """The goal, its name and numbers checked; raises UNKNOWN_GOAL or BAD_REQUEST."""
     from magic_verifier import goals
-    from magic_verifier.learning import Demonstration, Task, learn
 
-    goal = Goal("none" if given.goal == "none" else given.goal, _values(given.value))
-    if given.goal != "none" and given.goal not in goals.GOALS:
+    values: dict[str, float] = {}
+    for text in given.value:
+        name, equals, number = text.partition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            raise MagicError(Code.BAD_REQUEST, "--value", text, "NAME=NUMBER") from None
+        if not equals or name in values:
+            raise MagicError(Code.BAD_REQUEST, "--value", text, "NAME=NUMBER, each name once")
+        values[name] = value
+    if given.goal == "none":
+        if values:
+            raise MagicError(Code.BAD_REQUEST, "--value", ", ".join(values), "no numbers with --goal none: nothing is judged")
+        return Goal("none")
+    if given.goal not in goals.GOALS:
         raise MagicError(Code.UNKNOWN_GOAL, "goal test", given.goal, [*goals.GOALS, "none"])
-    if given.out.exists() and any(given.out.iterdir()):
-        raise MagicError(Code.BAD_REQUEST, "folder of the new strategy", str(given.out), "a new or an empty folder")
+    known = goals.GOALS[given.goal].defaults
+    for name, value in values.items():
+        if name not in known:
+            raise MagicError(Code.BAD_REQUEST, f"--value of goal {given.goal}", name, list(known))
+        if not 0 <= value <= LARGEST or (value == 0 and name in ABOVE_ZERO):
+            least = "above 0" if name in ABOVE_ZERO else "from 0"
+            raise MagicError(Code.BAD_REQUEST, f"--value {name}", value, f"{least} to {LARGEST:g}")
+    # The kicks of the released code's test belong to its set of standing cylinders, not to whatever was demonstrated.
+    return Goal(given.goal, {"noise": 0.0, **values} if "noise" in known else values)
+
+
+def check_given(given: argparse.Namespace) -> None:
+    """Everything on the command line but the goal, before anything is read; raises BAD_REQUEST."""
+
+    def require(fine: bool, what: str, value: object, allowed: str) -> None:
+        if not fine:
+            raise MagicError(Code.BAD_REQUEST, what, value, allowed)
+
+    for key, (what, least, greatest) in RANGES.items():
+        value = getattr(given, key)
+        require(least <= value <= greatest, what, value, f"{least:g} to {greatest:g}")
+    require(given.tool_pose is None or given.tool_frame is None, "--tool-pose and --tool-frame", "both", "one of them")
+    for option, value, pattern in (
+        ("--tool-pose", given.tool_pose, TOPIC),
+        ("--tool-frame", given.tool_frame, FRAME),
+        ("--world", given.world, FRAME),
+    ):
+        require(value is None or bool(re.fullmatch(pattern, value)), option, value, "a name of letters, digits, _ and /")
+    require(not given.tool or given.tool != given.target, "--tool and --target", given.tool, "two objects")
+    require(given.goal != "hang" or given.releases, "--goal hang without --releases", "the tool stays in the hand", "--releases")
+    require(
+        given.goal not in ("hook", "scoop") or not given.fixed_target,
+        f"--goal {given.goal} with --fixed-target",
+        "a target that cannot move",
+        "a free target, or another goal",
+    )
+    out = given.out.absolute()
+    require(bool(re.fullmatch(NAME, out.name)), "name of the new strategy", out.name, "letters, digits, _, - and .")
+    for folder in (out, _failed(out)) if given.keep_failed else (out,):
+        # Written over is nothing, and an empty folder is nothing.
+        empty = folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
+        require(empty or not os.path.lexists(folder), "folder of the new strategy", str(folder), "a new or an empty folder")
+    above = next(p for p in out.parents if p.exists())
+    require(above.is_dir() and os.access(above, os.W_OK), "folder of the new strategy", f"{above} cannot be written", "a folder of yours")
+
+
+def _failed(out: Path) -> Path:
+    return out.with_name(f"{out.name}.failed")
+
+
+def _learn(given: argparse.Namespace) -> int:
+    from magic_core import conversions
+    from magic_perception.pipeline import perceive
+    from magic_verifier.learning import Demonstration, Task, advice, learn
+
+    goal = goal_of(given)
+    check_given(given)
+    topic = TOOL_POSE if given.tool_pose is None else "/" + given.tool_pose.lstrip("/")
     bag = Recorded(given.bag)
     frames = frames_of(bag, given.world)
-    known = conversions.scene_from_msg(bag.of("/known_objects")[-1]).objects if "/known_objects" in bag.topics else ()
-    scene = perceive(frames, tuple(known))
-    print(f"objects: {', '.join(item.id for item in scene.objects)}")
-    times, poses = track_of(bag, given.world, given.tool_pose, given.tool_frame)
     seen = max(frame.stamp for frame in frames)
+    times, poses = track_of(bag, given.world, topic, given.tool_frame or "", since=min(frame.stamp for frame in frames))
     if not times[0] - APART <= seen <= times[-1]:
         raise MagicError(
             Code.STALE_DATA,
@@ -223,19 +410,31 @@ def _learn(given: argparse.Namespace) -> int:
             round(times[0] - seen, 2),
             f"at most {APART:g}, and ends after them",
         )
+    what = f"frame {given.tool_frame}" if given.tool_frame else topic
+    track.check_still(what, times, poses, min(frame.stamp for frame in frames), max(seen, times[0]))
+    known = conversions.scene_from_msg(bag.of("/known_objects")[-1]).objects if "/known_objects" in bag.topics else ()
+    scene = perceive(frames, tuple(known))
+    print(f"objects: {', '.join(item.id for item in scene.objects)}")
     first = transforms.interpolate(times, poses, [seen])[0]
     tool, target = choose(scene, given.tool, given.target, first[:3, 3])
+    fixed = given.fixed_target or target.source != "camera"
+    if fixed and given.goal in ("hook", "scoop"):
+        raise MagicError(Code.BAD_REQUEST, f"target of --goal {given.goal}", f"{target.id} is a known fixture", "a target that can move")
     # What is tracked is fixed to the tool, wherever on it.
     later = times > seen
     times = np.concatenate([[seen], times[later]])
     world_from_tool = np.concatenate([[first], poses[later]]) @ (transforms.inverse(first) @ tool.world_from_object)
-    fixed = given.fixed_target or target.source != "camera"
-    print(f"tool: {tool.id}, target: {target.id}{' (fixed)' if fixed else ''}, {len(times)} poses over {times[-1] - times[0]:.1f} s")
+    track.check_above(what, tool.mesh, times, world_from_tool, scene.table)
+    told = track.check_seen(what, tool.mesh, times, world_from_tool, later_frames(bag, given.world))
+    print(
+        f"tool: {tool.id}, target: {target.id}{' (fixed)' if fixed else ''}, {len(times)} poses over {times[-1] - times[0]:.1f} s, "
+        + (f"seen there in {told} depth pictures" if told else "compared with no later picture: there is none")
+    )
     demonstration = Demonstration(
         tool, target, tuple(o for o in scene.objects if o.id not in (tool.id, target.id)), scene.table, times, world_from_tool
     )
     task = Task(
-        given.out.resolve().name,
+        given.out.absolute().name,
         goal,
         Physics(given.friction, given.tool_density, given.target_density, fixed),
         given.releases,
@@ -246,34 +445,56 @@ def _learn(given: argparse.Namespace) -> int:
     )
     learned = learn(demonstration, task)
     strategy = replace(learned.strategy, environment={})
-    save(strategy, given.out)
-    views = [
-        drawing.draw_match(view, contact)
-        for view, contact in ((strategy.tool_view, strategy.tool_contact), (strategy.target_view, strategy.target_contact))
-    ]
-    cv2.imwrite(str(given.out / "contacts.png"), drawing.side_by_side(views, ("tool", "target"))[..., ::-1])
     print(
-        f"mode {strategy.mode}, matched in the view {strategy.view}; contacts found by replay, {1000 * learned.tool_gap:.1f} mm from the tool's outline"
+        f"mode {strategy.mode}, matched in the view {strategy.view}, the target met at the {strategy.target_outline} outline; contacts of the "
+        f"replay: {1000 * learned.tool_gap:.1f} mm from the strategy's on the tool, {1000 * learned.target_gap:.1f} mm on the target"
     )
     for waypoint in strategy.waypoints:
         print(f"  {waypoint.phase:9} {waypoint.name:12} " + " ".join(f"{1000 * x:7.1f}" for x in waypoint.offset) + " mm")
-    print(f"strategy: {given.out}, picture: {given.out / 'contacts.png'}")
-    if learned.verdict is None:
+    verdict = learned.verdict
+    if verdict is None:
         print("not tried in simulation: it cannot judge this goal")
-        return 0
-    print(f"tried with the demonstrated objects: {learned.verdict.code.name}, {learned.verdict.message}")
-    return 0 if learned.verdict.success else 1
+    else:
+        print(f"tried with the demonstrated objects: {verdict.code.name}, {verdict.message}")
+    if verdict is not None and not verdict.success:
+        for line in advice(learned):
+            print(line)
+        if not given.keep_failed:
+            print(f"no strategy was written (--keep-failed leaves it as {_failed(given.out)})")
+            return 1
+        marked = f"FAILED ITS OWN TRIAL ({verdict.code.name}: {verdict.message}). {strategy.description}".strip()
+        write(replace(strategy, description=marked), _failed(given.out.absolute()))
+        print(f"strategy that failed, to look at: {_failed(given.out)}")
+        return 1
+    write(strategy, given.out.absolute())
+    print(f"strategy: {given.out}, picture: {given.out / 'contacts.png'}")
+    return 0
 
 
-def _values(texts: list[str]) -> dict[str, float]:
-    values = {}
-    for text in texts:
-        name, _, number = text.partition("=")
-        try:
-            values[name] = float(number)
-        except ValueError:
-            raise MagicError(Code.BAD_REQUEST, "--value", text, "NAME=NUMBER") from None
-    return values
+def write(strategy: Strategy, out: Path) -> None:
+    """A strategy's folder with a picture of its contacts, all at once: nothing is at ``out`` unless all of it can be read again.
+
+    Raises BAD_STRATEGY where it cannot, OSError where the disk does not take it or somebody has put something there meanwhile.
+    """
+    import cv2
+
+    from magic_matcher import drawing
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(prefix=".learning_", dir=out.parent))
+    try:
+        save(strategy, beside)
+        load(beside)
+        pairs = ((strategy.tool_view, strategy.tool_contact), (strategy.target_view, strategy.target_contact))
+        picture = drawing.side_by_side([drawing.draw_match(view, contact) for view, contact in pairs], ("tool", "target"))
+        if not cv2.imwrite(str(beside / "contacts.png"), picture[..., ::-1]):
+            raise OSError(f"{beside / 'contacts.png'} cannot be written")
+        umask = os.umask(0)
+        os.umask(umask)
+        beside.chmod(0o777 & ~umask)
+        beside.rename(out)  # an empty folder is replaced, another one is not
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
 1. The motion is replayed in physics.  Where tool and target press on each other are the contact points p_T and p_O; when they
    first do is when the contact is made.
-2. The plane in which the contact is reasoned about is chosen: across the thinnest side of the tool that the contact's normal does not
-   lie along.  Looked at from above if that direction is upright, else from the side; in section where the contact is
-   inside the silhouette, as a bowl's is.
+2. The plane in which the contact is reasoned about is chosen: across the thinnest side of the tool in which both contacts are on an
+   outline where they were shown.  Looked at from above if that direction is upright, else from the side; in section where the contact is
+   inside the silhouette, as a bowl's is.  The target may be met outside, in a hole or notch, or inside its cut.
 3. The part of the motion that belongs to the contact is kept, with its phases: approach, contact, goal, retreat.  Where the tool keeps
    its attitude it becomes waypoints (mode ``plan``), else it is carried over as it is (``retarget``).
 """
@@ -20,11 +20,11 @@ from scipy.signal import savgol_filter
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact, ContactCandidate
 from magic_core.errors import Code, MagicError
-from magic_core.motion import MotionPlan, Phase
+from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.rendering import canonical_view
 from magic_core.scene import VIEW_KINDS, CanonicalView, SceneObject
 from magic_core.shapes import section_view
-from magic_core.strategy import MODES, Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import MODES, OUTLINES, Goal, Physics, Strategy, Waypoint
 from magic_matcher import contour as contours
 from magic_matcher import curvature
 from magic_matcher.matching import target_contact, target_view, to_contact
@@ -48,6 +48,14 @@ NEARLY = np.deg2rad(20.0)
 ATTITUDE = np.deg2rad(15.0)
 #: How far (m) a contact point may lie from the outline on which it is matched, and this share of the object's size.
 OFF_OUTLINE, OFF_SHARE = 0.006, 0.03
+#: A tool may have met the target so far beside where a strategy will have tools meet it, the middle of a side: share of the target's size.
+ASIDE_SHARE = 0.15
+#: What a strategy calls the target's outlines, in words.
+PLACES = {
+    "outer": "middle of its outer side",
+    "inner": "side of its hole or notch",
+    "cut": "inner side of its cut",
+}
 #: Waypoints stand for the motion to this (m); between them the tool moves at the demonstrated speed within these bounds (m/s).
 STRAIGHT, SPEEDS = 0.005, (0.02, 0.12)
 #: A motion that goes on for so long (s) after tool and target have parted ends in a retreat.
@@ -85,13 +93,15 @@ class Demonstration:
 
 @dataclass(frozen=True)
 class Learned:
-    """The strategy; how far (m) the contacts that the replay read are from the outlines' points that stand for them; and the verdict on
-    the strategy carried out with the demonstrated objects by a floating gripper (None where simulation cannot judge it)."""
+    """The strategy; how far (m) the contacts that the replay read are from the outlines' points that stand for them; the verdict on
+    the strategy carried out with the demonstrated objects by a floating gripper, and that on the demonstrated motion itself (None where
+    simulation cannot judge the goal)."""
 
     strategy: Strategy
     tool_gap: float
     target_gap: float
     verdict: Verdict | None
+    shown: Verdict | None
 
 
 @dataclass(frozen=True)
@@ -120,39 +130,80 @@ def learn(demonstration: Demonstration, task: Task) -> Learned:
             raise MagicError(Code.BAD_REQUEST, what, value, allowed)
     motion = _motion(demonstration, task)
     found, made, parted = _contacts(demonstration, task, motion)
-    target = demonstration.target
+    draft, tool_gap, target_gap = _drafted(demonstration, task, motion, found, made)
+    strategy = _with_motion(draft, motion, made, parted, task.mode)
+    shown = _shown(demonstration, strategy, motion, made, parted)
+    return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown)
+
+
+def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float) -> tuple[Strategy, float, float]:
+    """The strategy but for its phases, looked at so that both contacts are where they were shown, and how far (m) each is from there.
+
+    The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  Raises BAD_REQUEST that says
+    how near the best of them came.
+    """
+    tool, target = demonstration.tool, demonstration.target
     world_from_tool = target.world_from_object @ motion.target_from_tool[motion.index(made)]
-    normal = target.world_from_object[:3, :3] @ found.target_normal
     came = world_from_tool[:3, 3] - (target.world_from_object @ motion.target_from_tool[_last_away(motion, found, made, APPROACH)])[:3, 3]
-    direction = view_direction(demonstration.tool, world_from_tool, normal, came)
-    normal = levelled(transforms.unit(normal - (normal @ direction) * direction))
-    view, contact, tool_gap = _tool_contact(demonstration.tool, world_from_tool, direction, found, task.view)
-    draft = Strategy(
-        name=task.name,
-        description=task.description,
-        view=view.kind,
-        mode="retarget",
-        tool_view=view,
-        tool_contact=contact,
-        target_view=view,
-        target_contact=contact,
-        target_normal=normal,
-        target_view_direction=direction,
-        times=motion.times,
-        target_from_tool=motion.target_from_tool,
-        tool_mesh=demonstration.tool.mesh,
-        target_mesh=target.mesh,
-        waypoints=(),
-        goal=task.goal,
-        physics=task.physics,
-        releases=task.releases,
-        simulatable=task.simulatable,
+    towards = target.world_from_object[:3, :3] @ found.target_normal
+    why: list[MagicError] = []
+    for direction in view_directions(tool, world_from_tool, towards, came):
+        normal = levelled(transforms.unit(towards - (towards @ direction) * direction))
+        try:
+            view, contact, tool_gap = _tool_contact(tool, world_from_tool, direction, found, task.view)
+            draft = Strategy(
+                name=task.name,
+                description=task.description,
+                view=view.kind,
+                mode="retarget",
+                tool_view=view,
+                tool_contact=contact,
+                target_view=view,
+                target_contact=contact,
+                target_normal=normal,
+                target_view_direction=direction,
+                times=motion.times,
+                target_from_tool=motion.target_from_tool,
+                tool_mesh=tool.mesh,
+                target_mesh=target.mesh,
+                waypoints=(),
+                goal=task.goal,
+                physics=task.physics,
+                releases=task.releases,
+                simulatable=task.simulatable,
+            )
+            draft, target_gap = _target_contact(draft, target, found)
+            return draft, tool_gap, target_gap
+        except MagicError as error:
+            why.append(error)
+    raise why[0]
+
+
+def _target_contact(draft: Strategy, target: SceneObject, found: Replay) -> tuple[Strategy, float]:
+    """The strategy with the first of the target's outlines whose contact is where it was shown, and how far (m) it is from there."""
+    gaps: dict[str, float] = {}
+    for outline in OUTLINES:
+        tried = replace(draft, target_outline=outline)
+        try:
+            seen = target_view(target, tried)
+            touched = target_contact(tried, seen, target.world_from_object)
+        except MagicError:
+            continue  # the target has no such outline
+        off = (seen.pixels(touched.object_from_contact[:3, 3]) - seen.pixels(found.target_point)) * seen.metres_per_pixel
+        size = contours.extract(seen.mask).size * seen.metres_per_pixel
+        deep = abs(float(off @ touched.normal))
+        gaps[outline] = float(np.linalg.norm(off))
+        facing = float(touched.normal @ (found.target_normal @ seen.object_from_view[:3, :2])) > 0.3
+        if facing and deep <= max(OFF_OUTLINE, OFF_SHARE * size) and gaps[outline] <= max(OFF_OUTLINE, ASIDE_SHARE * size):
+            return replace(tried, target_view=seen, target_contact=touched), gaps[outline]
+    said = ", ".join(f"{1000 * gap:.0f} mm from the {PLACES[name]}" for name, gap in gaps.items())
+    raise MagicError(
+        Code.BAD_REQUEST,
+        "where the tool met the target",
+        said or "on no outline of it",
+        f"near one of these, within {1000 * OFF_OUTLINE:g} mm or {100 * ASIDE_SHARE:.0f} % of the target's size; meet the target there, "
+        "in the middle of its side",
     )
-    seen = target_view(target, draft)
-    touched = target_contact(draft, seen, target.world_from_object)
-    off = seen.pixels(touched.object_from_contact[:3, 3]) - seen.pixels(found.target_point)
-    strategy = _with_motion(replace(draft, target_view=seen, target_contact=touched), motion, made, parted, task.mode)
-    return Learned(strategy, tool_gap, float(np.linalg.norm(off)) * seen.metres_per_pixel, _tried(demonstration, strategy))
 
 
 def _motion(demonstration: Demonstration, task: Task) -> _Motion:
@@ -224,26 +275,23 @@ def _last_away(motion: _Motion, found: Replay, made: float, distance: float) -> 
     return int(far[-1]) if len(far) else 0
 
 
-def view_direction(tool: SceneObject, world_from_tool: Array, normal: Array, came: Array) -> Array:
-    """The direction (3,), world, in which the contact is looked at: down, or level.
+def view_directions(tool: SceneObject, world_from_tool: Array, normal: Array, came: Array) -> list[Array]:
+    """Directions (3,), world, in which the contact may be looked at, down or level, those across the tool's thinner sides first.
 
     world_from_tool (4, 4) when the contact is made; normal (3,): of the target's surface; came (3,): how the tool came there.
-    Raises BAD_REQUEST where the tool's thinnest side that shows the contact in profile is neither upright nor level.
+    Raises BAD_REQUEST where no side of the tool that shows the contact in profile is upright or level.
     """
     axes, _ = box_axes(tool.mesh)
-    directions = axes @ world_from_tool[:3, :3].T
-    direction = next(d for d in directions if abs(d @ normal) < 0.7)
-    direction = levelled(direction)
-    if abs(direction[2]) == 1.0:
-        return np.array([0.0, 0.0, -1.0])
-    if direction[2] != 0.0:
+    directions = [levelled(d) for d in axes @ world_from_tool[:3, :3].T if abs(d @ normal) < 0.7]
+    usable = [d for d in directions if abs(d[2]) == 1.0 or d[2] == 0.0]
+    if not usable:
         raise MagicError(
             Code.BAD_REQUEST,
-            "direction in which the contact is seen in profile",
-            direction.round(2).tolist(),
-            "within 20 degrees of upright or of level",
+            "directions in which the contact is seen in profile",
+            [d.round(2).tolist() for d in directions],
+            "one within 20 degrees of upright or of level: hold the tool upright or level when it meets the target",
         )
-    return direction if direction @ came >= 0 else -direction
+    return [np.array([0.0, 0.0, -1.0]) if abs(d[2]) == 1.0 else d if d @ came >= 0 else -d for d in usable]
 
 
 def levelled(normal: Array) -> Array:
@@ -339,5 +387,74 @@ def _tried(demonstration: Demonstration, strategy: Strategy) -> Verdict | None:
     candidate = ContactCandidate(
         demonstration.tool.id, strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4)
     )
-    motion = plan_tool_motion(strategy, *scene, candidate, "keep", demonstration.table, demonstration.obstacles)
+    try:
+        motion = plan_tool_motion(strategy, *scene, candidate, "keep", demonstration.table, demonstration.obstacles)
+    except MagicError as error:
+        return Verdict(False, error.code, error.message)
     return verify(strategy, *scene, demonstration.obstacles, demonstration.table, candidate, MotionPlan("fg", motion))
+
+
+def _shown(demonstration: Demonstration, strategy: Strategy, motion: _Motion, made: float, parted: float) -> Verdict | None:
+    """The demonstrated motion itself, judged as the strategy's is: what the strategy cannot do better than."""
+    if not strategy.simulatable:
+        return None
+    end = float(motion.times[-1])
+    last = parted if end - parted > PARTED else end
+    ends = [("approach", made), ("contact", min(made + READ, last)), ("goal", last), ("retreat", end)]
+    times, poses = motion.times, demonstration.target.world_from_object @ motion.target_from_tool
+    if motion.releases:
+        # The hand opens where the motion ends.
+        times, poses = np.append(times, end + READ), np.concatenate([poses, poses[-1:]])
+        ends = [("approach", end), ("release", end + READ)]
+    phases, start = [], 0.0
+    for name, until in ends:
+        if until > start:
+            phases.append(Phase(name, start, until))
+            start = until
+    plan = MotionPlan("fg", ToolMotion(times, poses, tuple(phases)))
+    return verify(strategy, demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table, None, plan)
+
+
+def advice(learned: Learned) -> list[str]:
+    """What a trial that failed measured beside what was shown, and what to change: sentences, none for a trial that passed."""
+    verdict, shown, strategy = learned.verdict, learned.shown, learned.strategy
+    if verdict is None or shown is None or verdict.success:
+        return []
+    if shown.success:
+        other = "retarget" if strategy.mode == "plan" else "plan"
+        return [
+            f"the demonstrated motion itself passes, replayed: {shown.message}",
+            f"to change: --mode {other} instead of {strategy.mode}; or record again: slower, the tool led straight to its contact and away",
+        ]
+    lines = [f"the demonstrated motion itself fails, replayed: {shown.code.name}, {shown.message}"]
+    return [*lines, f"to change: {_remedy(shown, strategy)}"]
+
+
+def _remedy(shown: Verdict, strategy: Strategy) -> str:
+    """What to record or to give otherwise where a demonstration does not pass its goal."""
+    metrics, physics = shown.metrics, strategy.physics
+    if shown.code == Code.GOAL_NOT_REACHED:
+        for name, value in (("pulled_distance", "distance"), ("target_height", "height"), ("tool_height", "height")):
+            reached = np.floor(100 * 0.95 * metrics.get(name, 0.0)) / 100
+            if reached > 0:
+                return f"--value {value}={reached:g} (m) asks for no more than was shown; or record it farther than the goal asks for"
+        return "the goal, or record a demonstration that reaches it"
+    if shown.code == Code.DRIFT and metrics.get("holds") == 0.0:
+        return "--value hold=0 where the target is only to be pushed; or a tool whose contact encloses the target"
+    if shown.code == Code.DRIFT:
+        return (
+            "record again, the tool led straight along its normal; or --value drift=NUMBER (allowed share of the target's radius, "
+            f"{metrics.get('sideways_drift', 0.0) / max(metrics.get('target_radius', 1.0), 1e-6):.2f} was measured)"
+        )
+    if shown.code == Code.LOST_CONTACT:
+        return (
+            f"--friction (now {physics.friction:g}) and --target-density (now {physics.target_density:g} kg/m^3) as they really are; or record "
+            "again: slower, and still for a second at the end"
+        )
+    if shown.code == Code.UNSTABLE:
+        return f"record again: slower towards the end, and still for a second before the recording ends; or --friction (now {physics.friction:g})"
+    if shown.code == Code.PRE_CONTACT_COLLISION:
+        return "record again: the tool led to its contact without touching anything before"
+    if shown.code == Code.LIMIT_EXCEEDED:
+        return "record again: the tool held a few millimetres off the table and fixtures"
+    return "record again: slower, and without pressing"

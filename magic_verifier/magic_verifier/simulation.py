@@ -349,6 +349,13 @@ class World:
         """Set the linear velocity of a dynamic body."""
         self._bodies[name].linear_velocity = np.asarray(velocity, dtype=np.float32)
 
+    def place(self, name: str, world_from_object: NDArray[np.float64]) -> None:
+        """Put a dynamic body (4, 4) somewhere, at rest."""
+        component = self._bodies[name]
+        component.entity.pose = to_pose(world_from_object)
+        component.linear_velocity = np.zeros(3, np.float32)
+        component.angular_velocity = np.zeros(3, np.float32)
+
     def move_to(self, name: str, pose: Any) -> None:
         """Where a kinematic body shall be after the next step (a sapien.Pose)."""
         self._bodies[name].kinematic_target = pose

@@ -1,8 +1,10 @@
 """``learn``: from a recorded bag to a strategy folder that serves other tools."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,6 +12,9 @@ import scenes
 
 pytest.importorskip("magic_perception.pipeline")
 pytest.importorskip("magic_bringup.bag_file")
+
+from geometry_msgs.msg import TransformStamped
+from tf2_msgs.msg import TFMessage
 
 from magic_core import conversions, transforms
 from magic_core.errors import Code, MagicError
@@ -20,7 +25,7 @@ from magic_core.strategy import load
 from magic_matcher.features import load as load_features
 from magic_matcher.matching import Matcher
 from magic_planner.object_motion import plan_tool_motion
-from magic_verifier.learn import choose, main, track_of
+from magic_verifier.learn import Recorded, choose, main, track_of, write
 from magic_verifier.verification import verify
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -28,17 +33,17 @@ BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
-    """The folder of a strategy learned from the recorded images and poses of the hooking demonstration."""
-    folder = tmp_path_factory.mktemp("strategies") / "pulling"
-    given = ["--bag", str(BAGS / "hooking_demonstration"), "--out", str(folder), "--goal", "hook", "--friction", "0.3"]
-    assert main([*given, "--value", "distance=0.2", "noise=0"]) == 0
+    """The folder of a strategy learned from the recorded images and poses of the hooking demonstration, by the README's own command."""
+    folder = tmp_path_factory.mktemp("strategies") / "new" / "pulling"
+    assert main(["--bag", str(BAGS / "hooking_demonstration"), "--goal", "hook", "--out", str(folder)]) == 0
+    assert [p.name for p in folder.parent.iterdir()] == ["pulling"], "nothing is left beside it"
     return folder
 
 
 def test_a_recorded_demonstration_becomes_a_strategy(learned):
     strategy = load(learned)
     assert (strategy.name, strategy.view, strategy.mode) == ("pulling", "top", "plan")
-    assert strategy.goal.values == {"distance": 0.2, "noise": 0.0} and strategy.physics.friction == 0.3
+    assert strategy.goal.values == {"noise": 0.0} and strategy.target_outline == "outer"
     np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.05)
     assert strategy.tool_contact.concave
     assert (learned / "contacts.png").stat().st_size > 1000
@@ -64,6 +69,21 @@ def test_what_was_learned_serves_a_tool_that_was_never_seen(learned, family, see
     [
         ({"--goal": "juggle"}, "UNKNOWN_GOAL"),
         ({"--bag": "nowhere"}, "BAD_BAG"),
+        ({"--goal": "hang"}, "--releases"),
+        ({"--goal": "none", "--value": "distance=0.1"}, "no numbers"),
+        ({"--value": "distance=nan"}, "--value distance: nan (allowed: above 0 to 100)"),
+        ({"--value": "distance=0"}, "--value distance: 0.0"),
+        ({"--value": "height=0.2"}, "'height' (allowed: distance, drift"),
+        ({"--friction": "-0.1"}, "friction coefficient: -0.1 (allowed: 0.01 to 5)"),
+        ({"--friction": "nan"}, "friction coefficient: nan"),
+        ({"--tool-density": "0"}, "density of the tool, kg/m^3: 0.0 (allowed: 5 to 25000)"),
+        ({"--target-density": "inf"}, "density of the target"),
+        ({"--tool-pose": "not a topic"}, "--tool-pose: 'not a topic'"),
+        ({"--tool-pose": "/joint_states"}, "sensor_msgs/msg/JointState"),
+        ({"--tool-frame": "hand", "--tool-pose": "/pose"}, "--tool-pose and --tool-frame: 'both'"),
+        ({"--world": ""}, "--world: ''"),
+        ({"--world": "map"}, "'map': 'not connected'"),
+        ({"--tool": "object_1", "--target": "object_1"}, "two objects"),
         ({"--tool-pose": "/nobody"}, "/nobody"),
         ({"--tool-frame": "hand"}, "NO_TRANSFORM"),
         ({"--tool": "object_9"}, "UNKNOWN_OBJECT"),
@@ -75,12 +95,50 @@ def test_what_cannot_be_learned_is_said_in_one_line(change, said, tmp_path, caps
     assert main([word for pair in given.items() for word in pair]) == 2
     error = capsys.readouterr().err
     assert said in error and error.startswith("learn: ") and error.count("\n") == 1
-    assert not (tmp_path / "new").exists()
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_target_that_is_held_cannot_be_pulled(tmp_path, capsys):
+    given = ["--bag", str(BAGS / "hooking_demonstration"), "--goal", "hook", "--fixed-target", "--out", str(tmp_path / "new")]
+    assert main(given) == 2
+    assert "a target that cannot move" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["two words", ".hidden", "file", "file/below"])
+def test_a_folder_that_cannot_be_is_said_before_anything_is_read(name, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["--bag", "nowhere", "--goal", "hook", "--out", str(tmp_path / name)]) == 2
+    assert "the new strategy" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_strategy_that_is_there_is_not_written_over(learned, capsys):
-    assert main(["--bag", str(BAGS / "hooking_demonstration"), "--out", str(learned), "--goal", "hook"]) == 2
+    before = (learned / "strategy.yaml").read_bytes()
+    assert main(["--bag", "nowhere", "--out", str(learned), "--goal", "hook"]) == 2
     assert "empty folder" in capsys.readouterr().err
+    with pytest.raises(OSError):
+        write(load(learned), learned)
+    assert (learned / "strategy.yaml").read_bytes() == before
+    assert [p.name for p in learned.parent.iterdir()] == ["pulling"]
+
+
+def test_a_strategy_that_cannot_be_read_again_is_not_written(learned, tmp_path):
+    strategy = load(learned)
+    with pytest.raises(MagicError) as error:
+        write(replace(strategy, physics=replace(strategy.physics, friction=-1.0)), tmp_path / "new")
+    assert error.value.code == Code.BAD_STRATEGY and not any(tmp_path.iterdir())
+
+
+def test_a_trial_that_fails_says_what_to_change_and_leaves_no_strategy(tmp_path, capsys):
+    # Asked for is more than was shown.
+    given = ["--bag", str(BAGS / "hooking_demonstration"), "--goal", "hook", "--value", "distance=0.5", "--out", str(tmp_path / "far")]
+    assert main([*given, "--keep-failed"]) == 1
+    said = capsys.readouterr().out
+    assert "not pulled far enough" in said and "needed: 500 mm" in said
+    assert (found := re.search(r"--value distance=([0-9.]+)", said)) and 0.2 <= float(found[1]) < 0.3
+    assert [p.name for p in tmp_path.iterdir()] == ["far.failed"]
+    assert load(tmp_path / "far.failed").description.startswith("FAILED ITS OWN TRIAL (GOAL_NOT_REACHED")
+    assert main([*given, "--keep-failed"]) == 2, "nor is what failed written over"
 
 
 def pose_message(stamp, frame, pose):
@@ -89,29 +147,40 @@ def pose_message(stamp, frame, pose):
 
 
 class FakeBag:
-    """A bag with a moving /tf and poses in a camera's frame."""
+    """A bag of a marker seen by a camera: as poses in the camera's frame, and as a frame of /tf beside a faster one."""
 
     path = Path("fake")
+    types: ClassVar = {"/poses": "geometry_msgs/msg/PoseStamped"}
 
     def __init__(self):
-        from magic_core.tf import TransformBuffer
-
-        self.buffer = TransformBuffer(memory=float("inf"))
         self.world_from_camera = transforms.from_rpy(0.1, 0.2, 0.3, [1, 2, 3])
-        self.buffer.set("base", "camera", self.world_from_camera, static=True)
-        self.stamps = [1.0, 1.5, 2.0]
-        self.poses = [transforms.from_rpy(0, 0, 0.1 * s, [s, 0, 0]) for s in self.stamps]
-        for stamp, pose in zip(self.stamps, self.poses, strict=True):
-            self.buffer.set("camera", "tag", pose, stamp)
+        self.stamps = 1.0 + 0.05 * np.arange(41)
+        self.poses = [transforms.from_rpy(0, 0, 0.1 * s, [0.2 * s, 0, 0.1]) for s in self.stamps]
+        self.skipped: set[int] = set()
+        self.bad: set[int] = set()
+
+    def kept(self):
+        return [k for k in range(len(self.stamps)) if k not in self.skipped]
+
+    def _tf(self):
+        def message(parent, child, pose, stamp):
+            result = TransformStamped(header=conversions.header(parent, stamp), child_frame_id=child)
+            result.transform = conversions.transform_to_msg(pose)
+            return result
+
+        static = [message("base", "camera", self.world_from_camera, 0.0)]
+        tags = [message("camera", "tag", self.poses[k], self.stamps[k]) for k in self.kept()]
+        for k in self.bad:
+            tags[k].transform.rotation.w = 7.0
+        other = [message("base", "other", np.eye(4), 1.0 + 0.01 * k) for k in range(201)]
+        other[7].transform.rotation.w = 0.0
+        return {"/tf_static": [TFMessage(transforms=static)], "/tf": [TFMessage(transforms=[t]) for t in [*tags, *other]]}
 
     def transforms(self):
-        return self.buffer, self.stamps
+        return Recorded.transforms(SimpleNamespace(_messages=self._tf()))
 
     def of(self, topic):
-        # Out of order, and one twice.
-        return [pose_message(s, "camera", p) for s, p in [*zip(self.stamps, self.poses, strict=True)][::-1]] + [
-            pose_message(self.stamps[0], "camera", self.poses[0])
-        ]
+        return [pose_message(self.stamps[k], "camera", self.poses[k]) for k in self.kept()]
 
 
 @pytest.mark.parametrize("frame", ["", "tag"])
@@ -120,6 +189,24 @@ def test_the_track_is_in_the_world_whether_it_comes_as_poses_or_as_a_frame(frame
     times, poses = track_of(bag, "base", "/poses", frame)
     np.testing.assert_allclose(times, bag.stamps)
     np.testing.assert_allclose(poses, [bag.world_from_camera @ p for p in bag.poses], atol=1e-9)
+
+
+@pytest.mark.parametrize("frame", ["", "tag"])
+def test_a_marker_that_was_hidden_is_refused_though_other_frames_go_on(frame):
+    bag = FakeBag()
+    bag.skipped = set(range(20, 27))
+    with pytest.raises(MagicError, match=r"gap in .* from 0.95 to 1.35 s: '0.40 s' \(allowed: at most 0.25 s"):
+        track_of(bag, "base", "/poses", frame)
+    track_of(bag, "base", "/poses", frame, since=bag.stamps[30])
+
+
+def test_a_frame_whose_orientation_is_none_is_refused_and_anothers_is_not_asked_for():
+    bag = FakeBag()
+    bag.bad = {5}
+    with pytest.raises(MagicError, match=r"length of the orientation's quaternion of frame tag, 0.25 s"):
+        track_of(bag, "base", "/poses", "tag")
+    with pytest.raises(MagicError, match="never moves"):
+        track_of(bag, "base", "/poses", "camera")
 
 
 def scene_of(*places, known=()):
@@ -143,6 +230,8 @@ def test_what_is_not_clear_is_asked_for():
     with pytest.raises(MagicError) as error:
         choose(scene_of(("object_1", 0.3), ("object_2", 0.6), ("object_3", 0.9)), "", "", np.array([0.3, 0.0, 0.0]))
     assert "target" in error.value.message and "object_3" in error.value.message
+    with pytest.raises(MagicError, match=r"distance of the tool's track from object_1: '0.4"):
+        choose(scene_of(("object_1", 0.3), ("object_2", 0.6)), "object_1", "", np.array([0.3, 0.5, 0.0]))
     with pytest.raises(MagicError) as error:
         choose(scene_of(), "", "", np.zeros(3))
     assert error.value.code == Code.NO_OBJECTS

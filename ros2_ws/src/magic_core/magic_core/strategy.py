@@ -32,6 +32,9 @@ from magic_core.scene import CanonicalView
 
 MODES = ("plan", "retarget")
 REFLECTIONS = ("keep", "turn")
+#: Where the tool meets the target: outside on its silhouette, inside a hole or a notch of the silhouette, or inside what only a cut
+#: through the target's middle shows to be hollow (a ring seen from its side, a cup).
+OUTLINES = ("outer", "inner", "cut")
 
 #: libyaml's where PyYAML has it: seven times as quick, and a strategy is read for every goal.
 SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -79,7 +82,8 @@ class Strategy:
     target_normal (3,): world direction of the target's outward normal at p_O (the
     side on which the tool acts); target_view_direction (3,): world direction in which
     the target is looked at, and with which the tool's view direction is made to agree.
-    reflections: what to do with mirrored matches, in
+    target_outline: one of OUTLINES; "cut" has
+    the target drawn as cut through its middle.  reflections: what to do with mirrored matches, in
     order of trial: ``keep`` the tool's face or ``turn`` it over.  environment: names
     and numbers of fixed things around (for the scene set-ups).
     """
@@ -101,6 +105,7 @@ class Strategy:
     waypoints: tuple[Waypoint, ...]
     goal: Goal
     physics: Physics
+    target_outline: str = "outer"
     reflections: tuple[str, ...] = REFLECTIONS
     releases: bool = False
     simulatable: bool = True
@@ -149,6 +154,7 @@ def _check(strategy: Strategy) -> None:
     }
     positive = [name for name in numbers if not name.startswith(("goal", "friction"))]
     rules = {
+        f"outline of the target {strategy.target_outline!r}: one of {OUTLINES}": strategy.target_outline in OUTLINES,
         f"reflections {strategy.reflections}: of {REFLECTIONS}, at least one": bool(strategy.reflections)
         and set(strategy.reflections) <= set(REFLECTIONS),
         "times of trajectory.csv: finite, strictly increasing": bool(np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)),
@@ -212,6 +218,7 @@ def load(folder: str | Path) -> Strategy:
             ),
             goal=Goal(data["goal"]["test"], {k: float(v) for k, v in data["goal"].get("values", {}).items()}),
             physics=Physics(**physics),
+            target_outline=str(data["target"].get("outline", "outer")),
             reflections=tuple(data.get("reflections", REFLECTIONS)),
             releases=bool(data.get("releases", False)),
             simulatable=bool(data.get("simulatable", True)),
@@ -298,6 +305,7 @@ def save(strategy: Strategy, folder: str | Path) -> None:
             **_view_data(strategy.target_view, strategy.target_contact),
             "normal_in_world": _floats(strategy.target_normal),
             "view_direction_in_world": _floats(strategy.target_view_direction),
+            "outline": strategy.target_outline,
         },
         "reflections": list(strategy.reflections),
         "releases": strategy.releases,

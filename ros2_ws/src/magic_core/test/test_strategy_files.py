@@ -48,6 +48,7 @@ def make():
         waypoints=(Waypoint("behind", np.array([0.03, 0, 0]), "approach", 0.2), Waypoint("contact", np.zeros(3), "contact")),
         goal=Goal("hook", {"distance": 0.2}),
         physics=Physics(0.05, 500.0, 10.0, False),
+        target_outline="inner",
         reflections=("turn",),
         releases=True,
         simulatable=False,
@@ -63,7 +64,19 @@ def folder(tmp_path):
 
 def test_everything_comes_back(folder):
     before, after = make(), strategies.load(folder)
-    for name in ("name", "description", "view", "mode", "goal", "physics", "reflections", "releases", "simulatable", "environment"):
+    for name in (
+        "name",
+        "description",
+        "view",
+        "mode",
+        "goal",
+        "physics",
+        "target_outline",
+        "reflections",
+        "releases",
+        "simulatable",
+        "environment",
+    ):
         assert getattr(after, name) == getattr(before, name), name
     for name in ("target_normal", "target_view_direction", "times", "target_from_tool"):
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-7, err_msg=name)
@@ -111,6 +124,7 @@ def edit(folder, change):
         (lambda d: d["target"].update(normal_in_world=[0, 0, 0]), "direction"),
         (lambda d: d.update(reflections=["keep", "flip"]), "flip"),
         (lambda d: d.update(reflections=[]), "at least one"),
+        (lambda d: d["target"].update(outline="under"), "outline of the target 'under'"),
         (lambda d: d["waypoints"][0].update(offset=[0.1, 0.2]), "offset of waypoint behind"),
         (lambda d: d["waypoints"][0].update(offset=[0.1, 0.2, float("nan")]), "offset of waypoint behind"),
         (lambda d: d["waypoints"][0].update(speed=0.0), "speed of waypoint behind: above 0"),
