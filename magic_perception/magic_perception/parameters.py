@@ -22,7 +22,8 @@ class Parameters:
     snap_height, snap_tilt: a table found this near (metres, degrees) to the plane z = 0 is taken to be that plane,
     and the cameras' small errors of calibration are taken out; 0 turns it off.
     min_height: least height above the table that depth alone may call an object.
-    min_pixels, min_extent: smaller things are noise.
+    min_pixels, min_extent: smaller things are noise.  max_extent: what is longer and cut by the picture or the region is no thing
+    on the table.
     cluster_eps, cluster_points: DBSCAN's radius and neighbours on the thinned cloud.
     known_margin: points this near to a known object belong to it.
     resolution: cell of the occupancy grids that outlines come from.
@@ -43,6 +44,7 @@ class Parameters:
     min_height: float = 0.004
     min_pixels: int = 120
     min_extent: float = 0.008
+    max_extent: float = 0.6
     cluster_eps: float = 0.012
     cluster_points: int = 4
     known_margin: float = 0.012

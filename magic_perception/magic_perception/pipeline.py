@@ -15,12 +15,15 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.scene import Scene, SceneObject
+from magic_core.scene import FIXTURE, PICTURE, REGION, Scene, SceneObject
 from magic_core.views import find_view
 from magic_perception import cameras, clusters
+from magic_perception.confidence import Evidence
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
+from magic_perception.seen import cut_off, witnessed
 from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
+from magic_perception.sight import agreement
 
 
 @dataclass
@@ -37,6 +40,7 @@ class Report:
     shapes: dict[str, str] = field(default_factory=dict)
     pixels: dict[str, int] = field(default_factory=dict)
     cameras: list[cameras.Disagreement] = field(default_factory=list)
+    evidence: dict[str, Evidence] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -108,15 +112,18 @@ def perceive(
             labels = segmenter.segment(looks, fixtures, parameters)
         report.labels = labels
 
+    offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
+
     def build(label: int) -> _Built | MagicError:
         try:
-            return _build(label, looks, labels, world_from_table, parameters)
+            return _build(label, looks, labels, world_from_table, np.nan_to_num(offset), parameters)
         except MagicError as error:
             return error
 
     with report.stage("meshes"):
         numbers = list(range(1, max((int(image.max()) for image in labels), default=0) + 1))
         solids: list[_Built] = []
+        ids: dict[int | str, str] = {}
         for label, built in zip(numbers, each(build, numbers, parameters.workers), strict=True):
             if isinstance(built, MagicError):
                 report.notes.append(f"cluster {label} left out: {built.message}")
@@ -124,16 +131,19 @@ def perceive(
                     image[image == label] = 0
             else:
                 solids.append(built)
+                ids[label] = f"object_{len(solids)}"
 
     with report.stage("views"):
         objects = []
         for built, item in zip(solids, each(lambda b: _as_object(b, world_from_table), solids, parameters.workers), strict=True):
-            item = replace(item, id=f"object_{len(objects) + 1}")
+            # What hides a thing and was left out itself is as nameless as a fixture.
+            by = tuple(dict.fromkeys(by if isinstance(by, str) else ids.get(by, FIXTURE) for by in built.cut_off))
+            item = replace(item, id=f"object_{len(objects) + 1}", cut_off=by, seen_share=built.evidence.witnessed.seen)
+            report.evidence[item.id] = built.evidence
             report.shapes[item.id], report.pixels[item.id] = built.solid.shape, built.pixels
             objects.append(item)
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
     stamp = max(frame.stamp for frame in frames)
-    offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
     return Scene((*objects, *known), plane, stamp, camera_offset=offset, camera_angle=angle, notes=tuple(report.notes))
 
 
@@ -146,8 +156,9 @@ class _Built:
     colors: NDArray[np.uint8]
     mask: NDArray[np.bool_]
     camera: str
-    confidence: float
     pixels: int
+    cut_off: list[int | str]
+    evidence: Evidence
 
 
 def _build(
@@ -155,9 +166,10 @@ def _build(
     looks: list[Looked],
     labels: list[NDArray[np.int32]],
     world_from_table: NDArray[np.float64],
+    apart: float,
     parameters: Parameters,
 ) -> _Built:
-    """The solid of the object with that label, and what was seen of it."""
+    """The solid of the object with that label, and what was seen of it; ``apart``: how far the cameras disagree, m."""
     table_from_world = transforms.inverse(world_from_table)
     sights, clouds, paints, counts = [], [], [], []
     for looked, image in zip(looks, labels, strict=True):
@@ -188,15 +200,22 @@ def _build(
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
+    cut = cut_off(looks, labels, label)
+    # A wall, a monitor, a person: no thing on the table.
+    across = float(np.ptp(np.percentile(points, [1, 99], axis=0), axis=0).max())
+    if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut):
+        raise MagicError(
+            Code.OBJECT_CUT_OFF,
+            "extent in metres of something that the picture or the region cuts; motions do not avoid it",
+            round(across, 2),
+            f"up to {parameters.max_extent}",
+        )
     solid = reconstruct(sights, parameters)
+    evidence = Evidence(
+        solid.shape, agreement(solid.mesh, sights), witnessed(solid.mesh, sights), solid.mesh.extents, len(sights), apart, bool(cut)
+    )
     best = int(np.argmax(counts))
-    mask = labels[best] == label
-    confidence = solid.confidence * (0.6 if _cut_by_border(mask) else 1.0)
-    return _Built(solid, points, colors, mask, looks[best].frame.camera, confidence, counts[best])
-
-
-def _cut_by_border(mask: NDArray[np.bool_]) -> bool:
-    return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+    return _Built(solid, points, colors, labels[best] == label, looks[best].frame.camera, counts[best], cut, evidence)
 
 
 def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObject:
@@ -220,7 +239,7 @@ def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObj
     pieces = tuple(piece.transformed(object_from_table) for piece in built.solid.pieces)
     return SceneObject(
         "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera,
-        world_from_box=pose, box_extents=local.extents, confidence=built.confidence,
+        world_from_box=pose, box_extents=local.extents, confidence=built.solid.confidence,
     )  # fmt: skip
 
 

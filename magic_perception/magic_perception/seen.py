@@ -65,7 +65,8 @@ def cuts(look: Looked, labels: NDArray[np.int32], label: int) -> list[Cut]:
     add(REGION, (cv2.dilate(beyond, np.ones((5, 5), np.uint8)) > 0) & ~edge[cut])
     near = cv2.dilate(mine.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
     with np.errstate(invalid="ignore"):
-        front = near & (others != 0) & ~mine & (share > 0) & (depth < own - NEARER)
+        # Of a fixture or the robot there may be no depth.
+        front = near & (others != 0) & ~mine & (share > 0) & ((depth < own - NEARER) | ((others < 0) & ~np.isfinite(depth)))
     for by in np.unique(others[front]):
         add(int(by) if by > 0 else FIXTURE, cv2.dilate((front & (others == by)).view(np.uint8), np.ones((7, 7), np.uint8)) > 0)
     return found

@@ -137,3 +137,45 @@ def test_a_wall_alone_is_refused():
     with pytest.raises(MagicError, match="upright in the picture") as caught:
         table_in_view(k.unproject(frame.depth))
     assert caught.value.code == Code.TABLE_AMBIGUOUS
+
+
+# ---------------------------------------------------------------- what is seen in part
+
+
+def seen_by(meshes, names=("left", "right"), intrinsics=scenes.INTRINSICS, parameters=REGION):
+    caster = sensor.scene_raycaster(meshes)
+    frames = [sensor.capture([], intrinsics, scenes.POSES[name], [8, i], camera=name, raycaster=caster) for i, name in enumerate(names)]
+    return perceive(frames, parameters=parameters)
+
+
+def at(scene, x, y):
+    return min(scene.objects, key=lambda o: np.linalg.norm(o.world_from_object[:2, 3] - [x, y]))
+
+
+def test_the_border_of_the_picture_cuts():
+    hook = scenes.shape("l_hook", 1, 0.5, 0.0, 0.4)
+    # The right half of the left camera's picture, so that the border runs through the hook.
+    k = scenes.INTRINSICS
+    narrow = Intrinsics(320, 480, k.fx, k.fy, 319.5, k.cy)
+    whole, part = seen_by([hook], ("left",)), seen_by([hook], ("left",), narrow)
+    assert at(whole, 0.5, 0.0).cut_off == () and at(part, 0.5, 0.0).cut_off == ("picture",)
+    assert at(part, 0.5, 0.0).box_extents.max() < 0.9 * at(whole, 0.5, 0.0).box_extents.max()
+
+
+def test_the_region_cuts():
+    hook = scenes.shape("l_hook", 1, 0.5, 0.0, 0.4)
+    scene = seen_by([hook], parameters=replace(REGION, region_low=(0.5, -0.6, -0.05)))
+    assert scene.objects[0].cut_off == ("region",)
+
+
+def test_what_hides_a_thing_is_named_unless_another_camera_looks_behind_it():
+    eye = scenes.POSES["left"][:3, 3]
+    hook = scenes.shape("l_hook", 1, 0.6, -0.1, 0.4)
+    place = np.array([0.6, -0.1]) + 0.11 * transforms.unit(eye[:2] - [0.6, -0.1])
+    tin = scenes.placed(slab([0.07, 0.07, 0.12], [0, 0, 0], (90, 140, 90)), *place)
+    alone = seen_by([hook, tin], ("left",))
+    found = max((o for o in alone.objects if o.box_extents[2] < 0.06), key=lambda o: o.box_extents.max())
+    front = max(alone.objects, key=lambda o: o.box_extents[2])
+    assert found.cut_off == (front.id,) and front.cut_off == ()
+    both = seen_by([hook, tin])
+    assert [o.cut_off for o in both.objects] == [(), ()]
