@@ -9,7 +9,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        (f"share/{PACKAGE}/config", ["config/verifier.param.yaml"]),
+        (f"share/{PACKAGE}/config", ["config/verifier.param.yaml", "config/reality.yaml"]),
     ],
     install_requires=["setuptools"],
     zip_safe=False,
@@ -22,6 +22,7 @@ setup(
             f"verifier = {PACKAGE}.node:main",
             f"evaluate = {PACKAGE}.evaluate:main",
             f"learn = {PACKAGE}.learn:main",
+            f"reality = {PACKAGE}.reality:main",
         ]
     },
 )
