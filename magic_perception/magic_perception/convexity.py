@@ -51,7 +51,10 @@ class Evidence:
     other.  floor: a part that begins below this height stands on the table.  neck: an upper part on the lower one's axis,
     both round, and narrower than this share of it is its neck.
     foot: least width of the lowest 25 mm of what stands on another part; a post grows out of its base.
+    doubts: so many criteria must speak against two things before they are joined.
     """
+
+    doubts: int = 2
 
     seam: int = 24
     sharp: float = 25.0
@@ -175,7 +178,7 @@ def _join_unproven(
                 angle = float(np.median(bend[told])) if told.any() else 0.0
                 if int(told.sum()) < evidence.seam:
                     share = 0.0
-                if _two_things(centre, normal, height, part == i, part == j, share, angle, evidence):
+                if _doubts(centre, normal, height, part == i, part == j, share, angle, evidence) < evidence.doubts:
                     continue
                 seam = np.concatenate([a[across], b[across]])
                 rank = (not (_ends_at(centre, part == i, seam, evidence) or _ends_at(centre, part == j, seam, evidence)), share)
@@ -213,42 +216,37 @@ def _ends_at(centre: NDArray[np.float64], members: NDArray[np.bool_], seam: NDAr
     )
 
 
-def _two_things(
+def _doubts(
     centre: NDArray[np.float64], normal: NDArray[np.float64], height: NDArray[np.float64],
     first: NDArray[np.bool_], second: NDArray[np.bool_], share: float, angle: float, evidence: Evidence,
-) -> bool:  # fmt: skip
+) -> int:  # fmt: skip
+    """How many of the criteria of :class:`Evidence` speak against two parts being two things: the seam, the bulk of either, and how they lie."""
     from magic_perception.primitives import fit_circle
 
-    if share < evidence.concave or angle < evidence.bend:
-        return False
+    doubts = int(share < evidence.concave or angle < evidence.bend)
     for members in (first, second):
         local = centre[members] - centre[members].mean(axis=0)
         along = local @ np.linalg.svd(local, full_matrices=False)[2].T
         extent = np.sort(np.percentile(along, 97, axis=0) - np.percentile(along, 3, axis=0))
-        if extent[1] < evidence.breadth or extent[0] < evidence.depth:
-            return False
+        doubts += int(extent[1] < evidence.breadth or extent[0] < evidence.depth)
     lower, upper = (first, second) if np.median(height[first]) < np.median(height[second]) else (second, first)
     bottom, top = float(np.percentile(height[upper], 2)), float(np.percentile(height[lower], 97))
     if bottom < top - evidence.rest:
-        return (
-            bottom < evidence.floor
-            and float(np.percentile(height[lower], 2)) < evidence.floor
-            and share >= evidence.beside
-            and angle >= evidence.beside_bend
-        )
+        both = bottom < evidence.floor and float(np.percentile(height[lower], 2)) < evidence.floor
+        return doubts + int(not both) + int(share < evidence.beside or angle < evidence.beside_bend)
     foot = centre[upper & (height < bottom + 0.025), :2]
-    if len(foot) < 4 or float(np.ptp(foot @ np.linalg.svd(foot - foot.mean(axis=0), full_matrices=False)[2][0])) < evidence.foot:
-        return False
+    doubts += int(len(foot) < 4 or float(np.ptp(foot @ np.linalg.svd(foot - foot.mean(axis=0), full_matrices=False)[2][0])) < evidence.foot)
     circles = []
     for members in (lower, upper):
         side = members & (np.abs(normal[:, 2]) < 0.7)
         if side.sum() < 12:
-            return True
+            return doubts
         middle, radius = fit_circle(centre[side, :2])
         circles.append((middle, radius, float(np.percentile(np.abs(np.linalg.norm(centre[side, :2] - middle, axis=1) - radius), 80))))
     (c0, r0, e0), (c1, r1, e1) = circles
     neck = e0 < 0.15 * r0 and e1 < 0.2 * r1 and r1 < evidence.neck * r0 and np.linalg.norm(c0 - c1) < 0.2 * r0
-    return not neck
+    # A neck is no doubt but a sign of one thing.
+    return doubts + (evidence.doubts if neck else 0)
 
 
 def insides(

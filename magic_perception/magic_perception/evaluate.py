@@ -70,7 +70,9 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
     """Best IoU of each labelled object.  Labels 40, 41, ... are surfaces of one thing (a bowl's outside and inside): objects are told by their tens."""
     scenes: dict[str, object] = {}
     everything: list[float] = []
-    for name, k in json.loads((folder / "intrinsics.json").read_text()).items():
+    intrinsics = json.loads((folder / "intrinsics.json").read_text())
+    for name in sorted(path.name.removesuffix("_label.png") for path in folder.glob("*_label.png")):
+        k = intrinsics.get(name, intrinsics.get("all scenes"))
         frame = read_frame(
             folder / f"{name}_color.png",
             folder / f"{name}_depth_mm.png",
@@ -97,7 +99,12 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(pictures / f"{name}.png"), tinted(frame.color, labels)[..., ::-1])
-    return {"mean_best_iou": round(float(np.mean(everything)), 4), "objects": len(everything), "scenes": scenes}
+    return {
+        "mean_best_iou": round(float(np.mean(everything)), 4),
+        "above_0.75": round(float(np.mean(np.array(everything) > 0.75)), 4),
+        "objects": len(everything),
+        "scenes": scenes,
+    }
 
 
 def tinted(color: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -331,7 +338,7 @@ def markdown(result: dict) -> str:
     if "osd" in result:
         part = result["osd"]
         lines += [
-            f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects.",
+            f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects of {len(part['scenes'])} scenes; above 0.75: {part['above_0.75']:.1%}.",
             "",
             "| scene | objects | found | best IoU | CPU s |",
             "| --- | --- | --- | --- | --- |",
