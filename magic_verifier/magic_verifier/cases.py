@@ -18,10 +18,13 @@ from magic_verifier.posing import PoseEntry, posed, read_poses
 
 TASKS = ("scooping", "hanging", "hooking")
 VARIANTS = ("fg", "arm", "fg_no_selection")
-#: ``magic``: all of it.  ``no_verification``: the best-scored candidate is carried out, unseen by the verifier (which then only
-#: judges it).  ``no_two_step``: without the second curvature estimate and the convexity search.  ``global_only``: the best places
-#: of the global stage, neither refined nor ranked by curvature.
-METHODS = ("magic", "no_verification", "no_two_step", "global_only")
+#: ``magic``: all of it.  The paper's baselines: ``pca`` and ``fpfh_icp`` align the whole shape, ``dino`` takes the best places of the
+#: features, neither refined nor ranked by curvature, ``curvature`` draws contact points at random and ranks them by curvature alone.  The
+#: ablations of its Table III: ``no_feature_pca_patch`` (of features that have both), ``no_two_step_curvature`` (without the second estimate
+#: and the convexity search), ``no_simulation_verification`` (the best-scored candidate is carried out, unseen by the verifier, which then
+#: only judges it).  All but the last get as many candidates as ``magic``, and the same planner and verifier.
+BASELINES = ("pca", "fpfh_icp", "curvature")
+METHODS = ("magic", *BASELINES, "dino", "no_feature_pca_patch", "no_two_step_curvature", "no_simulation_verification")
 #: Tools of each task: family and seeds; none of them is the tool of a demonstration.
 SPOONS = (("spoon", 11), ("spoon", 12), ("ladle", 11), ("ladle", 12), ("measuring_cup", 11), ("measuring_cup", 12))
 HOOKS = (("scissors", 1), ("hanger", 1), ("caliper", 1), ("watch", 1))

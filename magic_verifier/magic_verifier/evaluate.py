@@ -15,6 +15,7 @@ import math
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -30,6 +31,7 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import captured
 from magic_verifier.cases import (
+    BASELINES,
     METHODS,
     SETS,
     SOURCES,
@@ -81,10 +83,12 @@ def _matcher(features: str, weights: str, method: str) -> Any:
     from magic_matcher.features import load
     from magic_matcher.matching import Matcher
 
+    if method == "no_feature_pca_patch":
+        return Matcher(load(features, weights, components=None, aggregation="none"))
     backend = load(features, weights)
-    if method == "global_only":
+    if method == "dino":
         return Matcher(backend, weight=0.0, two_step=False)
-    return Matcher(backend, two_step=method != "no_two_step")
+    return Matcher(backend, two_step=method != "no_two_step_curvature")
 
 
 @lru_cache(maxsize=1)
@@ -168,7 +172,6 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     import torch
 
     from magic_bringup.pipeline import Agenda
-    from magic_matcher.matching import Tool, tool_view
 
     _ready(options.variant)
     torch.set_num_threads(1)
@@ -187,24 +190,17 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     try:
         strategy = _strategy(options)
         problem = _as_seen(options, strategy, case, seconds, film) if options.source == "images" else _as_given(options, strategy, case)
-        tools, target = problem.tools, problem.target
-        matcher = _matcher(options.features, options.weights, options.method)
-        reference = _reference(strategy)
-        matcher.prepare(reference)
-        met = met_at(problem.meeting, target, strategy.view) if problem.meeting is not None else None
-        top_k = 1 if options.method == "no_verification" else options.top_k
+        only_best = options.method == "no_simulation_verification"
+        if options.method not in BASELINES:
+            _matcher(options.features, options.weights, options.method).prepare(
+                _reference(strategy)
+            )  # once for a strategy, not for a problem
         started = time.perf_counter()
-        if met is None:
-            found = matcher.match(strategy, tools, target, top_k)
-        else:
-            drawn = [Tool(tool.id, tool_view(tool, strategy.view)) for tool in tools]
-            found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.radius, started)
+        candidates, answer["features"] = _candidates(options, strategy, problem, 1 if only_best else options.top_k)
         seconds["match"] = time.perf_counter() - started
-        answer["features"] = found.features
-        by_id = {tool.id: (tool, name) for tool, name in zip(tools, problem.names, strict=True)}
-        only_best = options.method == "no_verification"
+        by_id = {tool.id: (tool, name) for tool, name in zip(problem.tools, problem.names, strict=True)}
         attempts = ARM_ATTEMPTS if options.variant == "arm" and not only_best else 1
-        agenda = Agenda(found.candidates[: 1 if only_best else None], strategy.reflections[: 1 if only_best else None], attempts)
+        agenda = Agenda(candidates[: 1 if only_best else None], strategy.reflections[: 1 if only_best else None], attempts)
         entries: dict[tuple[int, str], dict[str, Any]] = {}
         while not answer["success"] and (following := agenda.next()) is not None:
             promise, trial = following
@@ -235,6 +231,30 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         _draw(film, runs[-1], problem)
     seconds["total"] = sum(seconds.values())
     return answer
+
+
+def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: int) -> tuple[Sequence[Any], str]:
+    """Ranked contacts by the method that is evaluated, and the features that it used."""
+    from magic_matcher import baselines
+    from magic_matcher.matching import Target, Tool, target_contact, target_view, tool_view
+
+    tools, target = problem.tools, problem.target
+    met = met_at(problem.meeting, target, strategy.view) if problem.meeting is not None else None
+    if options.method in BASELINES:
+        if met is None:
+            view = target_view(target, strategy)
+            met = Target(target.id, view, target_contact(strategy, view, target.world_from_object))
+        if options.method == "curvature":
+            return baselines.by_curvature(strategy, tools, met, top_k, options.seed), "none"
+        return baselines.by_shape(options.method, strategy, tools, met, top_k, options.seed), "none"
+    matcher = _matcher(options.features, options.weights, options.method)
+    if met is None:
+        found = matcher.match(strategy, tools, target, top_k)
+    else:
+        drawn = [Tool(tool.id, tool_view(tool, strategy.view)) for tool in tools]
+        reference = _reference(strategy)
+        found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.radius)
+    return found.candidates, found.features
 
 
 def _judge(options: Options, case: Case, problem: _Problem | None, runs: list[_Tried], answer: dict[str, Any]) -> None:
@@ -426,6 +446,13 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
     """Run all cases that are not stored yet and write ``results.json``, ``summary.txt`` and the contact sheets."""
     from joblib import Parallel, delayed
 
+    if options.method == "no_feature_pca_patch" and options.features != "dinov2":
+        raise MagicError(
+            Code.BAD_REQUEST,
+            f"features of the method {options.method}",
+            options.features,
+            "dinov2, which has a PCA and patches to leave out",
+        )
     todo = all_cases(options)[: limit or None]
     (out / "cases").mkdir(parents=True, exist_ok=True)
     # What is stored belongs to these options only.

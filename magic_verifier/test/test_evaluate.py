@@ -125,14 +125,19 @@ def test_hooking_is_judged_by_the_released_codes_own_test():
     assert "unlike" in ev.summarise(replace(hooking, noise=0.5), [])["test"]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "no_feature_pca_patch"])
 def test_every_method_runs_a_case(method):
     options = replace(OPTIONS, task="hooking", variant="fg_no_selection", method=method)
     answer = ev.run_case(options, all_cases(options)[1])
     assert answer["reason"] in Code.__members__, answer
     assert answer["candidates"]
-    if method == "no_verification":
+    if method == "no_simulation_verification":
         assert answer["simulations"] <= 1
+
+
+def test_what_the_features_do_not_have_cannot_be_left_out(tmp_path):
+    with pytest.raises(MagicError, match="dinov2"):
+        ev.evaluate(replace(OPTIONS, method="no_feature_pca_patch"), tmp_path, limit=1, log=lambda _text: None)
 
 
 def test_a_mug_is_hung_on_a_mug_tree():
