@@ -13,6 +13,7 @@ from sensor_msgs.msg import JointState
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import check_solid
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
 from magic_core.robot import PANDA_ACCELERATION, RobotConfig
@@ -128,6 +129,8 @@ class PlannerNode(Node):
         feedback("motion", f"moving {goal.tool.id} by strategy {goal.strategy}")
         strategy = strategies.find(goal.strategy, self._strategies or None)
         tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        for item, what in ((tool, "tool"), (target, "target")):
+            check_solid(item.mesh, f"the {what} {item.id}")
         obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids) or "" in ids:
