@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import images as files
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
 from magic_matcher import contour as contours
@@ -32,33 +33,8 @@ CANNY = (100, 200)
 
 
 def decode(path: str | Path, name: str) -> NDArray[np.uint8]:
-    """A picture file as 8 bits a channel, (H, W), (H, W, 3) BGR or (H, W, 4) BGRA; ``name`` says in errors what it is.
-
-    16-bit files are scaled by their range (12 bits where nothing exceeds them), floating-point ones by their largest value where it exceeds 1.
-    """
-    path = Path(path).expanduser()
-    if not path.is_file():
-        raise MagicError(Code.BAD_REQUEST_IMAGE, name, str(path), "a file that exists")
-    raw = np.fromfile(path, np.uint8)
-    try:
-        # Decoded from memory: reading files OpenCV writes warnings of its own.
-        data = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
-    except cv2.error:
-        data = None
-    if data is None or data.size == 0:
-        raise MagicError(Code.BAD_REQUEST_IMAGE, name, str(path), "a readable PNG or JPEG file")
-    if data.dtype == np.bool_:
-        data = data.astype(np.uint8) * 255
-    elif data.dtype.kind == "f":
-        data = np.nan_to_num(data, nan=0.0, posinf=0.0, neginf=0.0)
-        data = np.clip(data * (255 / max(float(data.max()), 1.0)), 0, 255).astype(np.uint8)
-    elif data.dtype != np.uint8:
-        full = 4095 if data.dtype == np.uint16 and data.max() <= 4095 else np.iinfo(data.dtype).max
-        data = np.clip(data.astype(np.float64) * (255 / full), 0, 255).astype(np.uint8)
-    if data.ndim == 3 and data.shape[2] == 1:
-        data = data[..., 0]
-    elif data.ndim == 3 and data.shape[2] == 2:  # grey and alpha
-        data = np.dstack([data[..., :1].repeat(3, axis=2), data[..., 1]])
+    """A picture file as it is shown (:mod:`magic_core.images`), (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8; ``name`` says in errors what it is."""
+    data = files.read(path, name, Code.BAD_REQUEST_IMAGE)
     if min(data.shape[:2]) < SMALLEST:
         raise MagicError(
             Code.BAD_REQUEST_IMAGE, f"size of {name} {path}", f"{data.shape[1]}x{data.shape[0]}", f"{SMALLEST} px or more a side"

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import transforms
+from magic_core import images, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.mesh import Mesh, load
@@ -52,10 +52,8 @@ STANDING = ("mugs", "mug_trees", "targets", "watches")
 
 def read_frame(color: Path, depth: Path, intrinsics: Intrinsics, name: str) -> RgbdFrame:
     """A frame of PNG files, depth in mm; the table in sight is z = 0."""
-    image = cv2.imread(str(color))[..., ::-1].copy()
-    metres = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
-    metres[metres == 0] = np.nan
-    return RgbdFrame(image, metres, intrinsics, camera_over_table(intrinsics.unproject(metres)[::3, ::3]), name)
+    metres = images.read_depth(depth, "mm")
+    return RgbdFrame(images.read_color(color), metres, intrinsics, camera_over_table(intrinsics.unproject(metres)[::3, ::3]), name)
 
 
 def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:

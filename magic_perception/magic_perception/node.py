@@ -11,21 +11,22 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import CameraInfo, Image
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from visualization_msgs.msg import MarkerArray
 
 from magic_core import conversions as cv
+from magic_core import depth as depths
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
-from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
-from magic_core.qos import LATCHED, SENSOR
+from magic_core.qos import LATCHED, RELIABLE, SENSOR
 from magic_core.scene import Scene, SceneObject
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
@@ -38,6 +39,13 @@ from magic_perception.segmenters import SEGMENTERS, make_segmenter
 from magic_perception.stream import WAITING, Pair, Stream, next_scene
 from magic_perception.tracking import Tracker
 
+#: What image_transport calls its compressed images, and who reads them: raw, compressed.
+DECODERS = {
+    "color": (("compressed",), cv.color_from_msg, cv.color_from_compressed_msg),
+    "depth": (("compressedDepth", "compressed"), cv.depth_from_msg, cv.depth_from_compressed_msg),
+}
+#: What a user can do about a unit.
+REMEDY = "set the driver's depth unit, or this node's parameter depth_unit"
 #: After so long without a new pair of images, s, none of those that were taken together is still on its way.
 SETTLED = 0.5
 
@@ -55,6 +63,7 @@ class Perception(Node):
 
     Subscribes (sensor QoS), for each camera NAME of ``cameras``: ``camera/NAME/color/image_raw`` (rgb8, bgr8, rgba8, bgra8,
     mono8), ``camera/NAME/color/camera_info`` and ``camera/NAME/aligned_depth_to_color/image_raw`` (16UC1 mm or 32FC1 m);
+    where an image is not published but its ``/compressed`` or ``/compressedDepth`` is, those;
     with ``aligned`` false, ``camera/NAME/depth/image_rect_raw`` and ``camera/NAME/depth/camera_info`` instead, and depth
     is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures.
     Publishes ``objects`` and ``perception/markers`` (latched), ``/diagnostics`` (1 Hz).
@@ -87,6 +96,9 @@ class Perception(Node):
         )
         tolerance = p("pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0)
         self.period = 1.0 / p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0)
+        self.depth_unit = p("depth_unit", "", "what 1 in a depth image is (mm, 0.25mm, m, ...); empty: mm in 16UC1, m in 32FC1")
+        if self.depth_unit:
+            depths.metres(self.depth_unit)
         name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS)
         weights = p("weights", "", "weights of the segmenter: a hub name or a local folder; empty: its default")
         device = p("device", "cpu", "torch device of the segmenter")
@@ -112,12 +124,16 @@ class Perception(Node):
 
         self.objects_out = self.create_publisher(SceneObjectArray, "objects", LATCHED)
         self.markers_out = self.create_publisher(MarkerArray, "perception/markers", LATCHED)
+        self.diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
+        self.inputs = inputs
         self.topics = {camera: self._subscribe(camera, inputs) for camera in self.cameras}
+        self.compressed: dict[tuple[str, str], Subscription] = {}
         self.transforms = TransformListener(self, inputs, self.lock)
         self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
-        wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
-        self.diagnostics = Diagnostics(self, self.on_report, report)
+        self.create_timer(min(0.05, self.period / 4), self.on_work, callback_group=work)
+        self.create_timer(1.0, self.on_report, callback_group=report)
+        self.create_timer(0.5, self.on_look, callback_group=report)
         self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
 
     def _algorithm(self) -> Parameters:
@@ -164,6 +180,32 @@ class Perception(Node):
                 self.create_subscription(Image, topic, partial(self.on_image, camera, what), SENSOR, callback_group=group)
         return topics
 
+    def find_compressed(self) -> None:
+        """Subscribe to the compressed images of what is published compressed and not raw, for as long as that is so."""
+        for camera, topics in self.topics.items():
+            for what, (suffixes, _, _) in DECODERS.items():
+                raw, key = topics[what], (camera, what)
+                if self.count_publishers(raw):
+                    if key in self.compressed:
+                        self.destroy_subscription(self.compressed.pop(key))
+                elif key not in self.compressed:
+                    topic = next((f"{raw}/{suffix}" for suffix in suffixes if self.count_publishers(f"{raw}/{suffix}")), None)
+                    if topic is not None:
+                        callback = partial(self.on_image, camera, what)
+                        self.compressed[key] = self.create_subscription(
+                            CompressedImage, topic, callback, SENSOR, callback_group=self.inputs
+                        )
+                        self.get_logger().info(f"{raw} comes compressed only: listening to {topic}")
+
+    def elsewhere(self) -> str:
+        """Where images of other names come, for the message that none came here."""
+        kinds = {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
+        own = {self.resolve_topic_name(t) for topics in self.topics.values() for t in topics.values()}
+        own |= {s.topic_name for s in self.compressed.values()}
+        found = sorted(name for name, types in self.get_topic_names_and_types() if kinds & set(types) and name not in own)
+        found = [name for name in found if self.count_publishers(name)]
+        return f"; images come on {', '.join(found[:8])}: remap them, or name the cameras" if found else ""
+
     def warm_up(self) -> None:
         """Look at a small made-up scene, so that the first real one does not pay for loading the libraries."""
         from magic_core import sensor, shapes
@@ -197,8 +239,8 @@ class Perception(Node):
         except UnsupportedEventTypeError:
             self.create_subscription(kind, topic, callback, qos, callback_group=group)
 
-    def on_image(self, camera: str, what: str, msg: Image) -> None:
-        """One colour or depth image."""
+    def on_image(self, camera: str, what: str, msg: Image | CompressedImage) -> None:
+        """One colour or depth image, raw or compressed."""
         now = time.monotonic()
         stream = self.streams[camera]
         with self.lock:
@@ -220,10 +262,14 @@ class Perception(Node):
                             round(age, 2),
                             f"at most {self.max_age}",
                         )
+                compressed = isinstance(msg, CompressedImage)
+                _, raw_decoder, decoder = DECODERS[what]
+                decode = decoder if compressed else raw_decoder
                 if what == "color":
-                    stream.color(stamp, cv.color_from_msg(msg), msg.header.frame_id, now)
+                    stream.color(stamp, decode(msg), msg.header.frame_id, now)
                 else:
-                    stream.depth(stamp, cv.depth_from_msg(msg), msg.header.frame_id, now)
+                    stream.unit = self.depth_unit or ("m" if (msg.format if compressed else msg.encoding).startswith("32FC1") else "mm")
+                    stream.depth(stamp, decode(msg, self.depth_unit), msg.header.frame_id, now)
             except Exception as error:
                 code, message = describe(self, error)
                 stream.last[what] = now
@@ -450,7 +496,13 @@ class Perception(Node):
                 int(np.isfinite(result.depth).sum()),
                 "at least 100",
             )
-        return result
+        self.check_unit(stream, result)
+        return replace(result, depth=depths.without_far(result.depth))
+
+    def check_unit(self, stream: Stream, frame: RgbdFrame) -> None:
+        """Depth that is no table-top's, or not that of the table under this camera, is of another unit than its encoding says."""
+        depths.check_distance(frame.depth, self.topics[stream.name]["depth"], stream.unit, True, REMEDY)
+        depths.check_pose(frame, stream.unit, REMEDY, self.parameters.region_low, self.parameters.region_high)
 
     def publish(self, scene: Scene) -> None:
         """Objects and markers."""
@@ -459,26 +511,49 @@ class Perception(Node):
 
     # ------------------------------------------------------------ diagnostics
 
-    def on_report(self) -> list[DiagnosticStatus]:
-        """Once a second: what is there and what is missing."""
-        now = time.monotonic()
-        with self.lock:
-            states = [self.camera_status(camera, now) for camera in self.cameras]
-        level, code, message, values = self.outcome
-        worst = [s for s in states if s.level != DiagnosticStatus.OK]
-        if self.done == 0 and code is Code.NO_FRAMES and worst:
-            message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
-        states.append(pc.status(f"{label(self)}: scene", level, message, code, values))
-        for topic, message in self.unheard.items():
-            message = f"[{int(Code.NO_FRAMES)} QoS] {message}"
-            states.append(pc.status(f"{label(self)}: topic {topic}", DiagnosticStatus.ERROR, message, Code.NO_FRAMES, {}))
-        if self.known_problem is not None:
-            code, message = self.known_problem
-            message = f"[{int(code)} {code.name}] {message}"
-            states.append(pc.status(f"{label(self)}: known objects", DiagnosticStatus.ERROR, message, code, {}))
-        for state in states:
-            state.hardware_id = self.get_fully_qualified_name()
-        return states
+    def on_look(self) -> None:
+        """Look twice a second for images that come compressed only."""
+        try:
+            self.find_compressed()
+        except Exception as error:
+            self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
+
+    def on_report(self) -> None:
+        """Say once a second what is there and what is missing."""
+        try:
+            now = time.monotonic()
+            with self.lock:
+                states = [self.camera_status(camera, now) for camera in self.cameras]
+            level, code, message, values = self.outcome
+            worst = [s for s in states if s.level != DiagnosticStatus.OK]
+            if self.done == 0 and code is Code.NO_FRAMES and worst:
+                message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
+            states.append(pc.status(f"{self.get_name()}: scene", level, message, code, values))
+            for topic, message in self.unheard.items():
+                states.append(
+                    pc.status(
+                        f"{self.get_name()}: topic {topic}",
+                        DiagnosticStatus.ERROR,
+                        f"[{int(Code.NO_FRAMES)} QoS] {message}",
+                        Code.NO_FRAMES,
+                        {},
+                    )
+                )
+            if self.known_problem is not None:
+                states.append(
+                    pc.status(
+                        f"{self.get_name()}: known objects",
+                        DiagnosticStatus.ERROR,
+                        f"[{int(self.known_problem[0])} {self.known_problem[0].name}] {self.known_problem[1]}",
+                        self.known_problem[0],
+                        {},
+                    )
+                )
+            msg = DiagnosticArray(status=states)
+            msg.header.stamp = self.get_clock().now().to_msg()
+            self.diagnostics_out.publish(msg)
+        except Exception as error:
+            self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
 
     def camera_status(self, camera: str, now: float) -> DiagnosticStatus:
         """One camera: its problems, else what of it is silent, else OK."""
@@ -493,7 +568,7 @@ class Perception(Node):
             values["stamp"] = f"{stream.pairs[-1].stamp:.3f}"
         if self.distortion.get(camera, 0.0) > 1e-3:
             values["distortion"] = f"up to {self.distortion[camera]:.3f}, left out: publish rectified images"
-        name = f"{label(self)}: camera {camera}"
+        name = f"{self.get_name()}: camera {camera}"
         for what in ("camera_info", "depth_camera_info", "color", "depth", "stamps", "pairing", "frames"):
             if what in stream.problems:
                 problem = stream.problems[what]
@@ -516,6 +591,8 @@ class Perception(Node):
                     why = f"{len(publishers)} publishers" + (
                         f", silent for {silent:.1f} s" if what in stream.last else ", nothing received"
                     )
+                    if not publishers and not what.endswith("camera_info"):
+                        why += self.elsewhere()
                 code = Code.NO_CAMERA_INFO if what.endswith("camera_info") else (Code.STALE_DATA if what in stream.last else Code.NO_FRAMES)
                 return pc.status(
                     name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values

@@ -10,36 +10,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core import depth as depths
+from magic_core import images, transforms
+from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmenters import SEGMENTERS, make_segmenter
 from magic_perception.table import camera_over_table
-
-
-def read_frame(color: Path, depth: Path, intrinsics: str, unit: str) -> tuple[NDArray[np.uint8], NDArray[np.float32], Intrinsics]:
-    """Colour (H, W, 3) RGB, depth (H, W) metres with NaN, intrinsics ``fx,fy,cx,cy``.
-
-    A 16-bit depth image is in ``unit`` (mm or m per 1); a float one (TIFF, EXR, npy) in the same unit.
-    """
-    image = cv2.imread(str(color), cv2.IMREAD_COLOR)
-    if image is None:
-        raise MagicError(Code.BAD_IMAGE, "colour image", str(color), "a readable PNG or JPEG file")
-    raw = np.load(depth) if depth.suffix == ".npy" and depth.is_file() else cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)
-    if raw is None:
-        raise MagicError(Code.BAD_IMAGE, "depth image", str(depth), "a readable 16-bit PNG, TIFF or npy file")
-    if raw.ndim != 2 or raw.dtype == np.uint8:
-        raise MagicError(Code.BAD_ENCODING, "depth image", f"{raw.shape} {raw.dtype}", "one channel of 16 bits or floats")
-    metres = raw.astype(np.float32) * (0.001 if unit == "mm" else 1.0)
-    metres[~np.isfinite(metres) | (metres <= 0)] = np.nan
-    try:
-        fx, fy, cx, cy = (float(x) for x in intrinsics.split(","))
-    except ValueError:
-        raise MagicError(Code.BAD_INTRINSICS, "--intrinsics", intrinsics, "fx,fy,cx,cy: four numbers in pixels") from None
-    return np.ascontiguousarray(image[..., ::-1]), metres, Intrinsics(image.shape[1], image.shape[0], fx, fy, cx, cy)
 
 
 def write(scene_dir: Path, frame: RgbdFrame, scene, report: Report, seconds: float) -> None:
@@ -90,9 +69,12 @@ def main(args: list[str] | None = None) -> None:
     """Entry point; exit status 1 with one line on stderr where the input cannot be used."""
     parser = argparse.ArgumentParser(description="Objects from one colour and one depth image that is registered to it.")
     parser.add_argument("--color", required=True, type=Path, help="colour image (PNG, JPEG)")
-    parser.add_argument("--depth", required=True, type=Path, help="depth image of the same size (16-bit PNG, TIFF, npy)")
-    parser.add_argument("--intrinsics", required=True, help="fx,fy,cx,cy in pixels")
-    parser.add_argument("--depth-unit", choices=("mm", "m"), default="mm", help="what 1 in the depth image is (default mm)")
+    parser.add_argument("--depth", required=True, type=Path, help="depth image of the same size (16-bit PNG, TIFF, EXR, npy)")
+    parser.add_argument("--intrinsics", required=True, help="fx,fy,cx,cy in pixels, or a JSON file (FILE:NAME for one entry of several)")
+    parser.add_argument(
+        "--depth-unit",
+        help=f"what 1 in the depth image is: {', '.join(depths.UNITS)} or another multiple (default: mm for whole numbers, m for floating-point ones)",
+    )
     parser.add_argument("--segmenter", choices=SEGMENTERS, default="depth")
     parser.add_argument("--weights", default="", help="weights of the segmenter: a hub name or a local folder")
     parser.add_argument("--device", default="cpu", help="torch device of the segmenter")
@@ -109,20 +91,18 @@ def main(args: list[str] | None = None) -> None:
     report = Report()
     try:
         start = time.perf_counter()
-        color, depth, intrinsics = read_frame(given.color, given.depth, given.intrinsics, given.depth_unit)
-        if depth.shape != color.shape[:2]:
-            raise MagicError(Code.BAD_IMAGE, "size of the depth image", depth.shape, f"{color.shape[:2]}, that of the colour image")
+        picture = images.read_rgbd(given.color, given.depth, given.intrinsics, given.depth_unit)
+        report.notes += picture.notes
         if given.camera_pose:
-            from magic_core import transforms
-
             try:
                 numbers = [float(x) for x in given.camera_pose.split(",")]
-                pose = transforms.from_quaternion(numbers[:3], numbers[3:])
-            except ValueError:
-                raise MagicError(Code.NO_TRANSFORM, "--camera-pose", given.camera_pose, "x,y,z,qx,qy,qz,qw") from None
+                pose = transforms.from_numbers(numbers) @ picture.stored_from_shown
+            except ValueError as error:
+                raise MagicError(Code.NO_TRANSFORM, "--camera-pose", given.camera_pose, f"x,y,z,qx,qy,qz,qw; {error}") from None
         else:
-            pose = camera_over_table(intrinsics.unproject(depth)[::3, ::3], notes=report.notes)
-        frame = RgbdFrame(color, depth, intrinsics, pose, "camera")
+            pose = camera_over_table(picture.intrinsics.unproject(picture.depth)[::3, ::3], notes=report.notes)
+        frame = RgbdFrame(picture.color, picture.depth, picture.intrinsics, pose, "camera")
+        depths.check_pose(frame, picture.unit, images.REMEDY)
         reach = given.max_distance
         parameters = Parameters(
             region_low=(-reach, -reach, -0.05) if not given.camera_pose else (-np.inf, -np.inf, -0.05),
@@ -133,6 +113,8 @@ def main(args: list[str] | None = None) -> None:
         scene = perceive(
             [frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report
         )
+        sizes = [float(max(item.box_extents)) for item in scene.objects]
+        depths.check_sizes(float(np.nanmedian(frame.depth)), sizes, picture.unit, picture.told, images.REMEDY)
         write(given.out, frame, scene, report, time.perf_counter() - start)
     except MagicError as error:
         print(f"perceive_images: {error}", file=sys.stderr)

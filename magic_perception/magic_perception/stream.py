@@ -46,13 +46,15 @@ WAITING = 9
 class Stream:
     """The state of one camera.
 
-    tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept, in the order of their stamps.
+    tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept, in the order of their stamps.  unit: of
+    the newest depth image's numbers.
     Times called ``now`` are monotonic seconds.
     """
 
     name: str
     tolerance: float = 0.02
     keep: int = 5
+    unit: str = "mm"
     intrinsics: Intrinsics | None = None
     depth_intrinsics: Intrinsics | None = None
     pairs: list[Pair] = field(default_factory=list)

@@ -320,6 +320,143 @@ def test_sprinkled_bad_pixels_do_no_harm(frames):
         assert len(bench.objects[-1].objects) == 2
 
 
+def test_depth_of_another_unit_is_named_and_read_where_it_is_told(frames):
+    """A driver that counts in quarters of a millimetre, with its largest number where it saw nothing."""
+    clock = iter(range(10, 100000))
+    quarters = np.where(np.isfinite(frames[0].depth), np.nan_to_num(frames[0].depth) * 4000, 65535).round().clip(0, 65535).astype(np.uint16)
+
+    def act():
+        bench.send(later(frames[0], float(next(clock))), depth_pixels=quarters)
+
+    with Bench(cameras=["left"]) as bench:
+        bench.transforms()
+        bench.until(lambda: "DEPTH_UNIT" in bench.codes(), "DEPTH_UNIT", tick=act)
+        assert any("0.25mm" in m and "depth_unit" in m for m in bench.messages()) and not bench.objects
+    with Bench(cameras=["left"], depth_unit="0.25mm") as bench:
+        bench.transforms()
+        bench.until(lambda: bench.objects, "objects", tick=act)
+        assert_places(cv.scene_from_msg(bench.objects[-1]).objects, things())
+
+
+def test_images_that_come_compressed_only_are_decoded(frames):
+    import cv2
+    from sensor_msgs.msg import CompressedImage
+
+    clock = iter(range(10, 100000))
+    with Bench(cameras=["left"]) as bench:
+        for publisher in bench.out["left"][:2]:
+            bench.tester.destroy_publisher(publisher)
+        base = "camera/left"
+        color_out = bench.tester.create_publisher(CompressedImage, f"{base}/color/image_raw/compressed", SENSOR)
+        depth_out = bench.tester.create_publisher(CompressedImage, f"{base}/aligned_depth_to_color/image_raw/compressedDepth", SENSOR)
+        jpeg = cv2.imencode(".jpg", frames[0].color[..., ::-1])[1].tobytes()
+        millimetres = np.nan_to_num(frames[0].depth * 1000).round().astype(np.uint16)
+        png = bytes(12) + cv2.imencode(".png", millimetres)[1].tobytes()
+        bench.transforms()
+
+        def act(depth_format="16UC1; compressedDepth png"):
+            head = cv.header("left_color_optical_frame", float(next(clock)))
+            bench.out["left"][2].publish(cv.intrinsics_to_msg(frames[0].intrinsics, head))
+            color_out.publish(CompressedImage(header=head, format="rgb8; jpeg compressed bgr8", data=jpeg))
+            depth_out.publish(CompressedImage(header=head, format=depth_format, data=png))
+
+        bench.until(
+            lambda: "BAD_ENCODING" in bench.codes(), "a format of depth that is not read", tick=lambda: act("16UC1; compressedDepth rvl")
+        )
+        bench.until(lambda: bench.objects, "objects", tick=act)
+        assert_places(cv.scene_from_msg(bench.objects[-1]).objects, things())
+
+
+def test_images_of_other_names_are_named(frames):
+    with Bench(cameras=["left"]) as bench:
+        for publisher in bench.out["left"][:2]:
+            bench.tester.destroy_publisher(publisher)
+        bench.tester.create_publisher(Image, "wrist/rgb", SENSOR)
+        bench.until(lambda: any("NO_FRAMES" in m and "/wrist/rgb" in m for m in bench.messages()), "the name of the other topic")
+
+
+def moving_camera(bench):
+    """The left camera's pose at a time, along y by 0.25 m/s, and what publishes it."""
+    out = bench.tester.create_publisher(tf2_msgs.TFMessage, "/tf", RELIABLE)
+    bench.until(lambda: out.get_subscription_count(), "discovery of /tf")
+
+    def at(seconds):
+        return transforms.make(translation=[0, 0.25 * (seconds - 10.0), 0]) @ scenes.POSES["left"]
+
+    def publish(seconds):
+        t = TransformStamped(child_frame_id="left_color_optical_frame", transform=cv.transform_to_msg(at(seconds)))
+        t.header = cv.header("panda_link0", seconds)
+        out.publish(tf2_msgs.TFMessage(transforms=[t]))
+
+    return at, publish
+
+
+def test_a_moving_camera_s_frames_wait_for_their_transform():
+    """Transforms come 0.3 s after the images, and between their stamps: the things stay where they are."""
+    meshes = things()
+    with Bench(cameras=["left"]) as bench:
+        at, publish = moving_camera(bench)
+        shots = {}
+        for k in range(3):
+            seconds = 10.0 + 0.2 * k
+            shots[seconds], _ = scenes.capture(meshes, "left", k, world_from_camera=at(seconds), stamp=seconds)
+        publish(9.95)
+        for seconds, frame in shots.items():
+            bench.send(frame)
+            bench.until(
+                lambda: bench.node.streams["left"].pairs and bench.node.streams["left"].pairs[-1].stamp >= seconds - 1e-6, "the pair"
+            )
+        assert not bench.objects and bench.node.done == 0
+        for seconds in np.arange(10.0, 10.6, 0.07):
+            publish(float(seconds))
+        bench.until(lambda: bench.objects, "objects")
+        for message in bench.objects:
+            assert_places(cv.scene_from_msg(message).objects, meshes)
+
+
+def test_an_image_later_than_every_transform_is_refused_by_name(frames):
+    with Bench(cameras=["left"], transform_timeout=0.3) as bench:
+        _, publish = moving_camera(bench)
+        publish(9.0)
+        publish(10.0)
+        clock = iter(range(11, 100000))
+        bench.until(
+            lambda: any("NO_TRANSFORM" in m and "10.000" in m for m in bench.messages()),
+            "the newest transform's stamp",
+            tick=lambda: bench.send(later(frames[0], float(next(clock)))),
+        )
+        assert not bench.objects
+
+
+def test_static_transforms_of_volatile_publishers_are_heard_and_bad_rotations_named(frames):
+    from rclpy.qos import QoSProfile
+
+    clock = iter(range(10, 100000))
+    with Bench(cameras=["left"], transform_timeout=0.2) as bench:
+        bench.tester.destroy_publisher(bench.tf)
+        bench.tf = bench.tester.create_publisher(tf2_msgs.TFMessage, "/tf_static", QoSProfile(depth=1))
+        bench.until(lambda: bench.tf.get_subscription_count(), "discovery")
+        t = TransformStamped(child_frame_id="left_color_optical_frame", transform=cv.transform_to_msg(scenes.POSES["left"]))
+        t.header.frame_id = "panda_link0"
+        q = t.transform.rotation
+        good = (q.x, q.y, q.z, q.w)
+
+        def act(factor):
+            q.x, q.y, q.z, q.w = (factor * v for v in good)
+            bench.tf.publish(tf2_msgs.TFMessage(transforms=[t]))
+            bench.send(later(frames[0], float(next(clock))))
+
+        for factor, said in ((0.0, "here 0,"), (1.25, "here 1.25,")):
+            bench.until(
+                lambda said=said: any("NO_TRANSFORM" in m and "left_color_optical_frame" in m and said in m for m in bench.messages()),
+                f"the rotation of length {factor}",
+                tick=lambda factor=factor: act(factor),
+            )
+        assert any("volatile" in m for m in bench.messages()) and not bench.objects
+        bench.until(lambda: bench.objects, "objects once the rotation is nearly of length 1", tick=lambda: act(1.02))
+        assert_places(cv.scene_from_msg(bench.objects[-1]).objects, things())
+
+
 def test_stale_images_are_refused(frames):
     with Bench(cameras=["left"], max_age=5.0) as bench:
         bench.transforms()

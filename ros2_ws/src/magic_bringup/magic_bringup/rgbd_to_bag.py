@@ -13,19 +13,18 @@ Exit status 0; 1 with one line ``[code NAME] what: value (allowed: ...)`` for ba
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import depth as depths
+from magic_core import images, transforms
 from magic_core import strategy as strategies
-from magic_core import transforms
-from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
 from magic_core.shapes import make
@@ -34,8 +33,6 @@ from magic_core.strategy import Strategy
 
 #: Stamp of the first message, seconds since the epoch, and how often the frame is repeated, seconds apart.
 START, REPEATS, PERIOD = 1735689600.0, 3, 0.2
-#: Units of depth images, metres.
-UNITS = {"mm": 0.001, "m": 1.0}
 #: Where things are put in front of the robot (x, y), in order of preference, metres.
 PLACES = ((0.48, -0.30), (0.48, 0.30), (0.42, -0.24), (0.42, 0.24), (0.55, -0.30), (0.55, 0.30), (0.45, 0.0))
 #: Height above the table, metres, from which on a point belongs to a thing.
@@ -44,100 +41,6 @@ ABOVE = 0.012
 SMALLEST, GAP = 200, 0.012
 #: Gap in metres that fixtures keep from what was seen.
 CLEARANCE = 0.06
-
-
-def read_color(path: Path | str) -> NDArray[np.uint8]:
-    """A colour or grey image as (H, W, 3) uint8 RGB; raises ``BAD_IMAGE``."""
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
-    if image is None:
-        raise MagicError(Code.BAD_IMAGE, "colour image", str(path), "a readable PNG or JPEG")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def read_depth(path: Path | str, unit: str | None = None) -> NDArray[np.float32]:
-    """A depth image (16-bit PNG, float TIFF or EXR, ``.npy``) as (H, W) float32 metres, NaN where there is none.
-
-    unit: ``mm`` or ``m``; by default mm for whole numbers, m for floating-point ones.  Raises
-    ``BAD_IMAGE``, ``BAD_ENCODING`` (an 8-bit image), ``NO_DEPTH`` (no valid pixel, or none between 0.05 and 20 m).
-    """
-    import cv2
-
-    path = Path(path)
-    try:
-        raw = (
-            np.load(path, allow_pickle=False)
-            if path.suffix == ".npy"
-            else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            if path.is_file()
-            else None
-        )
-    except (OSError, ValueError) as error:
-        raise MagicError(Code.BAD_IMAGE, "depth image", f"{path}: {error}", "a readable array") from error
-    if raw is None:
-        raise MagicError(Code.BAD_IMAGE, "depth image", str(path), "a readable 16-bit PNG, float TIFF or .npy")
-    if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "uif":
-        raise MagicError(Code.BAD_ENCODING, "depth image", f"{path}: {raw.shape} {raw.dtype}", "one channel, 16-bit or floating point")
-    unit = unit or ("m" if raw.dtype.kind == "f" else "mm")
-    if unit not in UNITS:
-        raise MagicError(Code.BAD_ENCODING, "depth unit", unit, tuple(UNITS))
-    depth = raw.astype(np.float32) * np.float32(UNITS[unit])
-    depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
-    seen = depth[np.isfinite(depth)]
-    if len(seen) == 0:
-        raise MagicError(Code.NO_DEPTH, f"depth image {path}", "no valid pixel", "at least one above 0")
-    middle = float(np.median(seen))
-    if not 0.05 <= middle <= 20:
-        raise MagicError(Code.NO_DEPTH, f"median depth of {path} in {unit}", f"{middle:.4g} m", "0.05 to 20 m; is the depth unit right?")
-    return depth
-
-
-def read_intrinsics(source: str, width: int, height: int, hint: str = "") -> Intrinsics:
-    """Intrinsics from ``fx,fy,cx,cy`` or a JSON file, for an image of that size; raises ``BAD_INTRINSICS``.
-
-    The file holds ``fx, fy, cx, cy``, or a 3 x 3 ``K`` / ``intrinsic_matrix`` (nested rows, or nine
-    numbers, row- or column-major), or such entries by name: ``FILE:NAME`` picks one, else the one
-    that ``hint`` (a file name) begins with, else the only one.
-    """
-    allowed = "fx,fy,cx,cy or a JSON file with fx, fy, cx, cy or a 3 x 3 matrix"
-    path, _, name = source.partition(":") if not Path(source).is_file() else (source, "", "")
-    if Path(path).is_file():
-        try:
-            data: Any = json.loads(Path(path).read_text())
-        except (OSError, ValueError) as error:
-            raise MagicError(Code.BAD_INTRINSICS, "intrinsics file", f"{path}: {error}", allowed) from error
-        if isinstance(data, dict) and data and all(isinstance(v, dict) for v in data.values()):
-            fitting = [name] if name else [k for k in data if hint.startswith(k)] or (list(data) if len(data) == 1 else [])
-            if not fitting or fitting[0] not in data:
-                raise MagicError(Code.BAD_INTRINSICS, f"entry of {path}", name or hint, [f"{path}:{k}" for k in data])
-            data = data[max(fitting, key=len)]
-        values, size = _from_json(data, path, allowed)
-        if size and size != (width, height):
-            raise MagicError(
-                Code.BAD_INTRINSICS, f"image size in {path}", f"{size[0]} x {size[1]}", f"{width} x {height}, the size of the colour image"
-            )
-    else:
-        try:
-            values = [float(v) for v in source.split(",")]
-        except ValueError:
-            raise MagicError(Code.BAD_INTRINSICS, "intrinsics", source, allowed) from None
-    if len(values) != 4:
-        raise MagicError(Code.BAD_INTRINSICS, "intrinsics", source, allowed)
-    return Intrinsics(width, height, *values)
-
-
-def _from_json(data: Any, path: str, allowed: str) -> tuple[list[float], tuple[int, int] | None]:
-    try:
-        size = (int(data["width"]), int(data["height"])) if "width" in data and "height" in data else None
-        if "fx" in data:
-            return [float(data[k]) for k in ("fx", "fy", "cx", "cy")], size
-        matrix = np.array(next(data[k] for k in ("K", "k", "intrinsic_matrix", "camera_matrix") if k in data), dtype=float).reshape(3, 3)
-        if matrix[2, 0] != 0 or matrix[2, 1] != 0:  # Open3D writes the columns one after the other
-            matrix = matrix.T
-        return [float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])], size
-    except (KeyError, StopIteration, TypeError, ValueError, IndexError) as error:
-        raise MagicError(Code.BAD_INTRINSICS, "intrinsics file", f"{path}: {type(error).__name__} {error}", allowed) from error
 
 
 def strategy_fixtures(strategy: Strategy, pose: NDArray[np.float64] | None = None) -> list[SceneObject]:
@@ -155,8 +58,8 @@ def strategy_fixtures(strategy: Strategy, pose: NDArray[np.float64] | None = Non
     return found
 
 
-def place_camera(points: NDArray[np.float64], known: Sequence[SceneObject], seed: int = 0) -> NDArray[np.float64]:
-    """world_from_camera (4, 4) from the table in view, with the nearest thing on it where the robot reaches it.
+def place_camera(points: NDArray[np.float64], known: Sequence[SceneObject], seed: int = 0) -> tuple[NDArray[np.float64], float]:
+    """world_from_camera (4, 4) from the table in view, with the nearest thing on it where the robot reaches it, and that thing's length, m.
 
     points (H, W, 3) in the optical frame, NaN where there is none.  Of the places in
     :data:`PLACES` and 24 directions of view, the one is taken that keeps what was seen
@@ -192,7 +95,7 @@ def place_camera(points: NDArray[np.float64], known: Sequence[SceneObject], seed
             if best is None or cost < best[0]:
                 best = (cost, turn @ table_from_camera)
     assert best is not None
-    return best[1]
+    return best[1], float(np.ptp(thing, axis=0).max())
 
 
 def _nearest_thing(points: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -217,9 +120,7 @@ def _nearest_thing(points: NDArray[np.float64], camera: NDArray[np.float64]) -> 
 
 
 def convert(
-    color: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    intrinsics: Intrinsics,
+    picture: images.Rgbd,
     out: Path | str,
     *,
     strategy: Strategy | None = None,
@@ -228,12 +129,22 @@ def convert(
     camera: str = "left",
     seed: int = 0,
 ) -> RgbdFrame:
-    """Write the bag; returns the frame as it was written, with the camera's pose.  Raises ``BAD_BAG`` where the folder exists."""
+    """Write the bag; returns the frame as it was written, with the camera's pose.
+
+    camera_pose (4, 4): world_from_camera of the picture as it is stored.  Raises ``BAD_BAG`` where the folder exists, ``DEPTH_UNIT``
+    where depth does not fit the pose, or things are large and far away.
+    """
     from magic_bringup.recording import Recording
 
     known = strategy_fixtures(strategy, fixture_pose) if strategy is not None else []
+    color, depth, intrinsics = picture.color, picture.depth, picture.intrinsics
     RgbdFrame(color, depth, intrinsics, np.eye(4), camera)  # the sizes agree, or BAD_IMAGE says which do not
-    world_from_camera = place_camera(intrinsics.unproject(depth), known, seed) if camera_pose is None else camera_pose
+    if camera_pose is None:
+        world_from_camera, size = place_camera(intrinsics.unproject(depth), known, seed)
+        depths.check_sizes(float(np.nanmedian(depth)), [size], picture.unit, picture.told, images.REMEDY)
+    else:
+        world_from_camera = camera_pose @ picture.stored_from_shown
+        depths.check_pose(RgbdFrame(color, depth, intrinsics, world_from_camera, camera), picture.unit, images.REMEDY)
     with Recording(out) as bag:
         frames = [RgbdFrame(color, depth, intrinsics, world_from_camera, camera, START + 0.1 + k * PERIOD) for k in range(REPEATS)]
         bag.cameras(frames[:1], START)
@@ -246,9 +157,10 @@ def convert(
 
 
 def _pose(values: Sequence[float], what: str) -> NDArray[np.float64]:
-    if not np.all(np.isfinite(values)) or abs(float(np.linalg.norm(values[3:])) - 1) > 0.01:
-        raise MagicError(Code.BAD_REQUEST, what, list(values), "x y z in metres and a unit quaternion qx qy qz qw")
-    return transforms.from_quaternion(values[:3], values[3:])
+    try:
+        return transforms.from_numbers(values)
+    except ValueError as error:
+        raise MagicError(Code.BAD_REQUEST, what, list(values), f"x y z qx qy qz qw: {error}") from None
 
 
 def parser() -> argparse.ArgumentParser:
@@ -256,11 +168,12 @@ def parser() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser(prog="rgbd_to_bag", description="Turn a colour image, a depth image and intrinsics into a bag.")
     result.add_argument("--color", type=Path, required=True, help="colour image (PNG, JPEG)")
     result.add_argument(
-        "--depth", type=Path, required=True, help="depth image registered to the colour image (16-bit PNG, float TIFF, .npy)"
+        "--depth", type=Path, required=True, help="depth image registered to the colour image (16-bit PNG, TIFF, EXR, .npy)"
     )
     result.add_argument("--intrinsics", required=True, help="fx,fy,cx,cy in pixels, or a JSON file (FILE:NAME for one entry of several)")
     result.add_argument(
-        "--depth-unit", choices=tuple(UNITS), help="unit of the depth image; default: mm for whole numbers, m for floating point"
+        "--depth-unit",
+        help=f"what 1 in the depth image is: {', '.join(depths.UNITS)} or another multiple; default: mm for whole numbers, m for floating point",
     )
     result.add_argument("--out", type=Path, required=True, help="folder of the new bag")
     result.add_argument("--force", action="store_true", help="replace the bag if it exists")
@@ -281,16 +194,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit status."""
     options = parser().parse_args(arguments)
     try:
-        color = read_color(options.color)
-        depth = read_depth(options.depth, options.depth_unit)
-        intrinsics = read_intrinsics(options.intrinsics, color.shape[1], color.shape[0], options.color.name)
+        picture = images.read_rgbd(options.color, options.depth, options.intrinsics, options.depth_unit)
         strategy = None if options.strategy == "none" else strategies.find(options.strategy)
         if options.force and (options.out / "metadata.yaml").is_file():
             shutil.rmtree(options.out)
         frame = convert(
-            color,
-            depth,
-            intrinsics,
+            picture,
             options.out,
             strategy=strategy,
             fixture_pose=_pose(options.rod, "--rod") if options.rod else None,

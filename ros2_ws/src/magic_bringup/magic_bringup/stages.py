@@ -44,8 +44,7 @@ class Stages:
         server = self._server
         # First the servers: a run that cannot be verified is not begun.
         deadline = time.monotonic() + min(timeout, server.settings.presence)
-        needed = (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else []))
-        for remote in needed:
+        for remote in (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else [])):
             remote.require(max(0.0, deadline - time.monotonic()), self._token)
         wait = min(timeout, server.settings.objects)
 
@@ -58,13 +57,7 @@ class Stages:
                 len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
             )
 
-        watches = [server.objects_watch(), *(remote.watch() for remote in needed)]
-
-        def still_there() -> None:
-            for watch in watches:
-                watch()
-
-        came = self._token.wait(enough, time.monotonic() + wait, alive=still_there)
+        came = self._token.wait(enough, time.monotonic() + wait)
         scene = server.scene
         if not came:
             raise self._no_objects(scene, wait)

@@ -11,8 +11,8 @@ import pytest
 
 from magic_bringup import rgbd_to_bag
 from magic_bringup.bag_file import info as read_info
+from magic_core import images, transforms
 from magic_core import strategy as strategies
-from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
 from magic_core.sensor import capture, looking_at
@@ -61,10 +61,9 @@ def run(files: dict[str, Path], out: Path, *more: str, **instead: str) -> int:
 
 
 def test_the_mug_stands_upright_in_reach_beside_the_rod(files: dict[str, Path], tmp_path: Path) -> None:
-    color = rgbd_to_bag.read_color(files["c.png"])
-    depth = rgbd_to_bag.read_depth(files["d.png"])
+    picture = images.read_rgbd(files["c.png"], files["d.png"], str(files["k.json"]))
     strategy = strategies.load(STRATEGIES / "hanging")
-    frame = rgbd_to_bag.convert(color, depth, CAMERA, tmp_path / "bag", strategy=strategy)
+    frame = rgbd_to_bag.convert(picture, tmp_path / "bag", strategy=strategy)
     points = transforms.apply(frame.world_from_camera, CAMERA.unproject(frame.depth)).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     assert np.median(points[:, 2]) == pytest.approx(0, abs=0.002)
@@ -101,7 +100,9 @@ def test_without_a_strategy_nothing_is_known(files: dict[str, Path], tmp_path: P
         ({"color": "missing.png"}, Code.BAD_IMAGE),
         ({"depth": "missing.png"}, Code.BAD_IMAGE),
         ({"depth": "c.png"}, Code.BAD_ENCODING),
-        ({"depth_unit": "m"}, Code.NO_DEPTH),
+        ({"depth_unit": "m"}, Code.DEPTH_UNIT),
+        ({"depth_unit": "0.1mm"}, Code.DEPTH_UNIT),
+        ({"depth_unit": "inch"}, Code.DEPTH_UNIT),
         ({"intrinsics": "1,2,3"}, Code.BAD_INTRINSICS),
         ({"intrinsics": "0,300,212,120"}, Code.BAD_INTRINSICS),
         ({"intrinsics": "none.json"}, Code.BAD_INTRINSICS),
@@ -118,7 +119,7 @@ def test_bad_input_gets_a_code(
 
 
 def test_bad_depth_and_sizes_get_a_code(files: dict[str, Path], tmp_path: Path) -> None:
-    color = rgbd_to_bag.read_color(files["c.png"])
+    color = images.read_color(files["c.png"])
     strategy = strategies.load(STRATEGIES / "hanging")
     flat = capture([], CAMERA, looking_at([0.9, 0.2, 0.5], [0.5, 0, 0]), 0).depth
     for depth, code in (
@@ -127,43 +128,15 @@ def test_bad_depth_and_sizes_get_a_code(files: dict[str, Path], tmp_path: Path) 
         (flat[:100], Code.BAD_IMAGE),
     ):
         with pytest.raises(MagicError) as caught:
-            rgbd_to_bag.convert(color, depth, CAMERA, tmp_path / "bag", strategy=strategy)
+            rgbd_to_bag.convert(images.Rgbd(color, depth, CAMERA, "mm", True), tmp_path / "bag", strategy=strategy)
         assert caught.value.code in ((code,) if code else (Code.NO_TABLE, Code.NO_DEPTH, Code.NO_OBJECTS))
-    np.save(tmp_path / "nan.npy", np.full((240, 424), np.nan))
-    with pytest.raises(MagicError) as caught:
-        rgbd_to_bag.read_depth(tmp_path / "nan.npy")
-    assert caught.value.code == Code.NO_DEPTH
-
-
-def test_intrinsics_are_read_in_every_common_form(tmp_path: Path) -> None:
-    expected = Intrinsics(640, 480, 600.0, 601.0, 320.0, 240.0)
-    rows = [[600.0, 0, 320.0], [0, 601.0, 240.0], [0, 0, 1.0]]
-    columns = [600.0, 0, 0, 0, 601.0, 0, 320.0, 240.0, 1.0]
-    plain = {"fx": 600.0, "fy": 601.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
-    for data in (
-        plain,
-        {"K": rows},
-        {"intrinsic_matrix": columns, "width": 640, "height": 480},
-        {"mug": plain, "can": {**plain, "fx": 1.0}},
-    ):
-        path = tmp_path / "k.json"
-        path.write_text(json.dumps(data))
-        assert rgbd_to_bag.read_intrinsics(str(path), 640, 480, "mug_color.png") == expected
-    assert rgbd_to_bag.read_intrinsics(f"{path}:can", 640, 480).fx == 1.0
-    assert rgbd_to_bag.read_intrinsics("600,601,320,240", 640, 480) == expected
-    with pytest.raises(MagicError, match="mug"):
-        rgbd_to_bag.read_intrinsics(str(path), 640, 480, "spoon.png")
-    path.write_text(json.dumps(plain))
-    with pytest.raises(MagicError, match="320 x 240"):
-        rgbd_to_bag.read_intrinsics(str(path), 320, 240)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="shared/data is not here")
 def test_the_red_mug_of_a_real_capture(tmp_path: Path) -> None:
-    color = rgbd_to_bag.read_color(SHARED / "red_mug_color.png")
-    depth = rgbd_to_bag.read_depth(SHARED / "red_mug_depth_mm.png")
-    intrinsics = rgbd_to_bag.read_intrinsics(str(SHARED / "intrinsics.json"), 640, 480, "red_mug_color.png")
-    frame = rgbd_to_bag.convert(color, depth, intrinsics, tmp_path / "bag", strategy=strategies.load(STRATEGIES / "hanging"))
+    picture = images.read_rgbd(SHARED / "red_mug_color.png", SHARED / "red_mug_depth_mm.png", str(SHARED / "intrinsics.json"))
+    color, intrinsics = picture.color, picture.intrinsics
+    frame = rgbd_to_bag.convert(picture, tmp_path / "bag", strategy=strategies.load(STRATEGIES / "hanging"))
     points = transforms.apply(frame.world_from_camera, intrinsics.unproject(frame.depth)).reshape(-1, 3)
     reds = (color[..., 0] > 120) & (color[..., 1] < 60)
     mug = points[reds.ravel() & np.isfinite(points).all(axis=1)]

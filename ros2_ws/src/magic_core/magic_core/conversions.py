@@ -7,12 +7,14 @@ reference to the message's buffer.  Bad content raises :class:`MagicError`.
 from __future__ import annotations
 
 import math
+import struct
 
+import cv2
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh as MeshMsg
 from shape_msgs.msg import MeshTriangle, Plane
 from std_msgs.msg import Header
@@ -23,6 +25,7 @@ from trajectory_msgs.msg import (
     MultiDOFJointTrajectoryPoint,
 )
 
+from magic_core import depth as depths
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.contact import Contact, ContactCandidate
@@ -60,9 +63,6 @@ def header(frame_id: str, stamp: float = 0.0) -> Header:
 
 
 # ---------------------------------------------------------------- poses
-
-#: By how much a quaternion's length may differ from 1 and be normalised: numbers rounded to one decimal do; more is another rotation or none.
-UNIT = 0.1
 
 
 def pose_to_msg(transform: NDArray[np.float64]) -> Pose:
@@ -102,15 +102,10 @@ def remember_transform(buffer: TransformBuffer, msg: TransformStamped, static: b
 
 
 def _transform(translation: list[float], xyzw: list[float]) -> NDArray[np.float64]:
-    norm = float(np.linalg.norm(xyzw))
-    if not np.all(np.isfinite(translation)) or not 1 - UNIT < norm < 1 + UNIT:
-        raise MagicError(
-            Code.BAD_REQUEST,
-            "pose",
-            f"position {translation}, orientation {xyzw} of length {norm:.4g}",
-            f"finite numbers and a quaternion (x, y, z, w) whose length differs from 1 by less than {UNIT:g}",
-        )
-    return transforms.from_quaternion(translation, xyzw)
+    try:
+        return transforms.from_numbers([*translation, *xyzw])
+    except ValueError as error:
+        raise MagicError(Code.BAD_REQUEST, "pose", f"position {translation}, orientation {xyzw}", str(error)) from None
 
 
 # ---------------------------------------------------------------- images
@@ -171,12 +166,62 @@ def color_from_msg(msg: Image, code: Code = Code.BAD_IMAGE) -> NDArray[np.uint8]
     return np.ascontiguousarray(pixels[:, :, ::-1] if msg.encoding.startswith("bgr") else pixels)
 
 
-def depth_from_msg(msg: Image) -> NDArray[np.float32]:
-    """A depth Image, 16UC1 in millimetres or 32FC1 in metres (REP-118), as (H, W) float32 metres, NaN where there is none."""
-    pixels = _pixels(msg, ("16UC1", "mono16", "32FC1"), Code.BAD_IMAGE)[:, :, 0]
-    depth = pixels.astype(np.float32) * (1.0 if msg.encoding == "32FC1" else np.float32(0.001))
-    depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
-    return depth
+def depth_from_msg(msg: Image, unit: str = "") -> NDArray[np.float32]:
+    """A depth Image as (H, W) float32 metres, NaN where there is none (see :func:`magic_core.depth.in_metres`).
+
+    unit: empty for REP-118's, millimetres in 16UC1 and metres in 32FC1.
+    """
+    return depths.in_metres(_pixels(msg, ("16UC1", "mono16", "32FC1"), Code.BAD_IMAGE)[:, :, 0], unit)
+
+
+#: Bytes before the image of a compressedDepth message: int32 how, float32 A and B of depth = A / (value - B) where depth was floating point.
+_DEPTH_HEADER = 12
+
+
+def color_from_compressed_msg(msg: CompressedImage) -> NDArray[np.uint8]:
+    """A JPEG or PNG image as image_transport's ``compressed`` sends it, as (H, W, 3) uint8 RGB, in the camera's own orientation.
+
+    ``format`` is ``jpeg`` or ``png``, or ``ENCODING; jpeg compressed ORDER``: what was given to the encoder as if it were BGR.
+    """
+    image = _decoded(msg, bytes(msg.data), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    encoding, _, how = msg.format.partition(";")
+    order = how.partition("compressed")[2].strip() or (encoding if how else "")
+    return np.ascontiguousarray(image if order.startswith("rgb") else image[..., ::-1])
+
+
+def depth_from_compressed_msg(msg: CompressedImage, unit: str = "") -> NDArray[np.float32]:
+    """A depth image as image_transport's ``compressedDepth`` sends it (PNG), or its ``compressed`` as 16-bit PNG, as :func:`depth_from_msg` gives it.
+
+    ``format`` is ``16UC1; compressedDepth png``, the same with 32FC1, or ``16UC1; png compressed``; raises BAD_ENCODING for others (``rvl``).
+    """
+    encoding, _, how = (part.strip() for part in msg.format.partition(";"))
+    with_header = how in ("compressedDepth", "compressedDepth png") and encoding in ("16UC1", "32FC1")
+    if not with_header and not (encoding in ("16UC1", "mono16") and how.startswith("png compressed")):
+        raise MagicError(
+            Code.BAD_ENCODING,
+            "format of compressed depth",
+            msg.format,
+            ("16UC1; compressedDepth png", "32FC1; compressedDepth png", "16UC1; png compressed"),
+        )
+    data = bytes(msg.data)
+    raw = _decoded(msg, data[_DEPTH_HEADER if with_header else 0 :], cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise MagicError(Code.BAD_IMAGE, "compressed depth", f"{raw.shape} {raw.dtype}", "one channel of 16 bits")
+    if encoding == "32FC1":
+        _, a, b = struct.unpack("<iff", data[:_DEPTH_HEADER])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            raw = np.where(raw > 0, np.float32(a) / (raw.astype(np.float32) - np.float32(b)), np.float32(np.nan))
+    return depths.in_metres(raw, unit)
+
+
+def _decoded(msg: CompressedImage, data: bytes, flags: int) -> NDArray:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise MagicError(Code.BAD_IMAGE, "compressed image", f"{len(msg.data)} bytes of format {msg.format!r}", "a whole JPEG or PNG image")
+    return image
 
 
 def float_image_from_msg(msg: Image) -> NDArray[np.float32]:

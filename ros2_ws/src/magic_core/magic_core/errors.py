@@ -34,6 +34,7 @@ class Code(IntEnum):
     SEGMENTER_WEIGHTS = 113
     CAMERAS_DISAGREE = 114
     TABLE_AMBIGUOUS = 115
+    DEPTH_UNIT = 119
 
     # Matching
     UNKNOWN_STRATEGY = 200

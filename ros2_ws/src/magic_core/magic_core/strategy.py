@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from magic_core import transforms
+from magic_core import images, transforms
 from magic_core.contact import Contact, contact_frame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
@@ -113,17 +113,11 @@ class Strategy:
 
 
 def _read_image(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise MagicError(Code.BAD_STRATEGY, "reference image", str(path), "a readable PNG")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return images.read_color(path, "reference image", Code.BAD_STRATEGY)
 
 
 def _read_mask(path: Path) -> NDArray[np.bool_]:
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise MagicError(Code.BAD_STRATEGY, "reference mask", str(path), "a readable PNG")
-    return mask > 127
+    return images.read_color(path, "reference mask", Code.BAD_STRATEGY)[..., 0] > 127
 
 
 def _view(folder: Path, prefix: str, kind: str, data: dict[str, Any]) -> CanonicalView:

@@ -67,6 +67,24 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Matrix:
     return make(Rotation.from_quat(np.asarray(xyzw, dtype=float)).as_matrix(), translation)
 
 
+#: By how much a quaternion's length may differ from 1 and be normalised: numbers rounded to one decimal do; more is another rotation or none.
+UNIT = 0.1
+
+
+def from_numbers(numbers: ArrayLike) -> Matrix:
+    """Build a transform from what somebody wrote or sent: x y z in metres and a quaternion x y z w, which is normalised where it nearly is one.
+
+    Raises ``ValueError``, whose text says what is allowed.
+    """
+    values = np.asarray(numbers, dtype=float)
+    length = float(np.linalg.norm(values[3:])) if values.shape == (7,) else 0.0
+    if not np.all(np.isfinite(values)) or not 1 - UNIT < length < 1 + UNIT:
+        raise ValueError(
+            f"seven finite numbers, the last four a quaternion (x, y, z, w) whose length, here {length:.4g}, differs from 1 by less than {UNIT:g}"
+        )
+    return from_quaternion(values[:3], values[3:])
+
+
 def quaternion_xyzw(transform: Matrix) -> NDArray[np.float64]:
     """Rotation of a transform as a unit quaternion in ROS order (x, y, z, w), w >= 0."""
     q = Rotation.from_matrix(np.asarray(transform)[..., :3, :3]).as_quat()

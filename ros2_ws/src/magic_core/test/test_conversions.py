@@ -1,12 +1,15 @@
 """Messages and plain types: there and back."""
 
 import math
+import struct
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from sensor_msgs.msg import CompressedImage
 
 from magic_core import conversions as cv
 from magic_core import transforms as tf
@@ -58,8 +61,53 @@ def test_colour(image):
 @fast
 def test_depth_in_millimetres(raw):
     depth = cv.depth_from_msg(cv.image_to_msg(raw, "16UC1"))
-    np.testing.assert_allclose(depth[raw > 0], raw[raw > 0] * 0.001, rtol=1e-6)
-    assert np.isnan(depth[raw == 0]).all()
+    seen = (raw > 0) & (raw < 65535)  # the largest number is what some drivers write into holes
+    np.testing.assert_allclose(depth[seen], raw[seen] * 0.001, rtol=1e-6)
+    assert np.isnan(depth[~seen]).all()
+
+
+def test_compressed_images_are_what_was_sent():
+    rng = np.random.default_rng(0)
+    color = cv2.resize(rng.integers(0, 255, (4, 5, 3), dtype=np.uint8), (80, 64))
+    png = cv2.imencode(".png", color[..., ::-1])[1].tobytes()
+    as_it_is = cv2.imencode(".png", color)[1].tobytes()
+    for kind, data in (
+        ("png", png),
+        ("rgb8; png compressed bgr8", png),
+        ("rgb8; png compressed rgb8", as_it_is),
+        ("rgb8; png compressed ", as_it_is),
+    ):
+        np.testing.assert_array_equal(cv.color_from_compressed_msg(CompressedImage(format=kind, data=data)), color)
+    raw = rng.integers(300, 1500, (6, 7)).astype(np.uint16)
+    raw[0, :2] = 0, 65535
+    packed = cv2.imencode(".png", raw)[1].tobytes()
+    expected = np.where((raw > 0) & (raw < 65535), raw * np.float32(0.001), np.nan)
+    for kind, data in (
+        ("16UC1; compressedDepth png", bytes(12) + packed),
+        ("16UC1; compressedDepth", bytes(12) + packed),
+        ("16UC1; png compressed ", packed),
+    ):
+        np.testing.assert_allclose(cv.depth_from_compressed_msg(CompressedImage(format=kind, data=data)), expected, rtol=1e-6)
+    # Floating-point depth goes as a / depth + b.
+    metres, a, b = np.array([[0.5, 0.75, 2.0]]), 10000.0, -100.0
+    inverse = cv2.imencode(".png", np.round(a / metres + b).astype(np.uint16))[1].tobytes()
+    msg = CompressedImage(format="32FC1; compressedDepth png", data=struct.pack("<iff", 0, a, b) + inverse)
+    np.testing.assert_allclose(cv.depth_from_compressed_msg(msg), metres, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "kind, data",
+    [
+        ("16UC1; compressedDepth rvl", bytes(40)),
+        ("jpeg", bytes(40)),
+        ("16UC1; compressedDepth png", b""),
+        ("16UC1; compressedDepth png", bytes(40)),
+    ],
+)
+def test_compressed_depth_that_cannot_be_read_has_a_code(kind, data):
+    with pytest.raises(MagicError) as caught:
+        cv.depth_from_compressed_msg(CompressedImage(format=kind, data=data))
+    assert caught.value.code in (Code.BAD_ENCODING, Code.BAD_IMAGE)
 
 
 def test_depth_in_metres_and_what_is_none():
