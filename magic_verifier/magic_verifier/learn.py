@@ -415,8 +415,18 @@ def _learn(given: argparse.Namespace) -> int:
     known = conversions.scene_from_msg(bag.of("/known_objects")[-1]).objects if "/known_objects" in bag.topics else ()
     scene = perceive(frames, tuple(known))
     print(f"objects: {', '.join(item.id for item in scene.objects)}")
+    for note in scene.notes:
+        print(f"note: {note}")
     first = transforms.interpolate(times, poses, [seen])[0]
     tool, target = choose(scene, given.tool, given.target, first[:3, 3])
+    for item in (tool, target):
+        if item.cut_off:
+            raise MagicError(
+                Code.BAD_REQUEST,
+                f"{item.id} is seen in part only, cut off by",
+                ", ".join(item.cut_off),
+                "tool and target in full view, apart",
+            )
     fixed = given.fixed_target or target.source != "camera"
     if fixed and given.goal in ("hook", "scoop"):
         raise MagicError(Code.BAD_REQUEST, f"target of --goal {given.goal}", f"{target.id} is a known fixture", "a target that can move")

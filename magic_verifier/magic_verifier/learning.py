@@ -148,6 +148,8 @@ def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: R
     towards = target.world_from_object[:3, :3] @ found.target_normal
     why: list[MagicError] = []
     for direction in view_directions(tool, world_from_tool, towards, came):
+        if task.view and (task.view == "top") != (direction[2] != 0.0):
+            continue
         normal = levelled(transforms.unit(towards - (towards @ direction) * direction))
         try:
             view, contact, tool_gap = _tool_contact(tool, world_from_tool, direction, found, task.view)
@@ -176,7 +178,9 @@ def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: R
             return draft, tool_gap, target_gap
         except MagicError as error:
             why.append(error)
-    raise why[0]
+    if why:
+        raise why[0]
+    raise MagicError(Code.BAD_REQUEST, "view", task.view, "one in which the contact is seen in profile; without --view it is found")
 
 
 def _target_contact(draft: Strategy, target: SceneObject, found: Replay) -> tuple[Strategy, float]:

@@ -5,17 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from demonstrations import demonstration
+from demonstrations import demonstration, pressing, pushing, ring_pulling
 
 pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.strategy import Goal, load, save
-from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, learn, levelled, smoothed
+from magic_core.strategy import Goal, Physics, load, save
+from magic_matcher.matching import target_contact, target_view
+from magic_verifier.goals import Hook
+from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, learn, levelled, smoothed
 
 
-def shown(name, turn=0.0):
+def shipped(name, turn=0.0):
     """The demonstration that ships, everything turned about the upright by ``turn``, and its strategy."""
     strategy, tool, target, obstacles, _ = demonstration(name)
     around = transforms.from_rpy(0, 0, turn)
@@ -29,7 +31,7 @@ def shown(name, turn=0.0):
     ("name", "view", "mode"), [("hooking", "top", "plan"), ("hanging", "side", "plan"), ("scooping", "section", "retarget")]
 )
 def test_what_is_learned_is_what_was_annotated(name, view, mode, tmp_path):
-    seen, task, annotated = shown(name)
+    seen, task, annotated = shipped(name)
     learned = learn(seen, task)
     assert (learned.strategy.view, learned.strategy.mode) == (view, mode)
     for ours, theirs in (
@@ -50,7 +52,7 @@ def test_what_is_learned_is_what_was_annotated(name, view, mode, tmp_path):
 
 
 def test_the_waypoints_tell_the_motion_that_was_shown():
-    seen, task, annotated = shown("hooking")
+    seen, task, annotated = shipped("hooking")
     waypoints = learn(seen, task).strategy.waypoints
     assert [w.phase for w in waypoints] == sorted((w.phase for w in waypoints), key=["approach", "contact", "goal", "retreat"].index)
     made = next(w for w in waypoints if w.name == "contact")
@@ -65,7 +67,7 @@ def test_the_waypoints_tell_the_motion_that_was_shown():
 
 def test_a_turned_demonstration_is_the_same_strategy_turned():
     turn = 0.7
-    plain, turned = (learn(*shown("hooking", angle)[:2]).strategy for angle in (0.0, turn))
+    plain, turned = (learn(*shipped("hooking", angle)[:2]).strategy for angle in (0.0, turn))
     around = transforms.from_rpy(0, 0, turn)[:3, :3]
     np.testing.assert_allclose(turned.target_normal, around @ plain.target_normal, atol=0.01)
     np.testing.assert_allclose(turned.target_view_direction, plain.target_view_direction, atol=1e-9)
@@ -75,7 +77,7 @@ def test_a_turned_demonstration_is_the_same_strategy_turned():
 
 
 def test_a_trackers_jitter_does_no_harm():
-    seen, task, annotated = shown("hooking")
+    seen, task, annotated = shipped("hooking")
     rng = np.random.default_rng(1)
     times = np.arange(seen.times[0], seen.times[-1], 1 / 30)
     poses = transforms.interpolate(seen.times, seen.world_from_tool, times)
@@ -100,14 +102,62 @@ def test_smoothing_keeps_the_motion_and_takes_the_jitter():
     assert (smoothed(times, noisy)[1][:, :3, 3] - truth[:, :3, 3]).std() < 0.0006
 
 
+#: Pulled or pushed, whatever encloses whom.
+MOVED = Goal("hook", {name: value for name, value in {"noise": 0.0, "hold": 0.0}.items() if name in Hook.defaults})
+
+
+def test_a_push_is_learned_and_where_the_box_was_met():
+    learned = learn(pushing(aside=0.01), Task("pushing", MOVED, Physics(0.3)))
+    strategy = learned.strategy
+    assert (strategy.view, strategy.target_outline) == ("top", "outer") and learned.verdict.success, learned.verdict.message
+    np.testing.assert_allclose(strategy.target_normal, [-1, 0, 0], atol=0.05)
+    np.testing.assert_allclose(strategy.target_contact.object_from_contact[:2, 3], [-0.03, 0], atol=0.002)
+    assert learned.target_gap < 0.011 and advice(learned) == []
+
+
+def test_a_contact_that_no_new_target_would_be_given_is_refused():
+    with pytest.raises(MagicError, match=r"where the tool met the target: '\d\d mm from the middle of its outer side'") as error:
+        learn(pushing(aside=0.06), Task("pushing", MOVED, Physics(0.3)))
+    assert error.value.code == Code.BAD_REQUEST and "meet the target there" in error.value.message
+
+
+@pytest.mark.parametrize(("handle", "view", "outline"), [(True, "", "cut"), (False, "top", "inner")])
+def test_a_ring_is_pulled_by_its_inside_and_so_is_another(handle, view, outline, tmp_path):
+    learned = learn(ring_pulling(handle), Task("ring", MOVED, Physics(0.3), view=view))
+    assert learned.strategy.target_outline == outline and learned.verdict.success, learned.verdict.message
+    assert learned.target_gap < 0.01
+    save(learned.strategy, tmp_path / "ring")
+    strategy = load(tmp_path / "ring")
+    wide = [p.transformed(transforms.from_rpy(np.pi / 2, 0, 0)) for p in scenes.ring(0.06, 0.02, 0.03, 60)]
+    other = scenes.item("target", wide, transforms.from_rpy(0, 0, 1.0, [0.5, 0.2, 0.015]))
+    contact = other.world_from_object @ target_contact(strategy, target_view(other, strategy), other.world_from_object).object_from_contact
+    np.testing.assert_allclose(contact[:2, 3], [0.45, 0.2], atol=0.003)
+    np.testing.assert_allclose(contact[:3, 0], [1, 0, 0], atol=0.05)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_press_from_above_is_learned_whether_the_target_can_move_or_not(fixed):
+    learned = learn(pressing(), Task("pressing", Goal("none"), Physics(0.3, target_is_fixed=fixed), simulatable=False))
+    np.testing.assert_allclose(learned.strategy.target_normal, [0, 0, 1], atol=1e-9)
+    assert learned.strategy.view == "side" and max(learned.tool_gap, learned.target_gap) < 0.003
+
+
+def test_a_demonstration_that_does_not_reach_its_goal_says_what_it_reached():
+    learned = learn(pushing(far=0.12), Task("pushing", MOVED, Physics(0.3)))
+    assert learned.verdict.code == Code.GOAL_NOT_REACHED and learned.shown.code == Code.GOAL_NOT_REACHED
+    first, second = advice(learned)
+    assert "the demonstrated motion itself fails" in first and "needed: 200 mm" in first
+    assert "--value distance=0.1" in second
+
+
 def test_what_simulation_cannot_judge_is_learned_and_not_tried():
-    seen, task, _ = shown("hooking")
+    seen, task, _ = shipped("hooking")
     learned = learn(seen, replace(task, goal=Goal("none"), simulatable=False))
     assert learned.verdict is None and not learned.strategy.simulatable
 
 
 def test_a_tool_that_never_touches_its_target_shows_nothing():
-    seen, task, _ = shown("hooking")
+    seen, task, _ = shipped("hooking")
     far = transforms.make(translation=[0, 0.5, 0])
     with pytest.raises(MagicError) as error:
         learn(replace(seen, world_from_tool=far @ seen.world_from_tool), task)
@@ -124,7 +174,7 @@ def test_a_tool_that_never_touches_its_target_shows_nothing():
     ],
 )
 def test_a_motion_that_is_none_is_refused(change, code):
-    seen, task, _ = shown("hooking")
+    seen, task, _ = shipped("hooking")
     with pytest.raises(MagicError) as error:
         learn(replace(seen, **change), task)
     assert error.value.code == code
@@ -132,7 +182,7 @@ def test_a_motion_that_is_none_is_refused(change, code):
 
 @pytest.mark.parametrize("change", [{"view": "below"}, {"mode": "copy"}])
 def test_unknown_words_are_refused(change):
-    seen, task, _ = shown("hooking")
+    seen, task, _ = shipped("hooking")
     with pytest.raises(MagicError) as error:
         learn(seen, replace(task, **change))
     assert error.value.code == Code.BAD_REQUEST
