@@ -63,12 +63,13 @@ def pushing(aside=0.0, far=0.25):
 def ring_pulling(handle=True):
     """A ring that lies on the table is pulled by its inside: with the bent end of a bar, or with a stick that stands in it."""
     up = scenes.block((-0.006, 0.01), (-0.008, 0.008), (0.0, 0.066))
-    tool = scenes.item("tool", [scenes.block((-0.2, 0.01), (-0.008, 0.008), (0.05, 0.066)), up] if handle else [up], LYING)
+    lying = transforms.from_rpy(np.pi / 2, 0, 0, [0.46, -0.2, 0.009])
+    tool = scenes.item("tool", [scenes.block((-0.2, 0.01), (-0.008, 0.008), (0.05, 0.066)), up] if handle else [up], lying)
     ring = scenes.item(
         "target", [p.transformed(transforms.from_rpy(np.pi / 2, 0, 0)) for p in scenes.ring(0.04, 0.012, 0.02)], _at(0.6, 0, 0.01)
     )
     meets, low = 0.6 - 0.034 + 0.006, 0.003
-    way = [(LYING, 0.0), (LYING, 0.5), (_at(0.6, 0, 0.12), 1.5), (_at(0.6, 0, low), 1.0), (_at(meets, 0, low), 0.6)]
+    way = [(lying, 0.0), (lying, 0.5), (_at(0.6, 0, 0.12), 1.5), (_at(0.6, 0, low), 1.0), (_at(meets, 0, low), 0.6)]
     way += [(_at(meets - 0.25, 0, low), 3.0), (_at(meets - 0.24, 0, low), 0.5), (_at(meets - 0.24, 0, 0.12), 1.0)]
     return shown(tool, ring, way)
 

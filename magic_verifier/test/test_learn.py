@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import scenes
+from demonstrations import ring_pulling
 
 pytest.importorskip("magic_perception.pipeline")
 pytest.importorskip("magic_bringup.bag_file")
@@ -17,15 +18,19 @@ from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
 from magic_core import conversions, transforms
+from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.scene import Scene
+from magic_core.sensor import capture, looking_at, scene_raycaster
 from magic_core.shapes import make
-from magic_core.strategy import load
+from magic_core.strategy import Goal, Physics, load
 from magic_matcher.features import load as load_features
 from magic_matcher.matching import Matcher
+from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
 from magic_verifier.learn import Recorded, choose, main, track_of, write
+from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import verify
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -235,3 +240,20 @@ def test_what_is_not_clear_is_asked_for():
     with pytest.raises(MagicError) as error:
         choose(scene_of(), "", "", np.zeros(3))
     assert error.value.code == Code.NO_OBJECTS
+
+
+def test_a_ring_that_the_cameras_see_is_pulled_by_its_inside():
+    shown = ring_pulling()
+    cameras = {"left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
+    caster = scene_raycaster([item.mesh.transformed(item.world_from_object) for item in (shown.tool, shown.target)])
+    small = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
+    frames = [capture([], small, pose, [3, n], camera=name, raycaster=caster) for n, (name, pose) in enumerate(cameras.items())]
+    scene = perceive(frames)
+    tool, target = choose(scene, "", "", shown.tool.world_from_object[:3, 3])
+    moved = shown.world_from_tool @ (transforms.inverse(shown.tool.world_from_object) @ tool.world_from_object)
+    seen = Demonstration(tool, target, (), scene.table, shown.times, moved)
+    found = learn(seen, Task("ring", Goal("hook", {"noise": 0.0}), Physics(0.3)))
+    assert found.strategy.target_outline == "cut" and found.verdict.success, found.verdict.message
+    contact = target.world_from_object @ found.strategy.target_contact.object_from_contact
+    np.testing.assert_allclose(contact[:2, 3], [0.6 - 0.034, 0.0], atol=0.005)
+    np.testing.assert_allclose(contact[:3, 0], [1, 0, 0], atol=0.05)
