@@ -22,10 +22,10 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "matcher = magic_matcher.node:main",
-            "match_images = magic_matcher.match_images:main",
-            "match_meshes = magic_matcher.match_meshes:main",
-            "bench = magic_matcher.bench:main",
+            "matcher = magic_matcher.programs:matcher",
+            "match_images = magic_matcher.programs:match_images",
+            "match_meshes = magic_matcher.programs:match_meshes",
+            "bench = magic_matcher.programs:bench",
         ],
     },
 )

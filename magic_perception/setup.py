@@ -19,9 +19,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "perception = magic_perception.node:main",
-            "perceive_images = magic_perception.perceive_images:main",
-            "evaluate = magic_perception.evaluate:main",
+            "perception = magic_perception.programs:perception",
+            "perceive_images = magic_perception.programs:perceive_images",
+            "evaluate = magic_perception.programs:evaluate",
         ]
     },
 )

@@ -19,5 +19,5 @@ setup(
     maintainer_email="maintainers@magic-robotics.org",
     description="From a matched contact to the motion of the tool and of the arm that holds it.",
     license="Apache-2.0",
-    entry_points={"console_scripts": [f"planner = {PACKAGE}.node:main"]},
+    entry_points={"console_scripts": [f"planner = {PACKAGE}.programs:planner"]},
 )

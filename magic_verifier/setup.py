@@ -19,10 +19,10 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            f"verifier = {PACKAGE}.node:main",
-            f"evaluate = {PACKAGE}.evaluate:main",
-            f"learn = {PACKAGE}.learn:main",
-            f"reality = {PACKAGE}.reality:main",
+            f"verifier = {PACKAGE}.programs:verifier",
+            f"evaluate = {PACKAGE}.programs:evaluate",
+            f"learn = {PACKAGE}.programs:learn",
+            f"reality = {PACKAGE}.programs:reality",
         ]
     },
 )

@@ -7,10 +7,11 @@ import threading
 from pathlib import Path
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 
-from magic_core import conversions, qos, strategy
+from magic_core import conversions, diagnostics, qos, strategy
 from magic_core import node as nodes
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
@@ -44,7 +45,9 @@ class MatcherNode(Node):
         )
         weights = nodes.parameter(self, "weights", "", "hub name or local folder of DINOv2 or DINOv3 weights", read_only=True)
         device = nodes.parameter(self, "device", "cpu", "torch device of the network", read_only=True)
-        nodes.parameter(self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50)
+        nodes.parameter(
+            self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50, read_only=False
+        )
         weight = nodes.parameter(
             self, "curvature_weight", matching.score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True
         )
@@ -61,7 +64,11 @@ class MatcherNode(Node):
             SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._warm_up()
-        self.create_service(MatchContact, "match_contact", self._on_match, callback_group=ReentrantCallbackGroup())
+        self._answered = self._refused = 0
+        self._last = "none yet"
+        group = ReentrantCallbackGroup()
+        self._service = self.create_service(MatchContact, "match_contact", self._on_match, callback_group=group)
+        self._diagnostics = diagnostics.Diagnostics(self, self._report, group)
         self.get_logger().info(
             f"ready: features {self._matcher.backend.name}; waiting for objects on {self.resolve_topic_name('objects')} (requests with images need none)"
         )
@@ -131,11 +138,30 @@ class MatcherNode(Node):
     def _on_match(self, request: MatchContact.Request, response: MatchContact.Response) -> MatchContact.Response:
         try:
             self._answer(request, response)
+            self._answered += 1
         except Exception as error:  # every failure is answered with a code
             response.code, response.message = nodes.describe(self, error)
             response.candidates = []
+            self._refused += 1
             self.get_logger().warning(f"match refused: {response.message}")
+        self._last = f"{response.code}: {response.message}"
         return response
+
+    def _report(self) -> list[DiagnosticStatus]:
+        """What the matcher says about itself once a second."""
+        servers = self.count_services(self._service.service_name)
+        level, message = DiagnosticStatus.OK, f"answers {self._service.service_name}"
+        if servers > 1:
+            level, message = DiagnosticStatus.ERROR, f"{servers} servers of {self._service.service_name} (allowed: 1)"
+        scene = self._scene
+        values = {
+            "features": self._matcher.backend.name,
+            "objects": "none received yet" if scene is None else ", ".join(item.id for item in scene.objects) or "none",
+            "answered": self._answered,
+            "refused": self._refused,
+            "last answer": self._last,
+        }
+        return [diagnostics.status(self, "requests", level, message, values)]
 
     def _answer(self, request: MatchContact.Request, response: MatchContact.Response) -> None:
         found = self._strategy(request.strategy)

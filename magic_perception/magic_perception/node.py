@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
@@ -24,9 +24,10 @@ from magic_core import conversions as cv
 from magic_core import depth as depths
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, run
-from magic_core.qos import LATCHED, RELIABLE, SENSOR
+from magic_core.qos import LATCHED, SENSOR
 from magic_core.scene import Scene, SceneObject
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
@@ -124,16 +125,15 @@ class Perception(Node):
 
         self.objects_out = self.create_publisher(SceneObjectArray, "objects", LATCHED)
         self.markers_out = self.create_publisher(MarkerArray, "perception/markers", LATCHED)
-        self.diagnostics_out = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
         self.inputs = inputs
         self.topics = {camera: self._subscribe(camera, inputs) for camera in self.cameras}
         self.compressed: dict[tuple[str, str], Subscription] = {}
         self.transforms = TransformListener(self, inputs, self.lock)
         self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
-        self.create_timer(min(0.05, self.period / 4), self.on_work, callback_group=work)
-        self.create_timer(1.0, self.on_report, callback_group=report)
-        self.create_timer(0.5, self.on_look, callback_group=report)
+        wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
+        wall_timer(self, 0.5, self.on_look, report)
+        self.diagnostics = Diagnostics(self, self.on_report, report)
         self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
 
     def _algorithm(self) -> Parameters:
@@ -518,42 +518,26 @@ class Perception(Node):
         except Exception as error:
             self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
 
-    def on_report(self) -> None:
-        """Say once a second what is there and what is missing."""
-        try:
-            now = time.monotonic()
-            with self.lock:
-                states = [self.camera_status(camera, now) for camera in self.cameras]
-            level, code, message, values = self.outcome
-            worst = [s for s in states if s.level != DiagnosticStatus.OK]
-            if self.done == 0 and code is Code.NO_FRAMES and worst:
-                message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
-            states.append(pc.status(f"{self.get_name()}: scene", level, message, code, values))
-            for topic, message in self.unheard.items():
-                states.append(
-                    pc.status(
-                        f"{self.get_name()}: topic {topic}",
-                        DiagnosticStatus.ERROR,
-                        f"[{int(Code.NO_FRAMES)} QoS] {message}",
-                        Code.NO_FRAMES,
-                        {},
-                    )
-                )
-            if self.known_problem is not None:
-                states.append(
-                    pc.status(
-                        f"{self.get_name()}: known objects",
-                        DiagnosticStatus.ERROR,
-                        f"[{int(self.known_problem[0])} {self.known_problem[0].name}] {self.known_problem[1]}",
-                        self.known_problem[0],
-                        {},
-                    )
-                )
-            msg = DiagnosticArray(status=states)
-            msg.header.stamp = self.get_clock().now().to_msg()
-            self.diagnostics_out.publish(msg)
-        except Exception as error:
-            self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
+    def on_report(self) -> list[DiagnosticStatus]:
+        """Once a second: what is there and what is missing."""
+        now = time.monotonic()
+        with self.lock:
+            states = [self.camera_status(camera, now) for camera in self.cameras]
+        level, code, message, values = self.outcome
+        worst = [s for s in states if s.level != DiagnosticStatus.OK]
+        if self.done == 0 and code is Code.NO_FRAMES and worst:
+            message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
+        states.append(pc.status(f"{label(self)}: scene", level, message, code, values))
+        for topic, message in self.unheard.items():
+            message = f"[{int(Code.NO_FRAMES)} QoS] {message}"
+            states.append(pc.status(f"{label(self)}: topic {topic}", DiagnosticStatus.ERROR, message, Code.NO_FRAMES, {}))
+        if self.known_problem is not None:
+            code, message = self.known_problem
+            message = f"[{int(code)} {code.name}] {message}"
+            states.append(pc.status(f"{label(self)}: known objects", DiagnosticStatus.ERROR, message, code, {}))
+        for state in states:
+            state.hardware_id = self.get_fully_qualified_name()
+        return states
 
     def camera_status(self, camera: str, now: float) -> DiagnosticStatus:
         """One camera: its problems, else what of it is silent, else OK."""
@@ -568,7 +552,7 @@ class Perception(Node):
             values["stamp"] = f"{stream.pairs[-1].stamp:.3f}"
         if self.distortion.get(camera, 0.0) > 1e-3:
             values["distortion"] = f"up to {self.distortion[camera]:.3f}, left out: publish rectified images"
-        name = f"{self.get_name()}: camera {camera}"
+        name = f"{label(self)}: camera {camera}"
         for what in ("camera_info", "depth_camera_info", "color", "depth", "stamps", "pairing", "frames"):
             if what in stream.problems:
                 problem = stream.problems[what]

@@ -13,6 +13,7 @@ from sensor_msgs.msg import JointState
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import check_solid
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
 from magic_core.robot import PANDA_ACCELERATION, RobotConfig
@@ -41,7 +42,7 @@ class PlannerNode(Node):
         super().__init__("planner", **kwargs)
         self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
         self._timeout = parameter(self, "timeout", 10.0, "Wall time in s for one goal that names none.", low=0.05, high=3600.0)
-        self._arm = self._load_arm() if parameter(self, "arm", True, "Load the arm; without it only the variant fg is served.") else None
+        self._arm = self._load_arm(parameter(self, "arm", True, "Load the arm; without it only the variant fg is served."))
         self._threads = one_thread()
         self._server = OneGoalServer(
             self, PlanMotion, "plan_motion", self._answer, "another motion is being planned; send the goal again when it has ended"
@@ -53,8 +54,8 @@ class PlannerNode(Node):
         self._server.destroy()
         super().destroy_node()
 
-    def _load_arm(self) -> Any:
-        """Declare the arm's parameters and load it, so that the first goal does not pay for it; raises BAD_REQUEST."""
+    def _load_arm(self, wanted: bool) -> Any:
+        """Declare the arm's parameters and load it where it is wanted, so that the first goal does not pay for it; raises BAD_REQUEST."""
         from magic_planner.arm import ArmPlanner, ArmSettings
         from magic_planner.cloud import CloudSettings
         from magic_planner.grasps import GraspSettings
@@ -94,6 +95,8 @@ class PlannerNode(Node):
                 self, "cloud.margin", 0.01, "Metres around shapes, tool and table in which points are left to these.", low=0.0, high=0.2
             ),
         )
+        if not wanted:
+            return None
         planner = ArmPlanner(Robot(config), settings, grasping, cloud)
         planner.warm_up()
         self.get_logger().info(f"arm {config.urdf or 'panda'} ready after {time.monotonic() - started:.2f} s")
@@ -126,6 +129,8 @@ class PlannerNode(Node):
         feedback("motion", f"moving {goal.tool.id} by strategy {goal.strategy}")
         strategy = strategies.find(goal.strategy, self._strategies or None)
         tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        for item, what in ((tool, "tool"), (target, "target")):
+            check_solid(item.mesh, f"the {what} {item.id}")
         obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids) or "" in ids:

@@ -230,7 +230,7 @@ def load_object(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | N
     from magic_core import shapes
 
     if "//" in name:
-        from magic_core.mesh import load
+        from magic_core.mesh import check_solid, load
         from magic_verifier.decomposition import convex_pieces
 
         folder, _, rest = name.partition("//")
@@ -238,7 +238,9 @@ def load_object(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | N
         poses = read_poses(Path(folder))
         entry = poses.get(path, poses.get("default", PoseEntry()))
         entry = replace(entry, scale=entry.scale * float(scale))
-        mesh, object_from_mesh = posed(load(Path(folder) / path), kind, entry)
+        loaded = load(Path(folder) / path)
+        check_solid(loaded, path)
+        mesh, object_from_mesh = posed(loaded, kind, entry)
         meeting = None
         if entry.contact is not None:
             point, normal, direction = entry.contact

@@ -14,6 +14,7 @@ import json
 import math
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -136,16 +137,27 @@ class _Problem:
     table: NDArray[np.float64]
     meeting: Meeting | None
     layout: captured.Layout | None = None
+    left_out: tuple[str, ...] = ()
 
 
 def _as_given(options: Options, strategy: Strategy, case: Case) -> _Problem:
     """The meshes themselves, each tool where all tools lie."""
-    tools = [tool_object(name, index, strategy.view) for index, name in enumerate(case.tools)]
+    tools, names, left_out = [], [], []
+    for index, name in enumerate(case.tools):
+        try:
+            tools.append(tool_object(name, index, strategy.view))
+            names.append(name)
+        except MagicError as error:  # where there are others to choose from, one that is no body takes no part
+            if error.code != Code.BAD_MESH or len(case.tools) == 1:
+                raise
+            left_out.append(f"{short_name(name)}: {error.message}")
+    if not tools:
+        raise MagicError(Code.BAD_MESH, "; ".join(left_out))
     if options.variant == "arm":
         # The arm takes the tool as it lies by itself: a spoon set on the bottom of its bowl tips on to its handle.
         tools = [settled(tool, TABLE, strategy.physics) for tool in tools]
     target, obstacles, meeting = scene_for(strategy, case.target)
-    return _Problem(tools, list(case.tools), target, {tool.id: obstacles for tool in tools}, TABLE, meeting)
+    return _Problem(tools, names, target, {tool.id: obstacles for tool in tools}, TABLE, meeting, left_out=tuple(left_out))
 
 
 def _as_seen(options: Options, strategy: Strategy, case: Case, seconds: dict[str, float], film: Path | None) -> _Problem:
@@ -190,6 +202,8 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     try:
         strategy = _strategy(options)
         problem = _as_seen(options, strategy, case, seconds, film) if options.source == "images" else _as_given(options, strategy, case)
+        if problem.left_out:
+            answer["left_out"] = list(problem.left_out)
         only_best = options.method == "no_simulation_verification"
         if options.method not in BASELINES:
             _matcher(options.features, options.weights, options.method).prepare(
@@ -433,7 +447,13 @@ def _stored(path: Path) -> dict[str, Any] | None:
 def _work(options: Options, case: Case, folder: Path, films: bool) -> dict[str, Any]:
     started = time.perf_counter()
     key = _key(case.name)
-    result = run_case(options, case, folder / "films" / f"{key}.png" if films else None)
+    try:
+        result = run_case(options, case, folder / "films" / f"{key}.png" if films else None)
+    except Exception as error:  # the others are worth the same whatever became of this one
+        print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
+        message = {"code": Code.INTERNAL.name, "message": f"{type(error).__name__}: {error}"}
+        result = {"object": case.name, "success": False, "reason": Code.INTERNAL.name, "candidates": [message], "simulations": 0}
+        result["seconds"] = {"total": time.perf_counter() - started}
     result["wall"] = time.perf_counter() - started
     path = folder / "cases" / f"{key}.json"
     temporary = path.with_suffix(".tmp")

@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import check_solid
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
 from magic_core.threads import one_thread
@@ -141,6 +142,8 @@ class VerifierNode(Node):
             raise MagicError(Code.BAD_REQUEST, "timeout", goal.timeout, "0 or a number of seconds above it")
         strategy = strategies.find(goal.strategy, self._strategies or None)
         tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        for item, what in ((tool, "tool"), (target, "target")):
+            check_solid(item.mesh, f"the {what} {item.id}")
         obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids):

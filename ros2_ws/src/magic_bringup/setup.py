@@ -32,11 +32,11 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "strategy_server = magic_bringup.strategy_server:main",
-            "report = magic_bringup.report:main",
-            "rgbd_to_bag = magic_bringup.rgbd_to_bag:main",
-            "bag_player = magic_bringup.bag_player:main",
-            "bag_recorder = magic_bringup.bag_recorder:main",
+            "strategy_server = magic_bringup.programs:strategy_server",
+            "report = magic_bringup.programs:report",
+            "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
+            "bag_player = magic_bringup.programs:bag_player",
+            "bag_recorder = magic_bringup.programs:bag_recorder",
         ],
     },
 )

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from magic_bringup import mcap_mending
 from magic_core.errors import Code, MagicError
 
 
@@ -31,7 +32,10 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds. Times in nanoseconds since the epoch; ``end`` is the last message's stamp."""
+    """What a bag holds. Times in nanoseconds since the epoch; ``end`` is the last message's stamp.
+
+    ``note``: what became of a bag that was cut off; empty for whole ones.
+    """
 
     files: tuple[str, ...]
     size: int
@@ -42,6 +46,7 @@ class BagInfo:
     count: int
     compression: str
     topics: tuple[BagTopic, ...]
+    note: str = ""
 
     def format(self) -> str:
         """The text of ``ros2 bag info``."""
@@ -72,6 +77,8 @@ class BagInfo:
         ]
         if self.compression:
             lines.insert(4, f"Compression:       {self.compression}")
+        if self.note:
+            lines.append(f"Note:              {self.note}")
         return "\n".join(lines) + "\n"
 
 
@@ -79,26 +86,87 @@ class BagInfo:
 def open_bag(path: Path | str) -> Iterator[Any]:
     """The ``rosbags`` reader of a bag: a folder with ``metadata.yaml``, or a single ``.mcap`` or ``.db3`` file.
 
+    Of an MCAP file that was cut off, alone or as the one file of a folder, what is there is read; :func:`note_on` says so.
     Raises ``BAD_BAG`` where there is none, or where it cannot be read.
     """
-    from rosbags.rosbag2 import Reader, ReaderError
-
     path = Path(path)
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        raise MagicError(Code.BAD_BAG, "the folder holds no metadata.yaml", str(path), "a rosbag2 folder, or an .mcap or .db3 file")
     try:
-        reader = Reader(path)
-        reader.open()
+        reader = _opened(path)
+    except MagicError:
+        raise
     except FileNotFoundError:
         raise MagicError(Code.BAD_BAG, "no such bag", str(path), "a rosbag2 folder, or an .mcap or .db3 file") from None
-    except (ReaderError, OSError, ValueError, TypeError, IndexError) as error:
-        raise MagicError(Code.BAD_BAG, f"cannot read the bag ({error})", str(path)) from error
+    except Exception as error:  # the library lets out whatever the bytes of a broken file bring about
+        raise _unreadable(path, error) from error
     try:
         yield reader
-    except ReaderError as error:
-        raise MagicError(Code.BAD_BAG, f"cannot read the bag ({error})", str(path)) from error
+    except Exception as error:
+        if _from_library(error):
+            raise _unreadable(path, error) from error
+        raise
     finally:
         reader.close()
+
+
+def _unreadable(path: Path, error: Exception) -> MagicError:
+    return MagicError(Code.BAD_BAG, f"cannot read the bag ({str(error) or type(error).__name__})", str(path))
+
+
+def _from_library(error: BaseException) -> bool:
+    """Whether an exception came out of the library that reads bags, rather than out of what was done with its messages."""
+    frame = error.__traceback__
+    while frame is not None:
+        if "/rosbags/" in frame.tb_frame.f_code.co_filename:
+            return True
+        frame = frame.tb_next
+    return False
+
+
+def _opened(path: Path) -> Any:
+    """An open reader; of what was cut off, as much as there is."""
+    from rosbags.rosbag2 import Reader, ReaderError
+
+    file = _only_file(path)
+    cut_off = file is not None and file.suffix == ".mcap" and file.is_file() and mcap_mending.is_cut_off(file)
+    if not cut_off:
+        if path.is_dir() and file is not None and not (path / "metadata.yaml").exists():
+            path = file
+        reader = Reader(path)
+        reader.open()
+        return reader
+    for length in dict.fromkeys(mcap_mending.whole_records(file)):  # the last chunk may be whole in length and broken in content
+        reader = Reader(mcap_mending.Mended(file, length))
+        try:
+            reader.open()
+            return reader
+        except Exception as error:
+            failure = error
+    raise ReaderError(f"it was cut off, and nothing before that can be read: {failure}")
+
+
+def _only_file(path: Path) -> Path | None:
+    """The one file of a bag; None where it has several.  Raises BAD_BAG for a folder that is no bag, or whose recorder left it so."""
+    if not path.is_dir():
+        return path
+    files = [p for p in sorted(path.iterdir()) if p.suffix in (".mcap", ".db3")]
+    if not (path / "metadata.yaml").exists():
+        if not files:
+            raise MagicError(Code.BAD_BAG, "the folder holds no metadata.yaml", str(path), "a rosbag2 folder, or an .mcap or .db3 file")
+        if len(files) > 1:
+            raise MagicError(
+                Code.BAD_BAG,
+                f"the folder holds {len(files)} files and no metadata.yaml, as a recorder that was killed leaves it",
+                str(path),
+                f"one of its files, such as {files[0].name}, or the folder after `ros2 bag reindex`",
+            )
+    return files[0] if len(files) == 1 else None
+
+
+def note_on(reader: Any) -> str:
+    """What there is to say of an open reader's bag: that it was cut off; else empty."""
+    if not isinstance(reader.path, mcap_mending.Mended):
+        return ""
+    return f"{reader.path} was cut off; its {reader.message_count} messages before that can be used"
 
 
 def topics_of(reader: Any) -> tuple[BagTopic, ...]:
@@ -130,6 +198,7 @@ def info(path: Path | str) -> BagInfo:
             count=reader.message_count,
             compression=f"{metadata.compression_format} ({metadata.compression_mode})" if metadata.compression_mode else "",
             topics=topics_of(reader),
+            note=note_on(reader),
         )
 
 

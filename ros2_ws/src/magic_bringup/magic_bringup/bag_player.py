@@ -20,8 +20,9 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from magic_bringup import bag_qos
-from magic_bringup.bag_file import open_bag, topics_of
+from magic_bringup.bag_file import note_on, open_bag, topics_of
 from magic_bringup.bag_messages import message_class
+from magic_core import arguments
 from magic_core.errors import Code, MagicError
 
 #: After the last message: how long reliable subscribers have to acknowledge, s.
@@ -68,8 +69,10 @@ class Player:
         """Raises ``BAD_BAG`` where the bag is unreadable, empty, or none of its topics can be published."""
         options = self._options
         with open_bag(options.bag) as reader:
+            if note := note_on(reader):
+                self._node.get_logger().warning(note)
             if reader.message_count == 0:
-                raise MagicError(Code.BAD_BAG, "the bag is empty", options.bag)
+                raise MagicError(Code.BAD_BAG, f"the bag is empty{note and '; '}{note}", options.bag)
             self._advertise(topics_of(reader))
             connections = [c for c in reader.connections if (c.topic, c.msgtype) in self._publishers]
             start = reader.start_time + round(options.start_offset * 1e9)
@@ -159,24 +162,24 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
-def options_from(arguments: argparse.Namespace) -> PlayOptions:
+def options_from(parsed: argparse.Namespace) -> PlayOptions:
     """Options from the parsed command line; raises ``BAD_REQUEST``."""
     remap = []
-    for rule in arguments.remap:
+    for rule in parsed.remap:
         old, separator, new = rule.partition(":=")
         if not (old and separator and new):
             raise MagicError(Code.BAD_REQUEST, "remap", rule, "OLD:=NEW")
         remap.append((old, new))
     return PlayOptions(
-        bag=arguments.bag_path,
-        rate=arguments.rate,
-        clock_hz=arguments.clock,
-        loop=arguments.loop,
-        topics=tuple(arguments.topics),
-        exclude=tuple(arguments.exclude_topics),
-        start_offset=arguments.start_offset,
-        duration=arguments.playback_duration,
-        delay=arguments.delay,
+        bag=parsed.bag_path,
+        rate=parsed.rate,
+        clock_hz=parsed.clock,
+        loop=parsed.loop,
+        topics=tuple(parsed.topics),
+        exclude=tuple(parsed.exclude_topics),
+        start_offset=parsed.start_offset,
+        duration=parsed.playback_duration,
+        delay=parsed.delay,
         remap=tuple(remap),
     )
 
@@ -188,14 +191,15 @@ def interrupt(_signum: int, _frame: Any) -> None:
 
 def main(args: list[str] | None = None) -> None:
     """Exit status 0 at the end of the bag and on SIGINT or SIGTERM, 1 with one line on stderr where the bag cannot be played."""
-    parsed = parser().parse_args(rclpy.utilities.remove_ros_args(args if args is not None else sys.argv)[1 if args is None else 0 :])
+    own, ros = arguments.split(sys.argv[1:] if args is None else args)
+    parsed = parser().parse_args(own)
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
     status = 0
     node = None
     try:
         options = options_from(parsed)
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=ros, signal_handler_options=SignalHandlerOptions.NO)
         node = Node("rosbag2_player")
         count = Player(node, options).play()
         node.get_logger().info(f"played {count} messages of {options.bag}")

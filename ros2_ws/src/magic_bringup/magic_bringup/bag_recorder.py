@@ -15,21 +15,21 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from magic_bringup import bag_qos
 from magic_bringup.bag_file import BagWriter
 from magic_bringup.bag_messages import message_class
-from magic_bringup.bag_player import interrupt
+from magic_core import arguments
 from magic_core.errors import Code, MagicError
 
 #: How often the graph is asked for new topics, s (``ros2 bag record`` does the same).
 POLL = 0.1
 
-#: At the end: how long messages that have arrived already may take to be written, s.
-DRAIN = 2.0
+#: At the end: how long messages that have arrived already may take to be written, and after which silence none is left, s.
+DRAIN, SILENCE = 5.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -133,25 +133,36 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
-def options_from(arguments: argparse.Namespace) -> RecordOptions:
+def options_from(parsed: argparse.Namespace) -> RecordOptions:
     """Options from the parsed command line; raises ``BAD_REQUEST``."""
-    names = [name if name.startswith("/") else f"/{name}" for name in arguments.topics + arguments.named_topics]
+
+    def full(names: list[str]) -> tuple[str, ...]:
+        return tuple(name if name.startswith("/") else f"/{name}" for name in names)
+
     return RecordOptions(
-        output=arguments.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"),
-        topics=tuple(names),
-        regex=arguments.regex,
-        everything=arguments.all,
-        exclude=tuple(arguments.exclude_topics),
-        storage=arguments.storage,
-        compression=arguments.compression_mode,
+        output=parsed.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"),
+        topics=full(parsed.topics + parsed.named_topics),
+        regex=parsed.regex,
+        everything=parsed.all,
+        exclude=full(parsed.exclude_topics),
+        storage=parsed.storage,
+        compression=parsed.compression_mode,
     )
 
 
 def main(args: list[str] | None = None) -> None:
     """Records until SIGINT or SIGTERM (status 0); status 1 with one line on stderr where it cannot."""
-    parsed = parser().parse_args(rclpy.utilities.remove_ros_args(args if args is not None else sys.argv)[1 if args is None else 0 :])
-    signal.signal(signal.SIGINT, interrupt)
-    signal.signal(signal.SIGTERM, interrupt)
+    own, ros = arguments.split(sys.argv[1:] if args is None else args)
+    parsed = parser().parse_args(own)
+    told_to_end = False
+
+    def end(_signum: int, _frame: Any) -> None:
+        # No exception: it could come between the taking of a message and its writing.
+        nonlocal told_to_end
+        told_to_end = True
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
     status = 0
     node = recorder = None
     executor = None
@@ -159,17 +170,17 @@ def main(args: list[str] | None = None) -> None:
         options = options_from(parsed)
         if Path(options.output).exists():
             raise MagicError(Code.BAD_BAG, "the output folder exists already", options.output)
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=ros, signal_handler_options=SignalHandlerOptions.NO)
         node = Node("rosbag2_recorder")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         recorder = Recorder(node, options)
         node.get_logger().info("Recording...")
-        while recorder.error is None:
-            executor.spin_once(timeout_sec=1.0)
-        raise recorder.error
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        while recorder.error is None and not told_to_end:
+            executor.spin_once(timeout_sec=0.1)
+        _drain(executor, recorder)
+        if recorder.error is not None:
+            raise recorder.error
     except MagicError as error:
         print(f"bag_recorder: {error}", file=sys.stderr)
         status = 1
@@ -177,13 +188,6 @@ def main(args: list[str] | None = None) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if recorder is not None:
-            # What had arrived before the signal belongs into the bag.
-            deadline = time.monotonic() + DRAIN
-            quiet = 0
-            while quiet < 10 and time.monotonic() < deadline and recorder.error is None:
-                before = recorder.count
-                executor.spin_once(timeout_sec=0.0)
-                quiet = quiet + 1 if recorder.count == before else 0
             recorder.close()
             print(f"{recorder.count} messages recorded in {options.output}", file=sys.stderr)
         if executor is not None:
@@ -192,6 +196,17 @@ def main(args: list[str] | None = None) -> None:
             node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(status)
+
+
+def _drain(executor: SingleThreadedExecutor, recorder: Recorder) -> None:
+    """Write what had arrived before the signal: until nothing has come for a while, as a busy machine hands it over late."""
+    now = heard = time.monotonic()
+    deadline = now + DRAIN
+    while now < deadline and now - heard < SILENCE and recorder.error is None:
+        before = recorder.count
+        executor.spin_once(timeout_sec=0.05)
+        now = time.monotonic()
+        heard = now if recorder.count != before else heard
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, peak_memory
 from magic_bringup.pipeline import split_metrics
+from magic_core import environment
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS
@@ -106,7 +107,9 @@ def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
 
     info = bag_file.info(bag)
     if info.count == 0:
-        raise MagicError(Code.BAD_BAG, "the bag is empty", str(bag), "a bag with at least one message")
+        raise MagicError(Code.BAD_BAG, f"the bag is empty{info.note and '; '}{info.note}", str(bag), "a bag with at least one message")
+    if info.note:
+        print(f"demo: {info.note}", file=sys.stderr)
     return tuple(t.name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)), (info.end - info.start) * 1e-9
 
 
@@ -321,6 +324,7 @@ class Demo:
 
     def _run(self) -> None:
         options = self.options
+        environment.prepare()
         strategies.find(options.strategy)  # a wrong name is told before anything is started
         topics, self._length = look_into(options.bag)
         env = isolated()

@@ -16,6 +16,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
+from magic_core import presence
 from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
 
@@ -76,12 +77,20 @@ class Token:
             return True
 
 
+class _Gone(MagicError):
+    """Those who were asked have gone."""
+
+
 class _Remote:
     """What service and action calls share: the server's name and whether it is there."""
+
+    #: What a server of this kind adds to its name for the service that is asked first.
+    ASKED = ""
 
     def __init__(self, node: Node, name: str, server: str) -> None:
         self.name = node.resolve_service_name(name)
         self.server = server
+        self._node = node
 
     def ready(self) -> bool:
         """Whether the server can be seen now."""
@@ -94,9 +103,28 @@ class _Remote:
                 Code.SERVER_UNAVAILABLE, f"the {self.server} does not answer: nothing serves {self.name} (waited {timeout:.1f} s)"
             )
 
-    def _still_there(self) -> None:
-        if not self.ready():
-            raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server} has gone: nothing serves {self.name} any more")
+    def watch(self) -> Callable[[], None]:
+        """What raises SERVER_UNAVAILABLE once those who serve now have gone, be there others by then: they know nothing of what was asked."""
+        servers = presence.Watch(lambda: presence.servers(self._node, self.name + self.ASKED))
+        seen = self.ready()
+
+        def still_there() -> None:
+            nonlocal seen
+            if servers.gone() or (seen and not servers.begun and not self.ready()):
+                raise _Gone(Code.SERVER_UNAVAILABLE, f"the {self.server} has gone: what served {self.name} does not any more")
+            seen = seen or self.ready()
+
+        return still_there
+
+    def _asked_again(self, ask: Callable[[float], Any], timeout: float) -> Any:
+        """What ``ask(seconds left)`` returns, asked again where those asked have gone and others have come in their place meanwhile."""
+        deadline = time.monotonic() + timeout
+        while True:
+            try:
+                return ask(max(0.0, deadline - time.monotonic()))
+            except _Gone:
+                if not self.ready() or time.monotonic() > deadline:
+                    raise
 
     def _late(self, what: str, timeout: float) -> MagicError:
         return MagicError(Code.SERVER_TIMEOUT, f"the {self.server} ({self.name}) {what} within {timeout:.1f} s")
@@ -114,12 +142,16 @@ class RemoteService(_Remote):
 
     def call(self, request: Any, timeout: float, token: Token, presence: float = 5.0) -> Any:
         """The response; raises SERVER_UNAVAILABLE, SERVER_TIMEOUT or CANCELED."""
+        return self._asked_again(lambda left: self._call(request, left, token, presence), timeout)
+
+    def _call(self, request: Any, timeout: float, token: Token, presence: float) -> Any:
         deadline = time.monotonic() + timeout
         self.require(min(presence, timeout), token)
+        still_there = self.watch()
         future = self._client.call_async(request)
         future.add_done_callback(token.poke)
         try:
-            if not token.wait(future.done, deadline, alive=self._still_there):
+            if not token.wait(future.done, deadline, alive=still_there):
                 raise self._late("did not answer", timeout)
             return future.result()
         finally:
@@ -132,10 +164,10 @@ class RemoteAction(_Remote):
 
     #: How long a canceled or late goal is given to end by itself, s.
     CANCEL_PATIENCE = 2.0
+    ASKED = "/_action/send_goal"
 
     def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup, refusal: Code = Code.BUSY) -> None:
         super().__init__(node, name, server)
-        self._node = node
         self._refusal = refusal
         self._client = ActionClient(node, kind, name, callback_group=group)
 
@@ -160,7 +192,8 @@ class RemoteAction(_Remote):
         ``timeout`` is what the server itself is given; ``grace`` what is waited
         beyond it for the answer.  Raises what :meth:`respond` does.
         """
-        response = self.respond(goal, timeout + grace, token, presence, feedback)
+        # Of this project's actions none changes anything but its answer: a goal may be sent again.
+        response = self._asked_again(lambda left: self.respond(goal, left, token, presence, feedback), timeout + grace)
         if response.status != GoalStatus.STATUS_SUCCEEDED and response.result.code == 0:
             # rclpy answers an empty result where a server's handler raised.
             raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {response.status} and no result")
@@ -175,26 +208,27 @@ class RemoteAction(_Remote):
         deadline = time.monotonic() + timeout
         self.require(min(presence, timeout), token)
         token.check()
+        still_there = self.watch()
         callback = None if feedback is None else (lambda message: feedback(message.feedback))
         accepting = self._client.send_goal_async(goal, feedback_callback=callback)
         accepting.add_done_callback(token.poke)
         try:
-            if not token.wait(accepting.done, deadline, alive=self._still_there):
+            if not token.wait(accepting.done, deadline, alive=still_there):
                 raise self._late("did not accept the goal", timeout)
             handle = accepting.result()
             if not handle.accepted:
                 raise MagicError(self._refusal, f"the {self.server} ({self.name}) refused the goal")
             future = handle.get_result_async()
             future.add_done_callback(token.poke)
-            if not token.wait(future.done, deadline, alive=self._still_there):
+            if not token.wait(future.done, deadline, alive=still_there):
                 raise self._late("did not finish", timeout)
         except MagicError as error:
-            if self._cancel(accepting, token):
+            if isinstance(error, _Gone) or self._cancel(accepting, token, still_there):
                 raise
             raise MagicError(error.code, f"{error.message}; the {self.server} did not say that its goal has ended") from error
         return future.result()
 
-    def _cancel(self, accepting: Any, token: Token) -> bool:
+    def _cancel(self, accepting: Any, token: Token, still_there: Callable[[], None]) -> bool:
         """Cancel a goal that nobody waits for any more, be it accepted only later; true where it is known to have ended."""
         ended = threading.Event()
 
@@ -215,7 +249,7 @@ class RemoteAction(_Remote):
         else:
             accepting.add_done_callback(stop)
         try:
-            return token.wait(ended.is_set, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=self._still_there)
+            return token.wait(ended.is_set, time.monotonic() + self.CANCEL_PATIENCE, heed_cancel=False, alive=still_there)
         except MagicError:
             return False
 

@@ -44,7 +44,8 @@ class Stages:
         server = self._server
         # First the servers: a run that cannot be verified is not begun.
         deadline = time.monotonic() + min(timeout, server.settings.presence)
-        for remote in (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else [])):
+        needed = (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else []))
+        for remote in needed:
             remote.require(max(0.0, deadline - time.monotonic()), self._token)
         wait = min(timeout, server.settings.objects)
 
@@ -57,7 +58,13 @@ class Stages:
                 len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
             )
 
-        came = self._token.wait(enough, time.monotonic() + wait)
+        watches = [server.objects_watch(), *(remote.watch() for remote in needed)]
+
+        def still_there() -> None:
+            for watch in watches:
+                watch()
+
+        came = self._token.wait(enough, time.monotonic() + wait, alive=still_there)
         scene = server.scene
         if not came:
             raise self._no_objects(scene, wait)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -24,18 +24,21 @@ from magic_bringup.arm import Arm
 from magic_bringup.joints import JointStates
 from magic_bringup.remote import RemoteAction, RemoteService, Token, check_alone
 from magic_bringup.stages import Stages, complaint_code
-from magic_core import conversions, qos
+from magic_core import conversions, presence, qos
 from magic_core import strategy as strategies
+from magic_core.diagnostics import Diagnostics, clock_complaint, status
 from magic_core.errors import Code, MagicError
-from magic_core.node import describe, run
+from magic_core.node import RESULT_TIMEOUT, describe, run
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObjectArray, StageTimes
 from magic_interfaces.srv import MatchContact
 
-#: Where perception's own explanation is looked for when no objects come.
+#: Whose explanation is looked for when no objects come, besides that of those who publish objects: the node of this name beside this one.
 PERCEPTION = "perception"
 #: How old such an explanation may be, s.
 COMPLAINT_AGE = 30.0
+#: Where a run ends so, a clock that stands still may be why.
+OUT_OF_TIME = (Code.NO_FRAMES, Code.NO_OBJECTS, Code.STALE_DATA)
 
 
 class StrategyServer(Node):
@@ -83,11 +86,9 @@ class StrategyServer(Node):
         ).topic_name
         self.create_subscription(JointState, "joint_states", self._on_joints, qos.SENSOR, callback_group=group)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=group)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.RELIABLE)
         self._arm_pub = self.create_publisher(JointTrajectory, "verified_trajectory", qos.LATCHED)
         self._tool_pub = self.create_publisher(MultiDOFJointTrajectory, "verified_tool_trajectory", qos.LATCHED)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
-        self.create_timer(1.0, self._tick, callback_group=group)
         self._server = ActionServer(
             self,
             RunStrategy,
@@ -96,9 +97,11 @@ class StrategyServer(Node):
             goal_callback=lambda goal: GoalResponse.REJECT if self._closing else GoalResponse.ACCEPT,
             cancel_callback=self._on_cancel,
             callback_group=group,
+            result_timeout=RESULT_TIMEOUT,
         )
         self._server_name = self.resolve_service_name("run_strategy")
-        self._tick()
+        self._diagnostics = Diagnostics(self, self._report, group)
+        self._diagnostics.publish()
 
     # ------------------------------------------------------------ what comes in
 
@@ -111,16 +114,33 @@ class StrategyServer(Node):
         self.joints.take(message.name, message.position, message.velocity, stamp, time.monotonic())
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if PERCEPTION in status.name:
-                self._complaints[status.name] = (time.monotonic(), status)
+        for found in message.status:
+            # Graphs under other namespaces report on the same topic.
+            if found.name.partition(": ")[0] in self._perceivers():
+                self._complaints[found.name] = (time.monotonic(), found)
+
+    def _perceivers(self) -> set[str]:
+        """Labels of the nodes that publish this node's objects, and of perception beside this node."""
+        publishers = self.get_publishers_info_by_topic(self.objects_topic)
+        nodes = [(p.node_namespace, p.node_name) for p in publishers] + [(self.get_namespace(), PERCEPTION)]
+        return {f"{namespace.strip('/')}/{name}".lstrip("/") for namespace, name in nodes}
+
+    def objects_watch(self) -> Callable[[], None]:
+        """What raises SERVER_UNAVAILABLE once those who publish the objects now have gone."""
+        publishers = presence.Watch(lambda: presence.publishers(self, self.objects_topic))
+
+        def still_there() -> None:
+            if publishers.gone():
+                raise MagicError(Code.SERVER_UNAVAILABLE, f"perception has gone: what published {self.objects_topic} does not any more")
+
+        return still_there
 
     def _poke(self) -> None:
         token = self._token
         if token is not None:
             token.poke()
 
-    def _tick(self) -> None:
+    def _report(self) -> list[DiagnosticStatus]:
         """Once a second: say what is missing, in the log when it changes and on /diagnostics."""
         waiting = [f"{r.server} ({r.name})" for r in (self.matcher, self.planner, self.verifier) if not r.ready()]
         waiting += self._arm.ready() if self._arm is not None else []
@@ -131,16 +151,9 @@ class StrategyServer(Node):
         if waiting != self._waiting:
             self._waiting = waiting
             self.get_logger().info("waiting for " + ", ".join(waiting) if waiting else "ready: all servers are there and objects have come")
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if waiting else DiagnosticStatus.OK,
-            name=f"{self.get_name()}: readiness",
-            message="waiting for " + ", ".join(waiting) if waiting else "ready",
-            hardware_id="",
-            values=[KeyValue(key="running", value=str(self._token is not None).lower())],
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
+        level = DiagnosticStatus.WARN if waiting else DiagnosticStatus.OK
+        message = "waiting for " + ", ".join(waiting) if waiting else "ready"
+        return [status(self, "readiness", level, message, {"running": str(self._token is not None).lower()})]
 
     def complaint(self) -> DiagnosticStatus | None:
         """Perception's worst recent diagnostic, where it has one; among equals one that says more than that nothing comes."""
@@ -176,6 +189,8 @@ class StrategyServer(Node):
         finally:
             if mine:
                 self._token = None
+        if result.code in OUT_OF_TIME and (complaint := clock_complaint(self)):
+            result.message += f"; {complaint}"
         self._finish(handle, result)
         self._goals.pop(key, None)
         return result
@@ -325,7 +340,7 @@ class StrategyServer(Node):
     def _check_scene(self, planned: SceneObjectArray, token: Token) -> None:
         """The objects must have been seen just now, and where the plan believes them.  Waits a little for perception."""
         limit = self.settings.objects_age
-        if not token.wait(lambda: self._scene_age() <= limit, time.monotonic() + self.settings.objects):
+        if not token.wait(lambda: self._scene_age() <= limit, time.monotonic() + self.settings.objects, alive=self.objects_watch()):
             raise MagicError(
                 Code.STALE_DATA, "age of the objects in s", round(self._scene_age(), 1), f"at most {limit:g}, by stamp and by arrival"
             )

@@ -73,6 +73,22 @@ class Mesh:
         self.to_trimesh().export(str(path))
 
 
+#: A mesh that is thinner than this share of its length has no inside, and no two sides to be grasped by or to be seen from.
+FLAT = 1e-5
+
+
+def check_solid(mesh: Mesh, what: str) -> None:
+    """Raises BAD_MESH, naming ``what``, for a mesh that bounds no body: fewer than four triangles, or all of it in one plane."""
+    if len(mesh.faces) < 4:
+        raise MagicError(Code.BAD_MESH, f"triangles of {what}", len(mesh.faces), "at least 4, around a body")
+    used = mesh.vertices[np.unique(mesh.faces)]
+    centred = used - used.mean(axis=0)
+    along = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    longest, thinnest = np.ptp(along[:, 0]), np.ptp(along[:, 2])
+    if not thinnest > FLAT * longest:
+        raise MagicError(Code.BAD_MESH, f"thickness of {what} in m", float(f"{thinnest:.3g}"), f"above {FLAT * longest:.2g}; it is flat")
+
+
 def concatenate(meshes: list[Mesh] | tuple[Mesh, ...]) -> Mesh:
     """One mesh that holds all the given ones; colours are kept where all have them."""
     if not meshes:

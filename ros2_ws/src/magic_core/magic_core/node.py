@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import signal
 import sys
 import threading
 import time
 import traceback
+from array import array
 from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from magic_core import presence
+from magic_core.diagnostics import Diagnostics, status
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
 from magic_core.robot import RobotConfig
@@ -27,6 +33,22 @@ from magic_core.robot import RobotConfig
 WINDING_DOWN, ENDING = 5.0, 2.0
 #: What the last answers of a node that has wound down are given to go out, s.
 LAST_WORDS = 0.1
+
+#: How long an action server keeps a result for a client that has not asked for it yet, s.  Clients ask when their goal is accepted;
+#: rclpy's own 900 s keep hundreds of plans of some MB each.
+RESULT_TIMEOUT = 10
+
+#: The arm's parameters: one file gives them to every node, to those as well that need some of them or none.
+ROBOT_PARAMETERS = frozenset(
+    "robot." + name
+    for name in (
+        *("urdf", "srdf", "package_root", "move_group", "closing_axis", "opening", "home"),
+        *("acceleration", "velocity_scale", "acceleration_scale"),
+    )
+)
+
+#: Between looks at whether anybody still waits for a goal's result, s.
+ABANDONED_PERIOD = 0.25
 
 #: Set when a signal has told this process to end.
 _TOLD_TO_END = threading.Event()
@@ -54,6 +76,7 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
     status = 0
     try:
         node = node_type()
+        refuse_unknown_parameters(node)
         executor.add_node(node)
         spinning = True
         # The wait is in C, and Python only runs a signal's handler between its own instructions: without
@@ -102,12 +125,14 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
-    read_only: bool = False,
+    read_only: bool = True,
 ) -> Any:
     """Declare a parameter with its description and range, and return its value.
 
-    A value of a read-only or start-up parameter that is not one of ``choices`` raises ``BAD_REQUEST``.
+    A parameter that is read at the start alone is ``read_only``: to set it later is refused instead of having no effect.
+    A value that is not one of ``choices`` raises ``BAD_REQUEST``.
     """
+    _fit(node, name, default, choices)
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
     if choices is not None:
         descriptor.additional_constraints = "one of: " + ", ".join(choices)
@@ -120,6 +145,46 @@ def parameter(
     if choices is not None and value not in choices:
         raise MagicError(Code.BAD_REQUEST, f"parameter {name}", value, choices)
     return value
+
+
+def _fit(node: Node, name: str, default: Any, choices: tuple[str, ...] | None) -> None:
+    """Bring a given value to the type that is meant, where YAML has another one for how it is written.
+
+    Whole numbers for floats; ``y``, ``n``, ``on`` and the like, which are truths in the YAML of parameter files, for the choice that
+    is so written: the tools that dump parameters do not quote them.
+    """
+    given = node._parameter_overrides.get(name)
+    if given is None:
+        return
+    value: Any = given.value
+    if isinstance(default, float) and type(value) is int:
+        value = float(value)
+    elif isinstance(default, (list, tuple)) and default and isinstance(default[0], float) and isinstance(value, (list, tuple, array)):
+        value = [float(v) for v in value] if all(type(v) is int for v in value) else value
+    elif isinstance(default, str) and isinstance(value, bool):
+        words = {True: ("y", "yes", "on", "true"), False: ("n", "no", "off", "false")}[value]
+        meant = [c for c in choices or () if c.lower() in words]
+        value = meant[0] if len(meant) == 1 else value
+    if value is not given.value:
+        node._parameter_overrides[name] = Parameter(name, value=value)
+
+
+def refuse_unknown_parameters(node: Node) -> None:
+    """Raise BAD_REQUEST where a node was given a parameter that it has not declared, naming those that are written alike.
+
+    rclpy ignores such a parameter: ``excute:=true`` would seem to be heeded.  The arm's parameters are given to all nodes.
+    """
+    unknown = sorted(name for name in node._parameter_overrides if not node.has_parameter(name) and name not in ROBOT_PARAMETERS)
+    if not unknown:
+        return
+    declared = sorted(set(node.list_parameters([], 0).names) | ROBOT_PARAMETERS)
+    near = list(dict.fromkeys(match for name in unknown for match in difflib.get_close_matches(name, declared, 3, 0.5)))
+    raise MagicError(
+        Code.BAD_REQUEST,
+        f"{node.get_name()} has no such parameter",
+        ", ".join(unknown),
+        (f"written alike: {', '.join(near)}; " if near else "") + f"all: `ros2 param list` of {node.get_fully_qualified_name()}",
+    )
 
 
 def robot_parameters(node: Node) -> dict[str, Any]:
@@ -141,16 +206,27 @@ def robot_parameters(node: Node) -> dict[str, Any]:
 
 
 class Goal:
-    """What a handler needs of rclpy's handle of its goal.  ``is_cancel_requested`` is also true where the process is told to end."""
+    """What a handler needs of rclpy's handle of its goal.
 
-    def __init__(self, handle: Any) -> None:
+    ``is_cancel_requested`` is also true where the process is told to end, and where all have gone who could take the answer: a
+    client that was killed would otherwise keep this server busy for those that come after it.
+    """
+
+    def __init__(self, handle: Any, clients: presence.Watch) -> None:
         self._handle = handle
+        self._clients = clients
+        self._looked = 0.0
+        self._abandoned = False
         self.request = handle.request
 
     @property
     def is_cancel_requested(self) -> bool:
         """Whether the work is to stop."""
-        return _TOLD_TO_END.is_set() or bool(self._handle.is_cancel_requested)
+        now = time.monotonic()
+        if not self._abandoned and now - self._looked > ABANDONED_PERIOD:  # asked between any two steps of the work
+            self._looked = now
+            self._abandoned = self._clients.gone()
+        return self._abandoned or _TOLD_TO_END.is_set() or bool(self._handle.is_cancel_requested)
 
     def publish_feedback(self, feedback: Any) -> None:
         """As rclpy's."""
@@ -159,6 +235,8 @@ class Goal:
 
 class OneGoalServer:
     """An action server that works on one goal at a time; a goal during another one is answered BUSY at once, nothing is queued.
+
+    How it goes is told on ``/diagnostics`` at 1 Hz.
 
     The action's result has the fields ``code``, ``message`` and ``seconds``.  ``work(goal, result)`` fills the result in; an
     exception out of it becomes its code and message.  Cancel requests are accepted; ``work`` looks for them and raises CANCELED.
@@ -176,6 +254,10 @@ class OneGoalServer:
     ) -> None:
         self._node, self._action, self._work, self._message, self._aborts = node, action, work, busy, aborts
         self._busy = threading.Lock()
+        self._name = node.resolve_service_name(name)
+        self._answered = self._refused = 0
+        self._last = ""
+        group = ReentrantCallbackGroup()
         self._server = ActionServer(
             node,
             action,
@@ -183,27 +265,42 @@ class OneGoalServer:
             self._execute,
             goal_callback=lambda _goal: GoalResponse.ACCEPT,
             cancel_callback=lambda _handle: CancelResponse.ACCEPT,
-            callback_group=ReentrantCallbackGroup(),
+            callback_group=group,
+            result_timeout=RESULT_TIMEOUT,
         )
+        self._diagnostics = Diagnostics(node, self._report, group)
 
     def destroy(self) -> None:
         """Take the server down, before its node."""
         self._server.destroy()
 
+    def _report(self) -> list[DiagnosticStatus]:
+        servers = self._node.count_services(f"{self._name}/_action/send_goal")
+        message = f"at work on a goal of {self._name}" if self._busy.locked() else f"waiting for goals of {self._name}"
+        level = DiagnosticStatus.OK
+        if servers > 1:
+            message, level = f"{servers} servers of {self._name}: each carries every goal out (allowed: 1)", DiagnosticStatus.ERROR
+        values = {"goals answered": self._answered, "refused as BUSY": self._refused, "last answer": self._last or "none yet"}
+        return [status(self._node, "goals", level, message, values)]
+
     def _execute(self, handle: Any) -> Any:
         started = time.monotonic()
         result = self._action.Result()
         if not self._busy.acquire(blocking=False):
+            self._refused += 1
             result.code, result.message = int(Code.BUSY), self._message
             handle.abort()
             return result
         try:
-            self._work(Goal(handle), result)
+            clients = presence.Watch(lambda: presence.askers(self._node, f"{self._name}/_action/get_result"))
+            self._work(Goal(handle, clients), result)
         except Exception as error:  # no handler lets an exception out
             result.code, result.message = describe(self._node, error)
         finally:
             self._busy.release()
         result.seconds = time.monotonic() - started
+        self._answered += 1
+        self._last = f"{result.code}: {result.message} ({result.seconds:.2f} s)"
         if result.code == Code.CANCELED and handle.is_cancel_requested:
             handle.canceled()
         elif self._aborts(result.code):

@@ -57,16 +57,17 @@ def action_send_goal(arguments: list[str]) -> int:
         print("Waiting for an action server to become available...", flush=True)
         connect.wait_for(client.server_is_ready, None)
         print(f"Sending goal:\n     {messages.to_yaml(goal)}", flush=True)
+        server = connect.server_of(node, f"{parsed.action_name}/_action/send_goal")
         sending = client.send_goal_async(goal, feedback if parsed.feedback else None)
         handle = result = None
         try:
-            handle = connect.spin_until(node, sending)
+            handle = connect.spin_until(node, sending, server=server)
             if not handle.accepted:
                 print("Goal was rejected.")
                 return 0
             print(f"Goal accepted with ID: {bytes(handle.goal_id.uuid).hex()}\n", flush=True)
             result = handle.get_result_async()
-            answer = connect.spin_until(node, result)
+            answer = connect.spin_until(node, result, server=server)
         except KeyboardInterrupt:
             if handle is None:
                 # The goal may be on its way: what has been accepted meanwhile is canceled too.

@@ -11,6 +11,10 @@ from typing import Any, TypeVar
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
+from magic_core import presence
+from magic_core.presence import Watch
+from magic_ros2cli.errors import CommandError
+
 T = TypeVar("T")
 
 #: How long a named node, topic or service may take to be discovered, s.
@@ -61,17 +65,26 @@ def wait_for(condition: Callable[[], T], seconds: float | None = DISCOVERY) -> T
         time.sleep(0.02)
 
 
-def spin_until(made: Any, future: Any, seconds: float | None = None) -> Any | None:
+def spin_until(made: Any, future: Any, seconds: float | None = None, server: Watch | None = None) -> Any | None:
     """Spin the node until the future is done; its result, or None where the time was over (``seconds`` None: for ever).
 
-    In short steps: a signal is seen by Python only between two waits.
+    In short steps: a signal is seen by Python only between two waits.  ``server``: who is to answer; raises :class:`CommandError`
+    once it has gone.
     """
     deadline = None if seconds is None else time.monotonic() + seconds
     while not future.done():
         if deadline is not None and time.monotonic() > deadline:
             return None
         rclpy.spin_once(made, timeout_sec=0.1)
+        if server is not None and not future.done() and server.gone():
+            raise CommandError("The server has gone: it will not answer any more")
     return future.result()
+
+
+def server_of(made: Any, service: str) -> Watch:
+    """Those who serve a service now, to be given to :func:`spin_until`."""
+    name = made.resolve_service_name(service)
+    return Watch(lambda: presence.servers(made, name))
 
 
 def absolute(name: str) -> str:

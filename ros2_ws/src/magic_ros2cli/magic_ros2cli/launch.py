@@ -251,7 +251,7 @@ class Launcher:
 
                 path = str(self._temporary / f"{running.label}_{index}.yaml")
                 content = {"/**": {"ros__parameters": {parameters.name: parameters.value}}}
-                Path(path).write_text(yaml.safe_dump(content))
+                Path(path).write_text(parameters.text or yaml.safe_dump(content))
             result += ["--params-file", path]
         return ["--ros-args", *result] if result else []
 

@@ -2,7 +2,7 @@
 
 What is read (ROS 2's XML format, as far as this project uses it): ``launch``, ``arg`` (name, default, value, description, ``choice``),
 ``let``, ``include`` (file, ``arg``), ``group`` (scoped), ``push_ros_namespace``, ``set_env``, ``set_remap``, ``node`` (pkg, exec, name,
-namespace, args, ros_args, output, respawn, respawn_delay, launch-prefix, on_exit; ``param``, ``remap``, ``env``), ``executable`` (cmd,
+namespace, args, ros_args, output, respawn, respawn_delay, launch-prefix, on_exit; ``param`` (also from files, with allow_substs), ``remap``, ``env``), ``executable`` (cmd,
 cwd, name, output, ...; ``env``), ``log`` (message); ``if`` and ``unless`` on each; the substitutions ``var``, ``env``, ``find-pkg-share``,
 ``find-pkg-prefix``, ``dirname``, ``eval``, ``equals``, ``not-equals``, ``not``, ``and``, ``or``. Anything else is refused by name.
 """
@@ -38,9 +38,10 @@ class Argument:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of a node: a YAML file, or one named value (YAML text)."""
+    """Parameters of a node: a YAML file, the text of one (with substitutions done), or one named value."""
 
     file: str = ""
+    text: str = ""
     name: str = ""
     value: Any = None
 
@@ -275,11 +276,13 @@ class _Reader:
         self.result.processes.append(replace(process, is_node=True, ros_arguments=tuple(ros), parameters=tuple(parameters)))
 
     def parameters(self, entity: ElementTree.Element, scope: _Scope, prefix: str = "") -> list[Parameters]:
-        self.allow(entity, {"name", "value", "from", "type", "if", "unless"})
+        self.allow(entity, {"name", "value", "from", "allow_substs", "type", "if", "unless"})
         if "from" in entity.attrib:
             path = self.attribute(entity, "from", scope)
             if not Path(path).is_file():
                 raise self.wrong(f"the parameter file {path} does not exist")
+            if self.truth(self.attribute(entity, "allow_substs", scope, "false"), "allow_substs"):
+                return [Parameters(text=self.substituted(path, scope))]
             return [Parameters(file=path)]
         name = prefix + self.attribute(entity, "name", scope)
         if "value" not in entity.attrib:
@@ -292,6 +295,17 @@ class _Reader:
                 name=name, value=self.typed(name, self.attribute(entity, "value", scope), self.attribute(entity, "type", scope, "auto"))
             )
         ]
+
+    def substituted(self, path: str, scope: _Scope) -> str:
+        """The text of a parameter file with its substitutions done; comments are left out first, as launch_ros does."""
+        import yaml
+
+        try:
+            text = self.substitute(yaml.safe_dump(yaml.safe_load(Path(path).read_text())), scope)
+            yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise self.wrong(f"the parameter file {path} is no YAML: {error}") from None
+        return text
 
     def typed(self, name: str, text: str, kind: str) -> Any:
         import yaml

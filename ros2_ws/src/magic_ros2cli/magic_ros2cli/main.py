@@ -7,6 +7,8 @@ import os
 import signal
 import sys
 
+from magic_core import environment
+from magic_core.errors import MagicError
 from magic_ros2cli.errors import CommandError
 
 #: command -> verb -> module that has ``<command>_<verb>(arguments) -> int``; a command without verbs has the verb "".
@@ -16,7 +18,7 @@ VERBS: dict[str, dict[str, str]] = {
     "interface": {"show": "interface"},
     "launch": {"": "launch"},
     "node": {"list": "node"},
-    "param": {"get": "param", "list": "param", "set": "param"},
+    "param": {"dump": "param", "get": "param", "list": "param", "set": "param"},
     "run": {"": "run"},
     "service": {"call": "service", "list": "service", "type": "service"},
     "topic": {"echo": "topic", "hz": "topic", "info": "topic", "list": "topic", "pub": "topic"},
@@ -52,6 +54,10 @@ def dispatch(arguments: list[str]) -> int:
         verb, rest = rest[0], rest[1:]
         if verb not in verbs:
             raise CommandError(f"ros2 {command}: unknown verb '{verb}'; there are: {', '.join(verbs)}", 2)
+    try:
+        environment.prepare()
+    except MagicError as error:
+        raise CommandError(f"ros2: {error}") from None
     module = importlib.import_module(f"magic_ros2cli.{verbs[verb]}")
     return getattr(module, f"{command}_{verb}".rstrip("_"))(rest) or 0
 

@@ -1,4 +1,4 @@
-"""``ros2 param`` list, get and set."""
+"""``ros2 param`` list, get, set and dump."""
 
 from __future__ import annotations
 
@@ -116,6 +116,57 @@ def param_get(arguments: list[str]) -> int:
     if not answer.values:
         raise CommandError("Parameter not set")
     print(text_of(answer.values[0], parsed.hide_type))
+    return 0
+
+
+def plain(value: ParameterValue) -> Any:
+    """A parameter value as YAML has it; None where it is not set."""
+    if value.type not in TYPES:
+        return None
+    found = getattr(value, TYPES[value.type][1])
+    if value.type == ParameterType.PARAMETER_BYTE_ARRAY:
+        return [int.from_bytes(b, "little") for b in found]
+    return found if isinstance(found, (bool, int, float, str)) else list(found)
+
+
+class _Quoting(yaml.SafeDumper):
+    """Quotes every text: ROS's reader of parameter files takes ``y``, ``on`` and the like for truths, PyYAML does not."""
+
+
+_Quoting.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
+
+
+def _nested(values: dict[str, Any]) -> dict[Any, Any]:
+    """Names with dots as maps of maps.  Keys are left unquoted."""
+    result: dict[Any, Any] = {}
+    for name, value in sorted(values.items()):
+        *outer, last = name.split(".")
+        place = result
+        for part in outer:
+            place = place.setdefault(_Key(part), {})
+        place[_Key(last)] = value
+    return result
+
+
+class _Key(str):
+    """A key of a dumped file."""
+
+
+_Quoting.add_representer(_Key, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", str(text)))
+
+
+def param_dump(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="ros2 param dump", description="Show all of the parameters of a node in a YAML file format, with which it can be started again"
+    )
+    parser.add_argument("node_name", help="name of the ROS node")
+    parsed = parser.parse_args(arguments)
+    target = connect.absolute(parsed.node_name)
+    with connect.node() as node:
+        names = list(_call(node, target, ListParameters, "list_parameters", ListParameters.Request()).result.names)
+        answer = _call(node, target, GetParameters, "get_parameters", GetParameters.Request(names=names))
+    values = {name: plain(value) for name, value in zip(names, answer.values, strict=True) if value.type in TYPES}
+    print(yaml.dump({_Key(target): {_Key("ros__parameters"): _nested(values)}}, Dumper=_Quoting, default_flow_style=False), end="")
     return 0
 
 

@@ -58,7 +58,7 @@ def service_call(arguments: list[str]) -> int:
         while True:
             print(f"requester: making request: {request!r}\n", flush=True)
             start = time.monotonic()
-            response = connect.spin_until(node, client.call_async(request))
+            response = connect.spin_until(node, client.call_async(request), server=connect.server_of(node, parsed.service_name))
             print(f"response:\n{response!r}\n", flush=True)
             if parsed.rate is None:
                 return 0

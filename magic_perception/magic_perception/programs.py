@@ -1,0 +1,7 @@
+"""The package's executables, which import the rest of it only when they have begun."""
+
+from magic_core.entry import program
+
+perception = program("magic_perception.node")
+perceive_images = program("magic_perception.perceive_images")
+evaluate = program("magic_perception.evaluate")

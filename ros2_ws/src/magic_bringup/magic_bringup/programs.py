@@ -1,0 +1,9 @@
+"""The package's executables, which import the rest of it only when they have begun."""
+
+from magic_core.entry import program
+
+strategy_server = program("magic_bringup.strategy_server")
+report = program("magic_bringup.report")
+rgbd_to_bag = program("magic_bringup.rgbd_to_bag")
+bag_player = program("magic_bringup.bag_player")
+bag_recorder = program("magic_bringup.bag_recorder")
