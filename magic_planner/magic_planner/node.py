@@ -16,7 +16,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import check_solid
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
-from magic_core.robot import PANDA_ACCELERATION, RobotConfig
+from magic_core.robot import RobotConfig
 from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
@@ -64,9 +64,6 @@ class PlannerNode(Node):
         started = time.monotonic()
         config = RobotConfig(
             **robot_parameters(self),
-            acceleration=tuple(
-                parameter(self, "robot.acceleration", list(PANDA_ACCELERATION), "Acceleration limits, rad/s^2, one a joint or one for all.")
-            ),
             velocity_scale=parameter(self, "robot.velocity_scale", 0.3, "Share of the velocity limits that is used.", low=0.01, high=1.0),
             acceleration_scale=parameter(
                 self, "robot.acceleration_scale", 0.2, "Share of the acceleration limits that is used.", low=0.01, high=1.0

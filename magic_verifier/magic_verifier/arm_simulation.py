@@ -9,11 +9,12 @@ of the fingers.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
@@ -21,64 +22,85 @@ from magic_core.motion import MotionPlan
 from magic_core.robot import Description
 from magic_verifier.articulation import ARM, FINGERS, ArmOptions, Articulation, panda
 from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, Setup, fill_world, lifted_onto_table, phase_at, phase_start
-from magic_verifier.simulation import DYNAMIC
+from magic_verifier.simulation import DYNAMIC, KINEMATIC
 
 #: Tracking, torque, contacts and grasp are looked at every so many steps.
 WATCH_EVERY = 6
+#: Where a run begins with the tool in the hand the fingers begin farther apart by this (m), for a tool thicker than thought.
+WIDER = 0.008
+
+
+@dataclass(frozen=True)
+class Held:
+    """A tool in the hand: the moment of the trajectory in s, tool_from_tcp (4, 4), metres between the fingers."""
+
+    time: float
+    tool_from_tcp: NDArray[np.float64]
+    width: float
 
 
 class ArmRun:
     """One run of an arm plan; :meth:`advance` steps it once.
 
     ``time`` is the clock of the planned trajectory, which stands still while the
-    gripper closes; ``world.time`` goes on.
+    gripper closes; ``world.time`` goes on.  With ``held`` the run begins at that moment
+    of the trajectory with the tool in the hand, where the fingers close on it anew.
+    ``lag``: seconds by which the arm follows its command late.
     """
 
     variant = "arm"
 
-    def __init__(self, setup: Setup, plan: MotionPlan, options: ArmOptions | None, limits: Any, robot: Description | None = None) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        plan: MotionPlan,
+        options: ArmOptions | None,
+        limits: Any,
+        robot: Description | None = None,
+        held: Held | None = None,
+        lag: float = 0.0,
+    ) -> None:
         self.robot = robot = robot or panda()
         motion = plan.arm_motion
         if motion is None:
             raise MagicError(Code.BAD_MOTION, "plan", "without an arm motion", "an arm motion")
         positions = np.asarray(motion.positions, dtype=float)
         times = np.asarray(motion.times, dtype=float)
-        if tuple(motion.joint_names) != robot.names or positions.shape != (len(times), len(robot.names)) or len(times) < 2:
-            raise MagicError(
-                Code.BAD_MOTION,
-                "arm motion",
-                f"{len(times)} rows of {list(motion.joint_names)}",
-                f"two rows or more of {list(robot.names)}",
-            )
-        if not (np.all(np.isfinite(positions)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)):
-            raise MagicError(Code.BAD_MOTION, "arm motion", "times or positions", "finite positions at strictly increasing times")
-        self.setup = setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
+        if held is None:
+            setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
+        self.setup = setup
         self.options = options or ArmOptions()
         self.limits = limits
         self.phases = motion.phases or plan.tool_motion.phases
         self.duration = float(times[-1] - times[0])
-        if not self.duration <= 600:
-            raise MagicError(Code.BAD_SCENE, "length of the motion", f"{self.duration:.0f} s", "up to 600 s")
         self.grasp_time = float(motion.grasp_time)
         self.release_time = None if motion.release_time is None else float(motion.release_time)
         start = phase_start(self.phases, CONTACT_PHASES)
         self.contact_time = self.duration if start is None else start
         self._motion = motion
-        self.world = fill_world(setup, DYNAMIC)
+        self.world = fill_world(setup, DYNAMIC if held is None else KINEMATIC)
         self._arm = Articulation(self.world, robot, self.options)
         self._slides = np.array([joint.sliding for joint in robot.arm])
+        self._held = held
+        self._lag = round(lag * setup.settings.frequency)
         frequency = setup.settings.frequency
         clock = times[0] + np.arange(int(np.ceil(self.duration * frequency)) + 1) / frequency
         self._q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
         self._qd = np.gradient(self._q, 1.0 / frequency, axis=0) if len(self._q) > 1 else np.zeros_like(self._q)
-        self._index = 0
+        self._index = self._first = 0
         self._hold = 0.0
         self._quiet = 0.0
         self._closing = self._closed = self._open_again = False
         self._reference: NDArray[np.float64] | None = None
+        self._let_go_at: NDArray[np.float64] | None = None
         self._torque = np.zeros(len(robot.names))
         self._metrics = {"torque_ratio": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
-        self._arm.place(self._q[0])
+        if held is None:
+            self._arm.place(self._q[0])
+        else:
+            self._index = self._first = min(round(held.time * frequency), len(self._q) - 1)
+            self._arm.place(self._q[self._index], held.width + WIDER)
+            self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(held.tool_from_tcp))
 
     # ------------------------------------------------------------ what the goal tests ask
 
@@ -97,6 +119,16 @@ class ArmRun:
         """Whether the gripper has opened again."""
         return self._open_again
 
+    def hand_has_left(self) -> float:
+        """By how many metres the hand has gone away from where it let the tool go."""
+        return 0.0 if self._let_go_at is None else float(np.linalg.norm(self._arm.tcp()[:3, 3] - self._let_go_at))
+
+    def held(self) -> Held | None:
+        """The tool in the hand at this moment, to begin another run from; ``None`` where it is not."""
+        if self._reference is None or self._open_again:
+            return None
+        return Held(self.time, self._tool_from_tcp(), self._arm.width())
+
     def joints(self) -> NDArray[np.float64]:
         """(J + 2,): the arm's joints in rad (m), then the fingers in m."""
         return self._arm.joints()
@@ -109,7 +141,7 @@ class ArmRun:
 
     def advance(self) -> None:
         """One step."""
-        row = min(self._index, len(self._q) - 1)
+        row = min(max(self._index - self._lag, self._first), len(self._q) - 1)
         waiting = self._gripper()
         still = waiting or self._index >= len(self._q)
         command = self._q[row]
@@ -125,6 +157,7 @@ class ArmRun:
         """Open and close on time; whether the arm has to wait for the fingers."""
         if self.release_time is not None and self.time >= self.release_time and not self._open_again:
             self._open_again, self._closing = True, False
+            self._let_go_at = self._arm.tcp()[:3, 3].copy()
         if self._closed or self._open_again or self.time < self.grasp_time:
             return False
         self._closing = True
@@ -133,9 +166,23 @@ class ArmRun:
         self._quiet = self._quiet + dt if self._arm.finger_speed() < 0.002 and self._hold > 0.05 else 0.0
         if self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
             self._closed = True
+            if self._held is not None:
+                self.world.let_go(TOOL)
+                self._set_off()
             self._note_grasp()
             return False
         return True
+
+    def _set_off(self) -> None:
+        """Arm and tool as fast as they are at this moment of the trajectory, which the run begins in the middle of."""
+        row, dt = self._index, self.world.timestep
+        speed = self._qd[row]
+        self._arm.set_speed(speed)
+        now, soon = self.robot.forward(np.stack([self._q[row], self._q[row] + dt * speed]))
+        step = soon @ transforms.inverse(now)
+        middle = self.world.centre_of_mass(TOOL)
+        self.world.set_velocity(TOOL, (transforms.apply(step, middle) - middle) / dt)
+        self.world.set_turning(TOOL, Rotation.from_matrix(step[:3, :3]).as_rotvec() / dt)
 
     def _note_grasp(self) -> None:
         width = self._arm.width()

@@ -79,7 +79,7 @@ class Articulation:
 
     def __init__(self, world: World, robot: Description, options: ArmOptions) -> None:
         """Raises BAD_REQUEST for a description that the engine cannot load or gains that do not fit it."""
-        self._options = options
+        self._options, self._robot = options, robot
         gains = options.gains(robot)
         self._world = world  # the engine's bodies live no longer than their world
         self.body = body = _load(world, robot)
@@ -129,11 +129,18 @@ class Articulation:
 
     # ------------------------------------------------------------ state
 
-    def place(self, q: NDArray[np.float64]) -> None:
-        """Put the arm at q (J,), the fingers open, at rest."""
+    def place(self, q: NDArray[np.float64], width: float | None = None) -> None:
+        """Put the arm at q (J,), at rest, the fingers open or ``width`` metres apart."""
         positions = np.zeros(self._size)
-        positions[self._arm], positions[self._fingers] = q, self._opened
+        positions[self._arm] = q
+        positions[self._fingers] = self._opened if width is None else self._robot.finger_positions(width)
         self.body.set_qpos(positions)
+
+    def set_speed(self, speed: NDArray[np.float64]) -> None:
+        """Set the velocities of the arm's joints (J,), the fingers at rest."""
+        velocities = np.zeros(self._size)
+        velocities[self._arm] = speed
+        self.body.set_qvel(velocities)
 
     def arm_state(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions and velocities of the arm's joints, (J,) each, rad or m, and per second."""

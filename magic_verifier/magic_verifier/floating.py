@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, Phase
 from magic_core.scene import SceneObject
 from magic_core.strategy import Physics
-from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, Probe, Settings, World, to_poses, usable_pieces
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, Probe, Settings, World, sphere_of, to_poses, usable_pieces
 
 TOOL = "tool"
 TARGET = "target"
@@ -28,28 +29,27 @@ TABLE = "table"
 
 #: Phases in which the tool may touch what it acts on.
 CONTACT_PHASES = ("contact", "goal", "release", "retreat")
-
-
-@dataclass(frozen=True)
-class Perturbation:
-    """What a perturbed run draws: standard deviations of the target's place on the table (m) and turn about the
-    vertical (rad), and the half range by which frictions and densities are scaled."""
-
-    position: float = 0.002
-    turn: float = 0.03
-    friction: float = 0.2
-    density: float = 0.2
+#: A tool that overlaps what it is let go on, by no more than is allowed, is pushed out of it so fast (m/s): the fall of a tenth of a
+#: millimetre.  The solver's own speed for bodies that were driven into each other would throw it up by a centimetre.
+PUSHED_OUT = 0.05
 
 
 @dataclass(frozen=True)
 class Body:
     """An object ready for physics: hull corners in its own frame and its pose; ``mesh``, where it is given, is the exact
-    surface that it collides by instead, as long as it is not free."""
+    surface that it collides by instead, as long as it is not free; ``centre_shift`` (3,): by how much its centre of mass is
+    off that of the filled hulls, metres in its own frame."""
 
     id: str
     hulls: tuple[NDArray[np.float64], ...]
     world_from_object: NDArray[np.float64]
     mesh: Mesh | None = None
+    centre_shift: NDArray[np.float64] | None = None
+
+    @cached_property
+    def balls(self) -> tuple[tuple[NDArray[np.float64], float] | None, ...]:
+        """Of each hull the ball that it stands for, ``None`` where it is none."""
+        return tuple(sphere_of(hull) for hull in self.hulls)
 
     @property
     def corners(self) -> NDArray[np.float64]:
@@ -137,28 +137,6 @@ def settled(item: SceneObject, table: NDArray[np.float64], physics: Physics, sec
     return replace(item, world_from_object=pose, world_from_box=moved @ item.world_from_box)
 
 
-def perturbed(setup: Setup, perturbation: Perturbation, rng: np.random.Generator) -> Setup:
-    """A setup with the target displaced and friction and densities scaled; a fixed target stays where it is."""
-    scale = 1 + rng.uniform(-1, 1, 3) * [perturbation.friction, perturbation.density, perturbation.density]
-    shift, turn = rng.normal(0, perturbation.position, 2), rng.normal(0, perturbation.turn)
-    physics = replace(
-        setup.physics,
-        friction=setup.physics.friction * float(scale[0]),
-        tool_density=setup.physics.tool_density * float(scale[1]),
-        target_density=setup.physics.target_density * float(scale[2]),
-    )
-    if setup.target_kind == STATIC:
-        return replace(setup, physics=physics)
-    pose = setup.target.world_from_object
-    origin = transforms.apply(pose, setup.target.centre)
-    about = (
-        transforms.make(translation=origin + np.array([*shift, 0.0]))
-        @ transforms.from_rpy(0, 0, turn)
-        @ transforms.make(translation=-origin)
-    )
-    return replace(setup, physics=physics, target=replace(setup.target, world_from_object=about @ pose))
-
-
 def fill_world(setup: Setup, tool_kind: str) -> World:
     """A world with table, obstacles, target and tool."""
     physics = setup.physics
@@ -166,9 +144,12 @@ def fill_world(setup: Setup, tool_kind: str) -> World:
     world.add_table(setup.table, physics.friction, TABLE)
     for obstacle in setup.obstacles:
         world.add(obstacle.id, list(obstacle.hulls), obstacle.world_from_object, STATIC, 1000.0, physics.friction)
-    world.add(TARGET, list(setup.target.hulls), setup.target.world_from_object, setup.target_kind, physics.target_density, physics.friction)
-    tool = setup.tool
-    world.add(TOOL, list(tool.hulls), tool.world_from_object, tool_kind, physics.tool_density, physics.friction, tool.mesh)
+    for name, body, kind, density in (
+        (TARGET, setup.target, setup.target_kind, physics.target_density),
+        (TOOL, setup.tool, tool_kind, physics.tool_density),
+    ):
+        hulls = list(body.hulls)
+        world.add(name, hulls, body.world_from_object, kind, density, physics.friction, body.mesh, body.balls, body.centre_shift)
     return world
 
 
@@ -206,13 +187,18 @@ class FloatingRun:
     """One run of a floating plan; :meth:`advance` steps it once.
 
     ``duration`` is the motion's length in seconds; the run may be advanced beyond
-    it, the tool then stays where it is (or free, if it was released).
+    it, the tool then stays where it is (or free, if it was released).  ``start``: the
+    moment of the motion at which the run begins, after the tool has come along without
+    touching anything.  ``tool_from_held``: where the tool is in the hand, seen from where
+    it is thought to be.
     """
 
     variant = "fg"
 
-    def __init__(self, setup: Setup, plan: MotionPlan) -> None:
+    def __init__(self, setup: Setup, plan: MotionPlan, start: float = 0.0, tool_from_held: NDArray[np.float64] | None = None) -> None:
         motion = plan.tool_motion
+        if tool_from_held is not None:
+            motion = replace(motion, world_from_tool=_clear_of_table(setup, motion.world_from_tool, tool_from_held))
         self.setup = setup
         self.phases = motion.phases
         self.duration = float(motion.times[-1] - motion.times[0])
@@ -221,10 +207,12 @@ class FloatingRun:
         self.release_time = phase_start(self.phases, ("release",))
         self.contact_time = self._contact_time()
         self._motion = motion
-        self.world = fill_world(replace(setup, tool=replace(setup.tool, world_from_object=motion.world_from_tool[0])), KINEMATIC)
-        steps = int(np.ceil(self.duration * setup.settings.frequency)) + 1
-        at = motion.times[0] + np.arange(1, steps + 1) / setup.settings.frequency
-        self._targets = to_poses(transforms.interpolate(motion.times, motion.world_from_tool, at))
+        self._start = start = float(np.clip(start, 0.0, self.duration))
+        steps = int(np.ceil((self.duration - start) * setup.settings.frequency)) + 1
+        at = motion.times[0] + start + np.arange(steps + 1) / setup.settings.frequency
+        poses = transforms.interpolate(motion.times, motion.world_from_tool, at)
+        self.world = fill_world(replace(setup, tool=replace(setup.tool, world_from_object=poses[0])), KINEMATIC)
+        self._targets = to_poses(poses[1:])
         self._released = False
 
     def _contact_time(self) -> float:
@@ -233,13 +221,13 @@ class FloatingRun:
 
     @property
     def time(self) -> float:
-        """Simulated seconds."""
-        return self.world.time
+        """Seconds on the clock of the motion."""
+        return self._start + self.world.time
 
     @property
     def phase(self) -> str:
         """The name of the present phase."""
-        return phase_at(self.phases, self.world.time)
+        return phase_at(self.phases, self.time)
 
     @property
     def released(self) -> bool:
@@ -251,6 +239,7 @@ class FloatingRun:
         if not self._released:
             if self.release_time is not None and self.time >= self.release_time:
                 self.world.let_go(TOOL)
+                self.world.component(TOOL).max_depenetration_velocity = PUSHED_OUT
                 self._released = True
             else:
                 self.world.move_to(TOOL, self._targets[min(self.world.steps, len(self._targets) - 1)])
@@ -259,6 +248,10 @@ class FloatingRun:
     def joints(self) -> NDArray[np.float64]:
         """(0,): there is no arm."""
         return np.zeros(0)
+
+    def hand_has_left(self) -> float:
+        """By how many metres the hand has gone away from where it let the tool go: there is no hand."""
+        return np.inf
 
     def intrusions(self, interval: float = 0.02, check: Callable[[float], None] = lambda _time: None) -> tuple[Intrusion, ...]:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
@@ -293,6 +286,32 @@ class FloatingRun:
                 if name:
                     note(name, depth, float(time))
         return tuple(worst.values())
+
+
+def _clear_of_table(setup: Setup, poses: NDArray[np.float64], tool_from_held: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The poses (T, 4, 4) of a tool held otherwise than thought, raised together so that it goes no deeper into the table than 0, or
+    than it was planned to: a hand gives way to the table by what it is off."""
+    held = poses @ tool_from_held
+    normal, corners = setup.table[:3], setup.tool.corners
+
+    def lowest(at: NDArray[np.float64]) -> float:
+        return float(((normal @ at[:, :3, :3]) @ corners.T + (at[:, :3, 3] @ normal)[:, None]).min() + setup.table[3])
+
+    depth = min(0.0, lowest(poses)) - lowest(held)
+    if depth > 0:
+        held[:, :3, 3] += depth * normal
+    return held
+
+
+def nears(setup: Setup, poses: NDArray[np.float64], times: NDArray[np.float64], within: float) -> float | None:
+    """The first of the times (T,) at which the tool's box comes within so many metres of that of target or obstacle."""
+    others = {
+        body.id: ([transforms.apply(body.world_from_object, body.corners) + s * within for s in (-1.0, 1.0)], np.eye(4))
+        for body in (setup.target, *setup.obstacles)
+    }
+    corners = setup.tool.corners
+    near = np.flatnonzero(_near(corners[ConvexHull(corners).vertices], poses, others))
+    return float(times[near[0]]) if len(near) else None
 
 
 def _near(

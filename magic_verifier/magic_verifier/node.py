@@ -19,10 +19,11 @@ from magic_core.node import OneGoalServer, describe, parameter, robot_parameters
 from magic_core.robot import Description, RobotConfig
 from magic_core.threads import one_thread
 from magic_interfaces.action import VerifyMotion
+from magic_verifier import motion_check, uncertainty
 from magic_verifier.articulation import ArmOptions, Articulation
-from magic_verifier.floating import Perturbation
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
-from magic_verifier.verification import DEFAULTS, Limits, Verdict, verify
+from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, Verdict, verify
+from magic_verifier.workers import Workers
 
 #: More repetitions than this in one goal are refused.
 MAX_REPETITIONS = 1000
@@ -47,16 +48,14 @@ class VerifierNode(Node):
         fg = parameter(self, "frequency", 240.0, "Steps per simulated second, floating gripper.", low=60.0, high=2000.0)
         arm = parameter(self, "arm_frequency", 240.0, "Steps per simulated second, arm.", low=120.0, high=2000.0)
         self._settings = {"fg": replace(DEFAULTS["fg"], frequency=fg), "arm": replace(DEFAULTS["arm"], frequency=arm)}
-        self._perturbation = Perturbation(
-            position=parameter(
-                self, "noise.position", 0.002, "Standard deviation in m of the target's place in perturbed runs.", low=0.0, high=0.1
-            ),
-            turn=parameter(
-                self, "noise.turn", 0.03, "Standard deviation in rad of the target's turn in perturbed runs.", low=0.0, high=3.2
-            ),
-            friction=parameter(self, "noise.friction", 0.2, "Half range of the friction's scale in perturbed runs.", low=0.0, high=0.9),
-            density=parameter(self, "noise.density", 0.2, "Half range of the densities' scale in perturbed runs.", low=0.0, high=0.9),
+        self._rollouts = parameter(
+            self, "rollouts", ROLLOUTS, "Rollouts at most of a goal that names no number.", low=1, high=MAX_REPETITIONS
         )
+        self._spreads = uncertainty.read(
+            parameter(self, "uncertainty", "", "YAML file of what rollouts draw; empty: the one that is installed, uncertainty.yaml.")
+            or None
+        )
+        workers = parameter(self, "workers", 2, "Processes that simulate, this one among them.", low=1, high=64)
         self._limits = Limits(
             overlap=parameter(
                 self, "limits.overlap", 0.0015, "Depth in m that the tool may be in static things before the contact.", low=0.0, high=0.1
@@ -69,7 +68,12 @@ class VerifierNode(Node):
             tracking_slide=parameter(
                 self, "limits.tracking_slide", 0.01, "Way in m that a sliding joint may lag behind its command.", low=0.0001, high=1.0
             ),
-            required_rate=parameter(self, "required_rate", 0.5, "Share of perturbed runs that must pass.", low=0.0, high=1.0),
+            give=parameter(
+                self, "limits.give", 0.003, "Depth in m that a floating tool that is off may be in static things.", low=0.0, high=0.1
+            ),
+            required_rate=parameter(
+                self, "required_rate", Limits.required_rate, "Least lower end of the success rate's interval.", low=0.0, high=0.99
+            ),
         )
         self._arm = ArmOptions(
             stiffness=tuple(
@@ -100,6 +104,7 @@ class VerifierNode(Node):
             # A verdict is an answer, whatever it says; only what could not be judged aborts.
             lambda code: code in UNJUDGED,
         )
+        self._pool = Workers(workers - 1)
         self._warm_up()
         self._threads = one_thread()
         self.get_logger().info("ready: waiting for goals of verify_motion")
@@ -107,6 +112,7 @@ class VerifierNode(Node):
     def destroy_node(self) -> None:
         """Take the action server down with the node."""
         self._server.destroy()
+        self._pool.close()
         super().destroy_node()
 
     def _warm_up(self) -> None:
@@ -129,6 +135,9 @@ class VerifierNode(Node):
         result.code, result.message = int(verdict.code), verdict.message
         result.success = verdict.success
         result.success_rate = float(verdict.success_rate)
+        result.rate_low, result.rate_high = float(verdict.rate_low), float(verdict.rate_high)
+        result.rollouts = len(verdict.runs)
+        result.failures = list(verdict.failures)
         result.metric_names = list(verdict.metrics)
         result.metric_values = [float(v) for v in verdict.metrics.values()]
         result.simulated = float(verdict.simulated)
@@ -150,6 +159,7 @@ class VerifierNode(Node):
             raise MagicError(Code.BAD_REQUEST, "object ids", ", ".join(ids), "ids that differ")
         table = convert.plane_from_msg(goal.table)
         plan = convert.plan_from_msg(goal.plan)
+        motion_check.check_trajectory(goal.plan.tool_trajectory, tool.id, plan.tool_motion)
         candidate = convert.candidate_from_msg(goal.candidate) if goal.candidate.tool_id else None
 
         def feedback(phase: str, simulated: float) -> None:
@@ -167,15 +177,17 @@ class VerifierNode(Node):
             candidate,
             plan,
             seed=int(goal.seed),
-            repetitions=int(goal.repetitions),
+            repetitions=int(goal.repetitions) or self._rollouts,
             deadline=started + (goal.timeout or self._timeout),
             cancel=lambda: handle.is_cancel_requested,
             progress=feedback,
             settings=self._settings[plan.variant],
-            perturbation=self._perturbation,
+            spreads=self._spreads,
             limits=self._limits,
             arm_options=self._arm,
             robot=self._robot,
+            pool=self._pool.executor,
+            workers=self._pool.count,
         )
         self.get_logger().info(
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -189,7 +190,7 @@ class World:
     """One simulation: bodies by name, stepped together.
 
     The pieces' hulls are computed once and can be handed on to another world
-    (``hulls`` of :meth:`add`), which is what perturbed repetitions do.
+    (``hulls`` of :meth:`add`), which is what rollouts do.
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
@@ -274,10 +275,14 @@ class World:
         density: float,
         friction: float,
         mesh: Mesh | None = None,
+        balls: Sequence[tuple[NDArray[np.float64], float] | None] | None = None,
+        centre_shift: NDArray[np.float64] | None = None,
     ) -> None:
         """Add a body of convex hulls (see :func:`usable_pieces`), corners (N, 3) in its own frame; density in kg/m^3.
 
-        ``mesh``: its exact surface, which a body that is not free may collide by instead of its hulls.
+        ``mesh``: its exact surface, which a body that is not free may collide by instead of its hulls.  ``balls``: what
+        :func:`sphere_of` says of each hull, where that is known.  ``centre_shift`` (3,): how far its centre of mass is from that of
+        its hulls, metres in its own frame.
         """
         physx = self._sapien.physx
         if not (np.isfinite(density) and 0 < density < 1e5):
@@ -298,8 +303,9 @@ class World:
             shape.contact_offset = self.settings.contact_offset
             shape.rest_offset = self.settings.rest_offset
             component.attach(shape)
-            hulls = []
-        balls = [sphere_of(corners) for corners in hulls]
+            hulls, balls = [], ()
+        if balls is None:
+            balls = [sphere_of(corners) for corners in hulls]
         for corners, ball in zip(hulls, balls, strict=True):
             if ball is not None:
                 shape = physx.PhysxCollisionShapeSphere(radius=ball[1], material=material)
@@ -323,6 +329,9 @@ class World:
             component.angular_damping = self.settings.rolling_damping if balls and all(balls) else self.settings.angular_damping
             component.max_depenetration_velocity = self.settings.max_depenetration_speed
             component.kinematic = kind == KINEMATIC
+            if centre_shift is not None:
+                middle = component.cmass_local_pose
+                component.cmass_local_pose = self._sapien.Pose(middle.p + np.asarray(centre_shift, dtype=np.float32), middle.q)
         self._register(name, component, world_from_object)
 
     def component(self, name: str) -> Any:
@@ -349,12 +358,34 @@ class World:
         """Set the linear velocity of a dynamic body."""
         self._bodies[name].linear_velocity = np.asarray(velocity, dtype=np.float32)
 
-    def place(self, name: str, world_from_object: NDArray[np.float64]) -> None:
-        """Put a dynamic body (4, 4) somewhere, at rest."""
+    def turning(self, name: str) -> NDArray[np.float64]:
+        """Angular velocity (3,) of a body in rad/s."""
+        return np.asarray(self._bodies[name].angular_velocity, dtype=float)
+
+    def set_turning(self, name: str, velocity: NDArray[np.float64]) -> None:
+        """Set the angular velocity of a dynamic body."""
+        self._bodies[name].angular_velocity = np.asarray(velocity, dtype=np.float32)
+
+    def place(self, name: str, pose: NDArray[np.float64]) -> None:
+        """Put a body somewhere, at rest where it is free."""
         component = self._bodies[name]
-        component.entity.pose = to_pose(world_from_object)
-        component.linear_velocity = np.zeros(3, np.float32)
-        component.angular_velocity = np.zeros(3, np.float32)
+        component.entity_pose = to_pose(pose)
+        if not component.kinematic:
+            component.linear_velocity = component.angular_velocity = np.zeros(3, np.float32)
+
+    def centre_of_mass(self, name: str) -> NDArray[np.float64]:
+        """World position (3,) of a body's centre of mass."""
+        component = self._bodies[name]
+        return np.asarray((component.entity_pose * component.cmass_local_pose).p, dtype=float)
+
+    def set_friction(self, name: str, friction: float) -> None:
+        """Give all of a body's surface another friction coefficient."""
+        for shape in self._bodies[name].collision_shapes:
+            shape.physical_material = self.material(friction)
+
+    def calm(self, name: str, damping: float) -> None:
+        """Take speed off a free body, linear and angular, by so much per second."""
+        self._bodies[name].linear_damping = self._bodies[name].angular_damping = float(damping)
 
     def move_to(self, name: str, pose: Any) -> None:
         """Where a kinematic body shall be after the next step (a sapien.Pose)."""
@@ -419,6 +450,15 @@ class World:
         """Whether two bodies were within ``within`` metres of each other in the last step."""
         pairs = ((first, second), (second, first))
         return any(p.separation <= within for pair in pairs for contact in self._contacts().get(pair, ()) for p in contact.points)
+
+    def touched_by(self, name: str, within: float = 0.0) -> tuple[str, ...]:
+        """Names of the bodies that were within ``within`` metres of one in the last step, sorted."""
+        found = {
+            first if second == name else second
+            for (first, second), contacts in self._contacts().items()
+            if name in (first, second) and any(p.separation <= within for contact in contacts for p in contact.points)
+        }
+        return tuple(sorted(found))
 
     def _contacts(self) -> dict[tuple[str, str], list[Any]]:
         """The last step's contacts by the names of their bodies, sorted once a step."""

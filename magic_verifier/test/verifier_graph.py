@@ -66,6 +66,14 @@ def verifier(folder, **parameters) -> Iterator:
         rclpy.try_shutdown()
 
 
+def slow_plan():
+    """A motion that takes minutes to carry out, and seconds to simulate."""
+    *_, plan = scenes.hooking("L")
+    motion = plan.tool_motion
+    phases = tuple(replace(phase, start=100 * phase.start, end=100 * phase.end) for phase in motion.phases)
+    return replace(plan, tool_motion=replace(motion, times=100 * motion.times, phases=phases))
+
+
 def goal_message(name="hooking", kind="L", tool=None, target=None, plan=None, **fields):
     """A goal that passes (an L hook that pulls), with some of it exchanged."""
     from magic_interfaces.action import VerifyMotion

@@ -15,10 +15,10 @@ class Settings:
     """What a run may take, and whether the arm is moved.
 
     strategies: folder of the strategies, empty: the installed ones.  top_k: candidates where the goal names no number.
-    attempts: grasps for one contact.  repetitions: simulations of one motion.  timeout: s for a whole run where the goal says
-    nothing.  presence: s to wait for a server that is not there.  objects, match, plan, verify: s for each.  grace: s that an
-    answer may come late.  objects_age: s that objects may be old where the arm begins to move.  object_tolerance: m that they
-    may have moved by then.
+    attempts: grasps for one contact.  repetitions: rollouts of one motion at most, 0: the verifier's own number.  timeout: s for
+    a whole run where the goal says nothing.  presence: s to wait for a server that is not there.  objects, match, plan, verify:
+    s for each.  grace: s that an answer may come late.  objects_age: s that objects may be old where the arm begins to move.
+    object_tolerance: m that they may have moved by then.
     """
 
     strategies: str
@@ -53,7 +53,9 @@ def read(node: Node) -> Settings:
         strategies=parameter(node, "strategies", "", "folder of the strategies; empty: the installed ones", read_only=True),
         top_k=count("top_k", 3, "candidates to try where the goal does not say", 50),
         attempts=count("attempts", 3, "grasps to try for one contact (variant arm)", 50),
-        repetitions=count("repetitions", 1, "simulations of one motion; above 1: perturbed ones", 1000),
+        repetitions=parameter(
+            node, "repetitions", 0, "rollouts of one motion at most; 0: the verifier's own number", low=0, high=1000, read_only=True
+        ),
         timeout=seconds("timeout", 120.0, "s for a whole run where the goal does not say"),
         presence=seconds("server_timeout", 5.0, "s to wait for a server that is not there"),
         objects=seconds("objects_timeout", 10.0, "s to wait for objects"),

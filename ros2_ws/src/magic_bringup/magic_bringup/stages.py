@@ -213,7 +213,7 @@ class Stages:
         if code == Code.OK and not result.success:
             code = Code.GOAL_NOT_REACHED
         message = pipeline.with_metrics(result.message, list(zip(result.metric_names, result.metric_values)))
-        return pipeline.Verdict(code, message, max(1, server.settings.repetitions))
+        return pipeline.Verdict(code, message, max(1, result.rollouts))
 
     def film(self, outcome_code: Code) -> Image | None:
         """The film strip of the last simulation: the verifier draws it from what it recorded when it gets the same goal again.

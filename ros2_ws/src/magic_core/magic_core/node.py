@@ -202,6 +202,9 @@ def robot_parameters(node: Node) -> dict[str, Any]:
         ),
         "opening": parameter(node, "robot.opening", default.opening, "Metres between the open fingers.", low=0.005, high=1.0),
         "home": tuple(parameter(node, "robot.home", list(default.home), "Home configuration, rad (m where a joint slides).")),
+        "acceleration": tuple(
+            parameter(node, "robot.acceleration", list(default.acceleration), "Acceleration limits, rad/s^2, one a joint or one for all.")
+        ),
     }
 
 

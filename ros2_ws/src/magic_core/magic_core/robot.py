@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
@@ -68,7 +69,8 @@ class RobotConfig:
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint of a URDF: parent_from_joint (4, 4), unit axis (3,), limits in rad or m, effort in Nm or N."""
+    """One joint of a URDF: parent_from_joint (4, 4), unit axis (3,), limits in rad or m, effort in Nm or N, velocity in rad/s or
+    m/s (infinite where the URDF gives none)."""
 
     name: str
     kind: str
@@ -79,6 +81,7 @@ class Joint:
     lower: float
     upper: float
     effort: float
+    velocity: float = math.inf
 
     @property
     def moves(self) -> bool:
@@ -243,6 +246,42 @@ class Description:
                 poses[joint.child] = poses[link] @ joint.parent_from_joint @ joint.motion(float(positions.get(joint.name, 0.0)))
         return poses
 
+    def forward(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """base_from_tip (N, 4, 4), the tip being the move group, for positions (N, J) of the arm's joints."""
+        positions = np.atleast_2d(np.asarray(positions, dtype=float))
+        column = {name: index for index, name in enumerate(self.names)}
+        chain, link = [], self.config.move_group
+        while link in self._above:
+            chain.insert(0, self._above[link])
+            link = self._above[link].parent
+        poses = np.tile(np.eye(4), (len(positions), 1, 1))
+        for joint in chain:
+            poses = poses @ joint.parent_from_joint
+            if joint.name not in column:
+                poses = poses @ joint.motion(0.0) if joint.moves else poses
+                continue
+            moved = np.tile(np.eye(4), (len(positions), 1, 1))
+            at = positions[:, column[joint.name]]
+            if joint.sliding:
+                moved[:, :3, 3] = at[:, None] * joint.axis
+            else:
+                moved[:, :3, :3] = Rotation.from_rotvec(at[:, None] * joint.axis).as_matrix()
+            poses = poses @ moved
+        return poses
+
+    @property
+    def acceleration(self) -> NDArray[np.float64]:
+        """(J,): limits of the joints' accelerations in rad/s^2 (m/s^2); raises BAD_REQUEST where there are more or fewer than joints.
+
+        A URDF has none: where nothing was set for an arm of another number of joints than the Panda's, the least of the Panda's.
+        """
+        found = np.asarray(self.config.acceleration, dtype=float)
+        if self.config.acceleration == PANDA_ACCELERATION and len(self.arm) != len(PANDA_ACCELERATION):
+            found = np.array([min(PANDA_ACCELERATION)])
+        if found.size not in (1, len(self.arm)) or not np.all(found > 0):
+            raise MagicError(Code.BAD_REQUEST, "acceleration limits", found.tolist(), f"1 or {len(self.arm)} numbers above 0")
+        return np.broadcast_to(found, (len(self.arm),)).copy()
+
     def finger_positions(self, width: float) -> NDArray[np.float64]:
         """(2,): where the fingers are when they are ``width`` metres apart, as far as they can be."""
         way = float(np.abs(self.opened - self.closed).sum())
@@ -386,4 +425,5 @@ def _joint(element: ET.Element) -> Joint:
         bound("lower"),
         bound("upper"),
         bound("effort"),
+        bound("velocity") or math.inf,
     )

@@ -1,0 +1,56 @@
+"""Processes that simulate rollouts beside this one."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor
+
+
+class Workers:
+    """So many processes (0: none), each with the physics engine loaded; :meth:`close` ends them.
+
+    They are spawned, not forked: a process with threads of ROS in it cannot be forked safely.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.executor: ProcessPoolExecutor | None = None
+        if count > 0:
+            context = multiprocessing.get_context("spawn")
+            self.executor = ProcessPoolExecutor(count, mp_context=context, initializer=_ready, initargs=(os.getpid(),))
+            for _ in range(count):  # a process is started with the first work that it is given
+                self.executor.submit(_nothing)
+
+    def close(self) -> None:
+        """End the processes; what they have begun they finish, and no one waits for it."""
+        if self.executor is not None:
+            self.executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _ready(parent: int) -> None:
+    """Load what the first rollout would otherwise wait for; leave signals to the process that asked for this one."""
+    import signal
+
+    from magic_core.threads import one_thread
+    from magic_verifier.articulation import panda
+    from magic_verifier.simulation import engine
+
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    one_thread()
+    engine()
+    panda()
+
+
+def _end_with(parent: int) -> None:
+    """End with the process that asked for this one, also where that was killed."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+def _nothing() -> None:
+    return

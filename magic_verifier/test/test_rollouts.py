@@ -1,0 +1,229 @@
+"""A verdict is a set of rollouts, each a function of its draw; how many are needed; what is said of those that fail."""
+
+import pickle
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import yaml
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_verifier import uncertainty, verification
+from magic_verifier.floating import Body, make_setup
+from magic_verifier.goals import Judgement
+from magic_verifier.uncertainty import ShapeError, Spread
+from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, passes, verify, wilson
+
+RNG = np.random.default_rng
+
+
+def verdict_of(scene, **options):
+    strategy, tool, target, *obstacles, plan = scene
+    return verify(strategy, tool, target, tuple(obstacles), scenes.TABLE, None, plan, **options)
+
+
+def test_a_good_motion_is_verified_with_its_interval():
+    verdict = verdict_of(scenes.hooking("L", noise=0.0))
+    assert verdict.success, verdict.message
+    count, passed = len(verdict.runs), sum(run.code == Code.OK for run in verdict.runs)
+    assert (verdict.rate_low, verdict.rate_high) == wilson(passed, count)
+    assert verdict.success_rate == passed / count
+    assert 8 <= count <= ROLLOUTS and verdict.rate_low >= Limits().required_rate
+    assert f"{passed} of {count} rollouts" in verdict.message
+    assert len({run.metrics["pulled_distance"] for run in verdict.runs}) == count, "no two draws are the same"
+
+
+def test_the_same_seed_gives_the_same_verdict_whoever_computes_it():
+    scene = scenes.hooking("L", noise=0.5)
+    alone = verdict_of(scene, seed=3, repetitions=6)
+    together = verdict_of(scene, seed=3, repetitions=6, pool=Backwards(), workers=3)
+    assert together.runs == alone.runs and together.message == alone.message
+    assert verdict_of(scene, seed=4, repetitions=6).runs[1:] != alone.runs[1:]
+
+
+def test_a_motion_that_fails_as_given_is_not_rolled_out():
+    verdict = verdict_of(scenes.hooking("bar"))
+    assert not verdict.success and len(verdict.runs) == 1
+    assert verdict.failures == ("1 of 1: the tool lost the target",)
+
+
+def test_too_few_rollouts_are_not_enough_and_one_is_judged_as_given():
+    scene = scenes.hooking("L", noise=0.0)
+    few = verdict_of(scene, repetitions=3)
+    assert (few.success, few.code) == (False, Code.NOT_SURE_ENOUGH)
+    assert "70 %" in few.message
+    one = verdict_of(scene, repetitions=1)
+    assert one.success and len(one.runs) == 1 and one.rate_low < 0.3
+
+
+class Backwards(Executor):
+    """Computes what it is given, the last first, when the first of it is asked for."""
+
+    def __init__(self):
+        self.given = []
+
+    def submit(self, work, /, *args, **options):
+        pool = self
+
+        class Late(Future):
+            def done(self):
+                while pool.given:
+                    future, call = pool.given.pop()
+                    future.set_result(call())
+                return super().done()
+
+        future = Late()
+        # By way of pickle, as another process gets it.
+        packed = pickle.dumps((work, args, options))
+
+        def call():
+            again, its_args, its_options = pickle.loads(packed)
+            return again(*its_args, **its_options)
+
+        self.given.append((future, call))
+        return future
+
+
+def probability(rate, most, required):
+    """How probable it is that a motion of that rate is verified, and how many rollouts that takes on average."""
+    undecided, verified, looked = {1: rate}, 0.0, 1 - rate
+    for count in range(2, most + 1):
+        following: dict[int, float] = {}
+        for passed, share in undecided.items():
+            for more, chance in ((1, rate), (0, 1 - rate)):
+                k, p = passed + more, share * chance
+                if decided(k, count, most, required) or count == most:
+                    verified += p * passes(k, count, required)
+                    looked += p * count
+                else:
+                    following[k] = following.get(k, 0.0) + p
+        undecided = following
+    return verified, looked
+
+
+@pytest.mark.parametrize(("rate", "verified"), [(0.5, 0.002), (0.7, 0.06), (0.9, 0.67), (0.95, 0.90), (0.98, 0.97)])
+def test_how_often_a_motion_is_verified_is_what_the_documentation_says(rate, verified):
+    found, looked = probability(rate, ROLLOUTS, Limits().required_rate)
+    assert found == pytest.approx(verified, abs=0.008)
+    assert looked < 12
+
+
+def test_intervals():
+    assert wilson(0, 0) == (0.0, 1.0)
+    assert wilson(19, 20) == pytest.approx((0.764, 0.991), abs=1e-3)
+    assert not decided(8, 8, 24, 0.7) and decided(9, 9, 24, 0.7)
+    assert decided(0, 2, 24, 0.7), "two failures and nothing else: the interval is below"
+    assert decided(1, 1, 3, 0.7), "three rollouts cannot show it"
+
+
+# ------------------------------------------------------------ what is drawn
+
+
+def test_spreads_have_their_widths_and_are_cut():
+    normal = Spread("normal", 0.5).draw(RNG(0), 20_000)
+    assert np.abs(normal).max() <= 1.0
+    assert normal.std() == pytest.approx(0.5 * 0.88, abs=0.01)  # of a normal cut at two widths
+    factor = Spread("factor", 0.2).draw(RNG(0), 20_000)
+    assert np.exp(-0.4) <= factor.min() and factor.max() <= np.exp(0.4) and np.median(factor) == pytest.approx(1, abs=0.01)
+    uniform = Spread("uniform", 0.02).draw(RNG(0), 20_000)
+    assert uniform.min() >= 0 and uniform.max() <= 0.02
+
+
+def test_what_was_seen_less_is_known_less():
+    found = uncertainty.read()
+    _, tool, target, _ = scenes.hooking("L")
+    known, camera = (found.eyes(replace(tool, source=source, confidence=1.0)) for source in ("known", "camera"))
+    assert known[0].pieces.width < camera[0].pieces.width
+    half = found.eyes(replace(tool, source="camera", confidence=0.5))
+    assert half[1] == pytest.approx(2.0) and camera[1] == 1.0
+    assert found.eyes(replace(tool, source="camera", confidence=float("nan")))[1] > half[1]
+    eyes = found.eyes(target)
+    spread = [np.std([uncertainty.draw(found, e, eyes, 0, k).tool_error.size for k in range(200)]) for e in (camera, half)]
+    assert spread[1] == pytest.approx(2 * spread[0], rel=0.01)
+
+
+def test_a_shape_error_does_what_it_says():
+    cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.004)], dtype=float)
+    plain = {"amplitudes": np.zeros((3, 3)), "vectors": np.ones((3, 3)), "phases": np.zeros(3)}
+    body = Body("plate", (cube, cube + [0.1, 0, 0]), np.eye(4))
+    thicker = ShapeError(np.zeros(3), 0.001, **plain).applied(body)
+    assert np.ptp(thicker.hulls[0], axis=0) == pytest.approx([0.101, 0.101, 0.005], abs=1e-9)
+    larger = ShapeError(np.array([0.002, 0, 0]), 0.0, **plain).applied(body)
+    assert np.ptp(larger.corners, axis=0) == pytest.approx([0.202, 0.1, 0.004], abs=1e-9)
+    waves = [
+        uncertainty.draw(uncertainty.read(), (uncertainty.read().camera, 1.0), (uncertainty.read().known, 1.0), 0, k).tool_error
+        for k in range(200)
+    ]
+    zero = [replace(w, size=np.zeros(3), thickness=0.0).applied(body).corners - body.corners for w in waves]
+    assert np.std(np.concatenate(zero)) == pytest.approx(0.002, rel=0.15), "the width of the pieces' places"
+
+
+def test_fixed_targets_are_displaced_and_free_ones_stay_on_the_table():
+    spreads = uncertainty.read()
+    for scene, fixed in ((scenes.hanging(), True), (scenes.hooking("L"), False)):
+        strategy, tool, target, _ = scene
+        setup = make_setup(tool, target, (), scenes.TABLE, strategy.physics, DEFAULTS["fg"])
+        for k in range(20):
+            drawn = uncertainty.draw(spreads, spreads.eyes(tool), spreads.eyes(target), 0, k)
+            moved = uncertainty.applied(drawn, setup).target
+            lowest = transforms.apply(moved.world_from_object, moved.corners)[:, 2].min()
+            shift = (moved.world_from_object - setup.target.world_from_object)[:3, 3]
+            assert np.linalg.norm(shift) > 0
+            assert fixed or lowest == pytest.approx(0.0, abs=1e-9)
+        assert not fixed or abs(shift[2]) > 0
+
+
+def test_every_entry_of_the_parameter_file_gives_its_reason(tmp_path):
+    def entries(found):
+        return [found] if "kind" in found else [e for value in found.values() if isinstance(value, dict) for e in entries(value)]
+
+    found = yaml.safe_load(uncertainty.FILE.read_text())
+    assert len(entries(found)) == 19
+    assert all(len(entry["reason"]) > 20 and entry["unit"] for entry in entries(found))
+    for change, words in (
+        (lambda f: f["friction"].update(kind="guess"), "friction"),
+        (lambda f: f["known"]["size"].update(width="wide"), "known.size"),
+        (lambda f: f.pop("lag"), "lag"),
+        (lambda f: f["camera"].pop("seen_less"), "seen_less"),
+    ):
+        changed = yaml.safe_load(uncertainty.FILE.read_text())
+        change(changed)
+        path = tmp_path / "changed.yaml"
+        path.write_text(yaml.safe_dump(changed))
+        with pytest.raises(MagicError) as error:
+            uncertainty.read(path)
+        assert error.value.code == Code.BAD_REQUEST and words in error.value.message
+        path.unlink()
+    with pytest.raises(MagicError):
+        uncertainty.read(tmp_path / "nowhere.yaml")
+
+
+# ------------------------------------------------------------ why they fail
+
+
+def test_the_parameter_that_separates_is_named():
+    strategy, tool, target, plan = scenes.hooking("L")
+    setup = make_setup(tool, target, (), scenes.TABLE, strategy.physics, DEFAULTS["fg"])
+    spreads = uncertainty.read()
+    eyes = spreads.eyes(tool), spreads.eyes(target)
+    task = verification.Task(strategy, setup, plan, Limits(), 0, spreads, eyes)
+    friction = [None, *(task.drawn(k).values(setup)["friction"] for k in range(1, 24))]
+    order = sorted(friction[1:])
+
+    def judged(low):
+        return [
+            Judgement(Code.DRIFT, "the target slid off sideways: by 20 mm")
+            if f is not None and f < low
+            else Judgement(Code.OK, "pulled: 280 mm")
+            for f in friction
+        ]
+
+    (reason,) = verification.reasons(task, judged((order[3] + order[4]) / 2))
+    between = f"{(order[3] + order[4]) / 2:.3g}"
+    assert reason == f"4 of 24: the target slid off sideways, at friction below {between}"
+    # One failure of 24 is the outermost of some parameter more often than not: nothing is named.
+    (reason,) = verification.reasons(task, judged((order[0] + order[1]) / 2))
+    assert reason == "1 of 24: the target slid off sideways"
