@@ -42,7 +42,7 @@ def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: i
     if not closed(mesh):
         mesh = level_surface(field, axes, 0.5)
     mesh = _thinned(mesh, faces)
-    return Reconstruction(mesh, tuple(_pieces(field, axes)), "carved", 0.6)
+    return Reconstruction(mesh, tuple(_pieces(field, axes)), "carved")
 
 
 def _back(sight: Sight) -> NDArray[np.float32]:

@@ -71,7 +71,6 @@ def build_layers(sights: list[Sight], points: NDArray[np.float64], height: float
         shown, _, z, measured = sight.sample(mirrored)
         with np.errstate(invalid="ignore"):
             inside &= ~((shown < 0.3) | (measured > z + 0.015))
-    confidence = 0.7 if inside.mean() > 0.8 else 0.5
     everything = np.concatenate([seen, mirrored[inside]])
     views = [silhouette(sight, middle) for sight in sights]
     count = int(np.clip(height / 0.008, 3, 24))
@@ -94,7 +93,7 @@ def build_layers(sights: list[Sight], points: NDArray[np.float64], height: float
         raise MagicError(Code.RECONSTRUCTION_FAILED, "layers of one object", "empty", "points that span an area")
     loft = np.stack([rings[min(known, key=lambda j: abs(j - i))] for i in range(len(levels))])
     solid = np.concatenate([loft, np.repeat(levels[:, None, None], _SIDES, axis=1)], axis=2)
-    return Reconstruction(lofted(solid), tuple(loft_pieces(solid)), "layers", confidence)
+    return Reconstruction(lofted(solid), tuple(loft_pieces(solid)), "layers")
 
 
 #: Corners of a layer's outline.

@@ -108,7 +108,7 @@ def build_lying(sights: list[Sight], noise: float, parameters: Parameters) -> Re
         raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
     parts = [p for p in parts if p.area > 0.08 * parts[0].area]
     if flat:
-        return extruded(parts, thickness, "flat", 0.9)
+        return extruded(parts, thickness, "flat")
     # Smooth over 3 mm, over the thing's own cells only.
     weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
     smooth = cv2.GaussianBlur(np.where(occupied, grid.top, 0).astype(np.float32), (0, 0), 2.0) / np.maximum(weight, 1e-6)
@@ -131,7 +131,7 @@ def build_lying(sights: list[Sight], noise: float, parameters: Parameters) -> Re
     for part in parts:
         meshes.append(relief(part, grid, top, bottom))
         pieces += relief_pieces(part, grid, top, bottom)
-    return Reconstruction(concatenate(meshes), tuple(pieces), shape, 0.8)
+    return Reconstruction(concatenate(meshes), tuple(pieces), shape)
 
 
 def _filled(top: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from magic_core.mesh import Mesh
 from magic_core.scene import FIXTURE, PICTURE, REGION, Scene, SceneObject
 from magic_core.views import find_view
 from magic_perception import cameras, clusters
-from magic_perception.confidence import Evidence
+from magic_perception.confidence import Evidence, chance
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.seen import cut_off, witnessed
@@ -239,7 +239,7 @@ def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObj
     pieces = tuple(piece.transformed(object_from_table) for piece in built.solid.pieces)
     return SceneObject(
         "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera,
-        world_from_box=pose, box_extents=local.extents, confidence=built.solid.confidence,
+        world_from_box=pose, box_extents=local.extents, confidence=chance(built.evidence),
     )  # fmt: skip
 
 

@@ -111,16 +111,12 @@ def recognise(points: NDArray[np.float64], height: float, noise: float) -> Recon
         radius = (ball.radius + (ball.centre[2] + ball.radius) / 2) / 2
         ball = Sphere(np.array([*ball.centre[:2], radius]), radius, ball.residual)
         mesh = sphere_mesh(ball)
-        return Reconstruction(mesh, (sphere_mesh(ball, 2),), "sphere", _trust(ball.residual, limit))
+        return Reconstruction(mesh, (sphere_mesh(ball, 2),), "sphere")
     if tin is not None:
         profile = np.array([[tin.radius, 0], [tin.radius, tin.height]])
         mesh = revolve(profile, tin.centre)
-        return Reconstruction(mesh, (mesh,), "cylinder", _trust(tin.residual, limit))
+        return Reconstruction(mesh, (mesh,), "cylinder")
     return None
-
-
-def _trust(residual: float, limit: float) -> float:
-    return float(np.clip(1.0 - 0.5 * residual / limit, 0.3, 1.0))
 
 
 def sphere_mesh(sphere: Sphere, subdivisions: int = 3) -> Mesh:

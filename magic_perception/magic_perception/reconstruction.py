@@ -19,7 +19,6 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +97,7 @@ def _freest(builds: list[Callable[[], Reconstruction | None]], sights: list[Sigh
     if best is None:
         assert problem is not None
         raise problem
-    return replace(best, confidence=best.confidence * min(1.0, value.overlap / 0.8))
+    return best
 
 
 def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 0.005) -> Reconstruction:
@@ -111,4 +110,4 @@ def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 
     if not parts:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "alpha shape", "empty", "points that span an area")
     height = max(float(points[:, 2].max()), 0.002)
-    return extruded(parts[:1], height, "paper", 0.5)
+    return extruded(parts[:1], height, "paper")

@@ -14,12 +14,11 @@ from magic_perception import polygons
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """mesh and convex pieces in the table frame; ``shape`` names how they came about; confidence 0..1."""
+    """mesh and convex pieces in the table frame; ``shape`` names how they came about."""
 
     mesh: Mesh
     pieces: tuple[Mesh, ...]
     shape: str
-    confidence: float
 
 
 def hull_of(points: NDArray[np.float64]) -> Mesh | None:
@@ -99,10 +98,10 @@ def joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: in
     return [mesh for points, _, _ in parts.values() if (mesh := hull_of(points)) is not None]
 
 
-def extruded(parts: list[Polygon], height: float, shape: str, confidence: float, tolerance: float = 0.0004) -> Reconstruction:
+def extruded(parts: list[Polygon], height: float, shape: str, tolerance: float = 0.0004) -> Reconstruction:
     """Polygons pulled up from the table, with the prisms of their convex parts."""
     pieces = [polygons.prism(ring, 0.0, height) for part in parts for ring in polygons.convex_parts(part.simplify(0.0005), tolerance)]
-    return Reconstruction(concatenate([polygons.extrude(part, 0.0, height) for part in parts]), tuple(pieces), shape, confidence)
+    return Reconstruction(concatenate([polygons.extrude(part, 0.0, height) for part in parts]), tuple(pieces), shape)
 
 
 def lofted(rings: NDArray[np.float64]) -> Mesh:

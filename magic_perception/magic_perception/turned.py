@@ -318,7 +318,7 @@ def build_round(
     wall = max(parameters.wall, 0.0035)
     mesh, pieces = turned_body(body, wall)
     if handle is None:
-        return Reconstruction(mesh, tuple(pieces), "round", 0.85)
+        return Reconstruction(mesh, tuple(pieces), "round")
     bars, handle_pieces = handle
     try:
         import trimesh
@@ -327,7 +327,7 @@ def build_round(
         mesh = Mesh(joined.vertices, joined.faces)
     except Exception:  # the boolean library refuses a degenerate solid: overlapping closed parts still bound the same solid
         mesh = concatenate([mesh, *bars])
-    return Reconstruction(mesh, tuple(pieces + handle_pieces), "round with handle", 0.85)
+    return Reconstruction(mesh, tuple(pieces + handle_pieces), "round with handle")
 
 
 def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mesh]]:

@@ -179,3 +179,29 @@ def test_what_hides_a_thing_is_named_unless_another_camera_looks_behind_it():
     assert found.cut_off == (front.id,) and front.cut_off == ()
     both = seen_by([hook, tin])
     assert [o.cut_off for o in both.objects] == [(), ()]
+
+
+@pytest.mark.parametrize(("color", "count"), [((120, 60, 50), 1), ((60, 90, 150), 2)], ids=["part", "other colour"])
+def test_what_hangs_beside_a_thing_of_its_colour_is_its_part(color, count):
+    body = slab([0.08, 0.08, 0.10], [0.55, 0, 0.05], (120, 60, 50))
+    # Before the body and apart by more than clusters reach over.
+    bar = slab([0.012, 0.014, 0.06], [0.55 - 0.04 - 0.017 - 0.006, 0, 0.06], color)
+    scene = seen_by([body, bar])
+    assert len(scene.objects) == count
+    if count == 1:
+        assert scene.objects[0].box_extents.max() > 0.1
+
+
+def test_confidence_falls_with_what_was_seen(pair):
+    """A tin seen by two cameras is near certain; by cameras apart, or cut by the picture, it is less so."""
+    tin = scenes.shape("cylinder", 1, 0.5, 0.0)
+    k = scenes.INTRINSICS
+    # A picture that ends in the middle of the tin.
+    middle = k.project(transforms.apply(transforms.inverse(scenes.POSES["left"]), tin.bounds.mean(axis=0)[None]))[0]
+    narrow = Intrinsics(int(middle[0]), 480, k.fx, k.fy, k.cx, k.cy)
+    both, part = seen_by([tin]).objects[0], seen_by([tin], ("left",), narrow).objects[0]
+    assert both.confidence > 0.9 and both.seen_share > 0.6
+    assert part.cut_off == ("picture",) and part.confidence < 0.5 and part.seen_share < both.seen_share
+    good = {o.id: o.confidence for o in perceive(pair, parameters=REGION).objects}
+    apart = {o.id: o.confidence for o in perceive(moved(pair, transforms.make(translation=[0.0065, 0.004, 0])), parameters=REGION).objects}
+    assert all(apart[name] < good[name] for name in good)

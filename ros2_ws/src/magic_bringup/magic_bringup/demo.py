@@ -7,6 +7,7 @@ verified trajectory was published, 1 when not, 2 for wrong arguments, 130 when i
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import os
@@ -36,13 +37,29 @@ PATIENCE, PATIENCE_AFTER_ERROR = 60.0, 8.0
 #: Between the advertisement and the first message of the replay, s, so that the subscriptions have met their publishers.
 PLAYER_DELAY = 0.7
 
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 STAGES = ("perceive", "match", "plan", "verify", "total")
 CAMERA_TOPIC = re.compile(r"^(?P<camera>.*/)(?P<image>color|aligned_depth_to_color)/(?P<part>image_raw|camera_info)$")
 
 
+#: Option of a parameters file -> the nodes that get it, and the nodes that know an arm.
+FILES = {
+    "perception": ("perception",),
+    "matcher": ("matcher",),
+    "planner": ("planner",),
+    "verifier": ("verifier",),
+    "server": ("strategy_server",),
+}
+ROBOT_NODES = ("perception", "planner", "verifier", "strategy_server")
+
+
 @dataclass(frozen=True)
 class Options:
-    """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself."""
+    """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself.
+
+    cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it is played.
+    files: parameters files by node.
+    """
 
     strategy: str
     variant: str
@@ -53,6 +70,9 @@ class Options:
     target: str = ""
     seed: int = 0
     timeout: float = 120.0
+    cameras: tuple[str, ...] = ()
+    topics: tuple[tuple[str, str], ...] = ()
+    files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
 
 
 @dataclass
@@ -101,8 +121,12 @@ def candidate_summary(report: Any) -> dict[str, Any]:
     }
 
 
-def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
-    """The camera topics of a bag with messages in them, and its length in seconds.  Raises BAD_BAG for what is no bag or an empty one."""
+def look_into(bag: Path, topics: Sequence[tuple[str, str]] = (), cameras: Sequence[str] = ()) -> tuple[tuple[str, ...], float]:
+    """The camera topics of a bag with messages in them, as they are played, and its length in seconds.
+
+    topics: recorded name and the name that it is played under.  Raises BAD_BAG for what is no bag, an empty one, one without such a
+    topic or without a topic of one of these cameras.
+    """
     from magic_bringup import bag_file
 
     info = bag_file.info(bag)
@@ -110,21 +134,50 @@ def look_into(bag: Path) -> tuple[tuple[str, ...], float]:
         raise MagicError(Code.BAD_BAG, f"the bag is empty{info.note and '; '}{info.note}", str(bag), "a bag with at least one message")
     if info.note:
         print(f"demo: {info.note}", file=sys.stderr)
-    return tuple(t.name for t in info.topics if t.count and CAMERA_TOPIC.match(t.name)), (info.end - info.start) * 1e-9
+    renamed = dict(topics)
+    names = [t.name for t in info.topics if t.count]
+    for recorded in renamed:
+        if recorded not in names:
+            raise MagicError(Code.BAD_BAG, "the bag has no such topic", recorded, sorted(names))
+    played = [renamed.get(name, name) for name in names]
+    for camera in cameras:
+        if not any(name.startswith(f"/camera/{camera}/") for name in played):
+            raise MagicError(Code.BAD_BAG, f"the bag has no topic /camera/{camera}/...", camera, sorted(played))
+    return tuple(name for name in played if CAMERA_TOPIC.match(name)), (info.end - info.start) * 1e-9
 
 
-def first_images(bag: Path) -> dict[str, Any]:
-    """The first image of each camera topic of a bag, as messages: what the report shows.  Raises BAD_BAG."""
+def first_images(bag: Path, topics: Sequence[tuple[str, str]] = ()) -> dict[str, Any]:
+    """The first image of each camera topic of a bag, by the name that it is played under, as messages: what the report shows.  Raises BAD_BAG."""
     from magic_bringup import bag_messages
 
-    missing = {topic for topic in look_into(bag)[0] if topic.endswith("/image_raw")}
+    renamed = dict(topics)
     found: dict[str, Any] = {}
-    for topic, _, message in bag_messages.messages(bag, lambda topic, _: topic in missing) if missing else ():
-        found[topic] = message
-        missing.remove(topic)
-        if not missing:
-            break
+
+    def wanted(topic: str, kind: str) -> bool:
+        match = CAMERA_TOPIC.match(_raw(renamed.get(topic, topic)))
+        return match is not None and match["part"] == "image_raw" and match[0] not in found and kind in IMAGES
+
+    for topic, _, message in bag_messages.messages(bag, wanted):
+        name = renamed.get(topic, topic)
+        with contextlib.suppress(MagicError):  # a picture less in the report
+            found[_raw(name)] = _shown(message)
     return found
+
+
+def _raw(topic: str) -> str:
+    """The name that image_transport's raw image would have."""
+    return topic.removesuffix("/compressed").removesuffix("/compressedDepth")
+
+
+def _shown(message: Any) -> Any:
+    """An image message, decoded where it is a compressed one."""
+    if type(message).__name__ != "CompressedImage":
+        return message
+    from magic_core import conversions
+
+    if "compressedDepth" in message.format:
+        return conversions.image_to_msg(conversions.depth_from_compressed_msg(message), "32FC1", message.header)
+    return conversions.image_to_msg(conversions.color_from_compressed_msg(message), "rgb8", message.header)
 
 
 def perceive_seconds(heard: Mapping[str, float], topics: Collection[str], objects_at: float, replay_at: float) -> float:
@@ -326,16 +379,18 @@ class Demo:
         options = self.options
         environment.prepare()
         strategies.find(options.strategy)  # a wrong name is told before anything is started
-        topics, self._length = look_into(options.bag)
+        topics, self._length = look_into(options.bag, options.topics, options.cameras)
         env = isolated()
         os.environ.update({k: env[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
         parameters: dict[str, dict[str, object]] = {
             "matcher": {"features": options.features},
             "strategy_server": {"objects_timeout": 5.0},
         }
+        if options.cameras:
+            parameters["perception"] = {"cameras": json.dumps(options.cameras)}
         with Graph(options.out / "logs", env) as graph:
             self.say(f"starting the graph (ROS domain {env['ROS_DOMAIN_ID']})")
-            graph.start_nodes(parameters)
+            graph.start_nodes(parameters, files=options.files)
             watcher = Watcher(topics, self.say)
             try:
                 self._drive(graph, watcher)
@@ -370,7 +425,8 @@ class Demo:
         if not self._wait(graph, watcher, up, START_TIMEOUT):
             raise MagicError(Code.SERVER_UNAVAILABLE, f"not up after {START_TIMEOUT:g} s: {', '.join(missing)}")
         self.say(f"replaying {options.bag}")
-        player = graph.start("bag_player", "magic_bringup", "bag_player", str(options.bag), "--loop", "--delay", str(PLAYER_DELAY))
+        remap = ["--remap", *(f"{recorded}:={played}" for recorded, played in options.topics)] if options.topics else []
+        player = graph.start("bag_player", "magic_bringup", "bag_player", str(options.bag), "--loop", "--delay", str(PLAYER_DELAY), *remap)
 
         watcher.replay_at = time.monotonic() + PLAYER_DELAY
 
@@ -420,7 +476,7 @@ class Demo:
         memory = graph.peak_memory_mb()
         memory["demo"] = round(peak_memory(os.getpid()), 1)
         self.record.summary["peak_memory_mb"] = memory
-        self.record.images = first_images(self.options.bag)
+        self.record.images = first_images(self.options.bag, self.options.topics)
         self.record.scene = watcher.scene
 
 
@@ -436,8 +492,36 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
     parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
     parser.add_argument("--timeout", type=float, default=120.0, help="s for the run from match to verify (default 120)")
+    parser.add_argument(
+        "--cameras", nargs="+", default=[], metavar="NAME", help="the cameras, by the name in their topics (default left right)"
+    )
+    parser.add_argument(
+        "--topics",
+        nargs="+",
+        default=[],
+        metavar="RECORDED:=PLAYED",
+        help="topics of the bag under other names: /rs/rgb:=/camera/left/color/image_raw",
+    )
+    for node in FILES:
+        parser.add_argument(f"--{node}-params", type=Path, metavar="FILE", help=f"parameters file of {FILES[node][0]}")
+    parser.add_argument(
+        "--robot-params", type=Path, metavar="FILE", help="parameters file of the arm, for all nodes, after their own files"
+    )
     parser.add_argument("--root", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
     a = parser.parse_args(argv)
+    topics = [tuple(rule.split(":=")) for rule in a.topics]
+    for rule in topics:
+        if len(rule) != 2 or not all(name.startswith("/") and len(name) > 1 for name in rule):
+            parser.error(f"--topics: {':='.join(rule)!r} (allowed: /RECORDED:=/PLAYED)")
+    files: dict[str, list[Path]] = {}
+    for option, nodes in (*FILES.items(), ("robot", ROBOT_NODES)):
+        path = getattr(a, f"{option}_params")
+        if path is not None:
+            problem = _no_parameters(path)
+            if problem:
+                parser.error(f"--{option}-params: {path}: {problem}")
+            for node in nodes:
+                files.setdefault(node, []).append(path.resolve())
     name = Path(a.strategy).name
     return Options(
         strategy=str(Path(a.strategy).resolve()) if "/" in a.strategy else a.strategy,
@@ -449,7 +533,25 @@ def parse(argv: list[str] | None = None) -> Options:
         target=a.target,
         seed=a.seed,
         timeout=a.timeout,
+        cameras=tuple(a.cameras),
+        topics=tuple(topics),
+        files=files,
     )
+
+
+def _no_parameters(path: Path) -> str:
+    """Why a file is no ROS 2 parameters file; empty: it is one."""
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        return str(error.strerror)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        return " ".join(str(error).split())
+    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()) or "ros__parameters" not in str(content):
+        return "holds no ros__parameters (NODE: {ros__parameters: {NAME: VALUE}})"
+    return ""
 
 
 def _interrupt(_signum: int, _frame: Any) -> None:

@@ -133,12 +133,18 @@ class Graph:
         self.processes[name] = process
         return process
 
-    def start_nodes(self, parameters: Mapping[str, Mapping[str, object]] | None = None, leave_out: Sequence[str] = ()) -> None:
-        """Start the five nodes at once, each with its own parameters."""
+    def start_nodes(
+        self,
+        parameters: Mapping[str, Mapping[str, object]] | None = None,
+        leave_out: Sequence[str] = (),
+        files: Mapping[str, Sequence[Path]] | None = None,
+    ) -> None:
+        """Start the five nodes at once, each with its own parameters files, later ones over earlier ones, and parameters over those."""
         for name, (package, program) in NODES.items():
             if name in leave_out:
                 continue
-            arguments = [
+            arguments = [x for path in (files or {}).get(name, ()) for x in ("--params-file", str(path))]
+            arguments += [
                 x
                 for k, v in (parameters or {}).get(name, {}).items()
                 for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")

@@ -3,11 +3,15 @@
 import threading
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rclpy.task import Future
 
-from magic_bringup.demo import Pending, perceive_seconds
-from magic_core.errors import Code
+from magic_bringup.demo import Pending, first_images, look_into, parse, perceive_seconds
+from magic_bringup.recording import Recording
+from magic_core import conversions
+from magic_core.camera import Intrinsics
+from magic_core.errors import Code, MagicError
 
 LEFT = [f"/camera/left/{part}/camera_info" for part in ("color", "aligned_depth_to_color")]
 RIGHT = [topic.replace("left", "right") for topic in LEFT]
@@ -34,3 +38,53 @@ def test_a_refused_goal_is_an_answer():
     assert pending.result is None
     sent.set_result(SimpleNamespace(accepted=False))
     assert (pending.result.code, pending.result.verified) == (Code.SERVER_UNAVAILABLE, False)
+
+
+def test_what_the_command_line_names_is_looked_for_before_anything_starts(tmp_path, capsys):
+    good, bad = tmp_path / "good.yaml", tmp_path / "bad.yaml"
+    good.write_text("/**:\n  ros__parameters:\n    rate: 2.0\n")
+    bad.write_text("rate: 2.0\n")
+    options = parse(
+        [
+            "--perception-params",
+            str(good),
+            "--robot-params",
+            str(good),
+            "--cameras",
+            "wrist",
+            "--topics",
+            "/rgb:=/camera/wrist/color/image_raw",
+        ]
+    )
+    assert options.cameras == ("wrist",) and options.topics == (("/rgb", "/camera/wrist/color/image_raw"),)
+    assert options.files["perception"] == [good, good] and options.files["planner"] == [good] and "matcher" not in options.files
+    for words in (
+        ["--server-params", str(tmp_path / "none.yaml")],
+        ["--robot-params", str(bad)],
+        ["--topics", "rgb"],
+        ["--topics", "/a:=b"],
+    ):
+        with pytest.raises(SystemExit) as caught:
+            parse(words)
+        assert caught.value.code == 2 and words[0] in capsys.readouterr().err
+
+
+def test_topics_of_other_names_and_compressed_images_are_those_of_a_camera(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    from sensor_msgs.msg import CompressedImage
+
+    picture = np.full((8, 9, 3), (200, 30, 40), np.uint8)
+    png = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
+    with Recording(tmp_path / "bag") as bag:
+        bag.write(
+            "/rgb/compressed", CompressedImage(header=conversions.header("c", 1.0), format="rgb8; png compressed bgr8", data=png), 1.0
+        )
+        bag.write("/info", conversions.intrinsics_to_msg(Intrinsics(9, 8, 5.0, 5.0, 4.0, 4.0)), 1.2)
+    topics = (("/rgb/compressed", "/camera/w/color/image_raw/compressed"), ("/info", "/camera/w/color/camera_info"))
+    assert look_into(tmp_path / "bag", topics, ["w"]) == (("/camera/w/color/camera_info",), pytest.approx(0.2))
+    (found,) = first_images(tmp_path / "bag", topics).items()
+    assert found[0] == "/camera/w/color/image_raw" and (conversions.color_from_msg(found[1]) == picture).all()
+    for wrong in ({"topics": (("/none", "/a"),)}, {"cameras": ["w"]}):
+        with pytest.raises(MagicError) as caught:
+            look_into(tmp_path / "bag", **wrong)
+        assert caught.value.code is Code.BAD_BAG and "/info" in caught.value.message
