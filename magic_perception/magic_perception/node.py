@@ -337,6 +337,8 @@ class Perception(Node):
                 "cameras": ", ".join(f.camera for f in frames),
             }
             values.update({f"seconds {k}": round(v, 4) for k, v in report.seconds.items()})
+            if report.cameras:
+                values["camera poses"] = "; ".join(str(pair) for pair in report.cameras)
             values["notes"] = "; ".join(report.notes)
             if seen:
                 level = DiagnosticStatus.WARN if report.notes else DiagnosticStatus.OK

@@ -107,16 +107,23 @@ def perceive(
         for pair in pairs:
             if pair.certain:
                 report.notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if len(looks) == 2 else ""))
+            elif pair.offset > cameras.MOST_OFFSET:
+                report.notes.append(f"cameras may disagree: {pair}; more things in common view would tell")
+        both = sum(bool((image > 0).any()) for image in labels) > 1
+        if both and not pairs:
+            report.notes.append("whether the cameras agree could not be measured: they see no side of anything in common")
         if len(looks) == 2 and worst is not None and worst.certain:
             looks = cameras.brought_together(looks, worst, world_from_table)
             labels = segmenter.segment(looks, fixtures, parameters)
         report.labels = labels
 
     offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
+    # Cameras of which nothing is known may be as far apart as would be borne.
+    apart = offset if worst is not None else cameras.MOST_OFFSET if both else 0.0
 
     def build(label: int) -> _Built | MagicError:
         try:
-            return _build(label, looks, labels, world_from_table, np.nan_to_num(offset), parameters)
+            return _build(label, looks, labels, world_from_table, apart, parameters)
         except MagicError as error:
             return error
 
