@@ -49,7 +49,7 @@ from magic_verifier.cases import (
     tool_object,
 )
 from magic_verifier.floating import settled
-from magic_verifier.verification import Verdict
+from magic_verifier.verification import Verdict, wilson
 
 #: Sideways velocity noise of hooking in target radii, the released code's own test.
 HOOK_NOISE = 1.0
@@ -327,6 +327,7 @@ def _try(
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}
     entry = {"code": verdict.code.name, "message": verdict.message, "stage": "verify", "metrics": metrics}
+    entry |= {"rate": verdict.success_rate, "rate_low": verdict.rate_low, "rollouts": len(verdict.runs)}
     return entry, _Tried(name, tool, plan, verdict)
 
 
@@ -342,17 +343,6 @@ def _draw(path: Path, run: _Tried, problem: _Problem) -> None:
     strip = film_strip(run.verdict.recording, run.tool, problem.target, obstacles, problem.table, frames=3, columns=3, size=(220, 165))
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), strip[:, :, ::-1])
-
-
-def wilson(successes: int, count: int, z: float = 1.959964) -> tuple[float, float]:
-    """The 95 % Wilson score interval of a success rate."""
-    if count == 0:
-        return 0.0, 1.0
-    share = successes / count
-    centre = share + z * z / (2 * count)
-    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    scale = 1 + z * z / count
-    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
 
 
 def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
