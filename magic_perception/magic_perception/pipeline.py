@@ -207,7 +207,7 @@ def _build(
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
-    cut = cut_off(looks, labels, label)
+    cut = cut_off(looks, labels, label, parameters)
     # A wall, a monitor, a person: no thing on the table.
     across = float(np.ptp(np.percentile(points, [1, 99], axis=0), axis=0).max())
     if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.mesh import Mesh
 from magic_core.scene import FIXTURE, PICTURE, REGION
+from magic_perception.parameters import Parameters
 from magic_perception.segmentation import Looked
 from magic_perception.sight import Sight
 
@@ -30,7 +31,7 @@ class Cut:
     pixels: NDArray[np.int64]
 
 
-def cuts(look: Looked, labels: NDArray[np.int32], label: int) -> list[Cut]:
+def cuts(look: Looked, labels: NDArray[np.int32], label: int, parameters: Parameters) -> list[Cut]:
     """Where the picture's border, the region's, or something nearer ends a mask; ``by`` is a label where that is another thing."""
     mask = labels == label
     x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
@@ -60,9 +61,16 @@ def cuts(look: Looked, labels: NDArray[np.int32], label: int) -> list[Cut]:
     edge[:2] = edge[-2:] = True
     edge[:, :2] = edge[:, -2:] = True
     add(PICTURE, edge[cut])
-    # Of the region only its sides: where its rays end on the table, not where depth is missing.
+    # The region cuts where the thing itself is at its side: what lies far behind a tall thing's edge may be outside too.
+    rows, columns = np.nonzero(outline & ~edge[cut])
+    k, pose = look.frame.intrinsics, look.frame.world_from_camera
+    rays = np.column_stack([(columns + c0 - k.cx) / k.fx, (rows + r0 - k.cy) / k.fy, np.ones(len(rows))])
+    points = (rays * own[rows, columns, None]) @ pose[:3, :3].T + pose[:3, 3]
+    low, high = np.asarray(parameters.region_low), np.asarray(parameters.region_high)
+    aside = np.zeros(outline.shape, bool)
+    aside[rows, columns] = np.any((points[:, :2] < low[:2] + LEAST) | (points[:, :2] > high[:2] - LEAST), axis=1)
     beyond = (~look.inside[cut] & ~mine).astype(np.uint8)
-    add(REGION, (cv2.dilate(beyond, np.ones((5, 5), np.uint8)) > 0) & ~edge[cut])
+    add(REGION, aside & (cv2.dilate(beyond, np.ones((5, 5), np.uint8)) > 0))
     near = cv2.dilate(mine.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
     with np.errstate(invalid="ignore"):
         # Of a fixture or the robot there may be no depth.
@@ -72,12 +80,12 @@ def cuts(look: Looked, labels: NDArray[np.int32], label: int) -> list[Cut]:
     return found
 
 
-def cut_off(looks: list[Looked], labels: list[NDArray[np.int32]], label: int) -> list[int | str]:
+def cut_off(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, parameters: Parameters) -> list[int | str]:
     """What keeps a part of a thing out of the sight of all cameras: ``picture``, ``region``, ``fixture``, or labels of other things.
 
     A cut in one camera counts unless another camera sees the thing there and is not cut there itself.
     """
-    by_camera = [cuts(look, image, label) for look, image in zip(looks, labels, strict=True)]
+    by_camera = [cuts(look, image, label, parameters) for look, image in zip(looks, labels, strict=True)]
     result: list[int | str] = []
     for i, found in enumerate(by_camera):
         for cut in found:

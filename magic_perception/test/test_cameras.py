@@ -168,6 +168,11 @@ def test_the_region_cuts():
     assert scene.objects[0].cut_off == ("region",)
 
 
+def test_what_lies_beyond_the_region_behind_a_tall_thing_does_not_cut_it():
+    post = slab([0.06, 0.06, 0.30], [0.75, 0.0, 0.15], (90, 140, 90))
+    assert seen_by([post]).objects[0].cut_off == ()
+
+
 def test_what_hides_a_thing_is_named_unless_another_camera_looks_behind_it():
     eye = scenes.POSES["left"][:3, 3]
     hook = scenes.shape("l_hook", 1, 0.6, -0.1, 0.4)
