@@ -169,7 +169,7 @@ def test_the_region_cuts():
 
 
 def test_what_lies_beyond_the_region_behind_a_tall_thing_does_not_cut_it():
-    post = slab([0.06, 0.06, 0.30], [0.75, 0.0, 0.15], (90, 140, 90))
+    post = slab([0.06, 0.06, 0.25], [0.7, 0.0, 0.125], (90, 140, 90))
     assert seen_by([post]).objects[0].cut_off == ()
 
 
