@@ -380,8 +380,19 @@ def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id:
     No tool: every object that was seen by the cameras, but the target; where there is
     none of them, every other object.  No target: the one most like the demonstration's
     among the objects not named as tools.  What was seen in part is no tool: left out where
-    tools are chosen; ``OBJECT_CUT_OFF`` where one is named, or none is left.
+    tools are chosen; ``OBJECT_CUT_OFF`` where one is named, or none is left.  Raises
+    ``SOMETHING_HANGS`` where something is above the table with nothing below that
+    carries it: nothing is planned around a hand.
     """
+    hanging = [item for item in scene.objects if item.hanging]
+    if hanging:
+        places = (f"{item.id} at ({', '.join(f'{x:.2f}' for x in item.world_from_box[:3, 3])}) m" for item in hanging)
+        raise MagicError(
+            Code.SOMETHING_HANGS,
+            "something hangs above the table, with nothing below that carries it",
+            ", ".join(places),
+            "nothing there: hands away; an arm that the cameras see is cut out where its joint_states are there and fit",
+        )
     named = [scene.find(name) for name in tool_ids]
     for item in named:
         if item.cut_off:

@@ -216,6 +216,10 @@ def test_target_and_tools_are_chosen_where_none_is_named(demonstration):
         assert caught.value.code == code
     result = matching.match(found, tools, target, features.load("embedded"))
     assert result.target_id == "cylinder" and result.candidates[0].target.radius > 0
+    # Nothing is planned below a hand.
+    with pytest.raises(MagicError) as caught:
+        matching.select(Scene((replace(items[0], hanging=True), *items[1:]), scene.table), found, [], "")
+    assert caught.value.code == Code.SOMETHING_HANGS
     # What is seen in part is no tool: not chosen, and refused by name.
     part = Scene((replace(items[0], cut_off=("picture", "l_hook")), *items[1:]), scene.table)
     tools, _ = matching.select(part, found, [], "cylinder")

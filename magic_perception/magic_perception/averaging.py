@@ -16,6 +16,7 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
 
     A pixel needs depth in half of the frames.  Where the values spread by more than ``spread`` metres (edges flicker
     between two surfaces) the median is taken instead of the mean, so that no surface is made up between two.
+    What is blind in one of them is blind in the mean: colours of the robot and of what is behind it are mixed there.
     Raises ``BAD_IMAGE`` for frames of different sizes, ``NO_FRAMES`` for none.
     """
     if not frames:
@@ -35,7 +36,12 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
         ordered = np.sort(np.where(valid[:, wide], depth[:, wide], np.inf), axis=0)
         mean[wide] = np.take_along_axis(ordered, ((count[wide] - 1) // 2)[None], axis=0)[0]
     mean[2 * count < len(frames)] = np.nan
+    veils = [f.blind for f in frames if f.blind is not None]
+    blind = np.logical_or.reduce(veils) if veils else None
+    if blind is not None:
+        mean[blind] = np.nan
     total = np.zeros(last.color.shape, np.float32)
     for frame in frames:
         cv2.accumulate(frame.color, total)
-    return replace(last, depth=mean.astype(np.float32), color=np.clip(total / len(frames) + 0.5, 0, 255).astype(np.uint8))
+    color = np.clip(total / len(frames) + 0.5, 0, 255).astype(np.uint8)
+    return replace(last, depth=mean.astype(np.float32), color=color, blind=blind)

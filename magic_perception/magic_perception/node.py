@@ -17,7 +17,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from visualization_msgs.msg import MarkerArray
 
 from magic_core import conversions as cv
@@ -26,9 +26,11 @@ from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
-from magic_core.node import describe, parameter, run
+from magic_core.node import describe, parameter, robot_parameters, run
 from magic_core.qos import LATCHED, SENSOR
+from magic_core.robot import Description, RobotConfig
 from magic_core.scene import Scene, SceneObject
+from magic_core.self_filter import Margins
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
@@ -36,6 +38,7 @@ from magic_perception.averaging import average
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
+from magic_perception.robot_in_view import RobotInView
 from magic_perception.segmenters import SEGMENTERS, make_segmenter
 from magic_perception.stream import WAITING, Pair, Stream, next_scene
 from magic_perception.tracking import Tracker
@@ -66,7 +69,8 @@ class Perception(Node):
     mono8), ``camera/NAME/color/camera_info`` and ``camera/NAME/aligned_depth_to_color/image_raw`` (16UC1 mm or 32FC1 m);
     where an image is not published but its ``/compressed`` or ``/compressedDepth`` is, those;
     with ``aligned`` false, ``camera/NAME/depth/image_rect_raw`` and ``camera/NAME/depth/camera_info`` instead, and depth
-    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures.
+    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``joint_states``: the robot
+    (parameters ``robot.*``) is cut out of every picture.
     Publishes ``objects`` and ``perception/markers`` (latched), ``/diagnostics`` (1 Hz).
     """
 
@@ -106,6 +110,7 @@ class Perception(Node):
         self.parameters = self._algorithm()
         self.given = {camera: pose for camera in self.cameras if (pose := self._extrinsics(camera)) is not None}
         self.segmenter = make_segmenter(name, weights, device)
+        self.robot = self._robot(tolerance)
         self.warm_up()
 
         self.streams = {camera: Stream(camera, tolerance, self.count + WAITING) for camera in self.cameras}
@@ -114,6 +119,9 @@ class Perception(Node):
         self.known_problem: tuple[Code, str] | None = None
         self.unheard: dict[str, str] = {}
         self.distortion: dict[str, float] = {}
+        # Of each camera: the share of its last picture that was cut as the robot, or why it was not.
+        self.cut: dict[str, float | MagicError] = {}
+        self.joints_problem: MagicError | None = None
         self.done_stamp = self.last_run = -math.inf
         self.again = False  # the newest frames are to be looked at once more
         self.done = 0
@@ -131,6 +139,8 @@ class Perception(Node):
         self.compressed: dict[tuple[str, str], Subscription] = {}
         self.transforms = TransformListener(self, inputs, self.lock)
         self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
+        if self.robot is not None:
+            self.create_subscription(JointState, "joint_states", self.on_joints, SENSOR, callback_group=inputs)
         wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
         wall_timer(self, 0.5, self.on_look, report)
         self.diagnostics = Diagnostics(self, self.on_report, report)
@@ -153,6 +163,17 @@ class Perception(Node):
             min_height=p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1),
             seed=p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1),
         )
+
+    def _robot(self, slack: float) -> RobotInView | None:
+        """The arm that is cut out of the pictures, as the parameters describe it; ``None``: there is none to cut."""
+        p = partial(parameter, self, read_only=True)
+        cuts = p("self_filter", True, "cut the robot (parameters robot.*) out of the pictures by joint_states; false where there is no arm")
+        age = p("joint_state_age", 0.2, "how far a joint state may be from a picture's stamp, s", low=0.001, high=2.0)
+        space = p("robot_margin", 0.01, "how much wider than its shapes the robot is cut: calibration, cables, m", low=0.0, high=0.1)
+        config = robot_parameters(self)
+        if not cuts:
+            return None
+        return RobotInView(Description(RobotConfig(**config)), Margins(space=space), age, slack)
 
     def _extrinsics(self, camera: str) -> np.ndarray | None:
         """world_from_camera (4, 4) of a camera as parameters give it; None: it comes from TF."""
@@ -310,6 +331,17 @@ class Perception(Node):
             self.known_problem = (Code(code), f"known_objects: {message}")
             self.get_logger().error(self.known_problem[1])
 
+    def on_joints(self, msg: JointState) -> None:
+        """Where the arm's joints are."""
+        assert self.robot is not None
+        try:
+            self.robot.history.take(msg.name, msg.position, cv.time_from_msg(msg.header.stamp))
+            self.joints_problem = None
+        except MagicError as error:
+            self.joints_problem = error
+        except Exception as error:
+            self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
+
     # ------------------------------------------------------------ work
 
     def on_work(self) -> None:
@@ -340,7 +372,17 @@ class Perception(Node):
             if report.cameras:
                 values["camera poses"] = "; ".join(str(pair) for pair in report.cameras)
             values["notes"] = "; ".join(report.notes)
-            if seen:
+            hanging = [o.id for o in seen if o.hanging]
+            if hanging:
+                uncut = "; ".join(sorted({e.message for e in self.cut.values() if isinstance(e, MagicError)}))
+                self.outcome = (
+                    DiagnosticStatus.WARN,
+                    Code.SOMETHING_HANGS,
+                    f"[{int(Code.SOMETHING_HANGS)} SOMETHING_HANGS] {', '.join(hanging)}: {values['notes']}"
+                    + (f"; the robot was not cut out of all pictures: {uncut}" if uncut else ""),
+                    values,
+                )
+            elif seen:
                 level = DiagnosticStatus.WARN if report.notes else DiagnosticStatus.OK
                 self.outcome = (
                     level,
@@ -458,6 +500,9 @@ class Perception(Node):
                 else:
                     wrong = error
                 continue
+            if self.robot is not None and self.robot.waits(pair.stamp) and now - pair.arrived < self.robot.age:
+                pending = min(pending, pair.stamp)
+                continue
             found.append(Placed(pair, pose, moved))
             wrong = None
         return found, pending, self.transforms.explain(wrong) if wrong is not None else None
@@ -489,7 +534,7 @@ class Perception(Node):
                     pair.depth_frame_id,
                     f"{pair.frame_id}, that of colour; else set aligned to false",
                 )
-            frames.append(RgbdFrame(pair.color, depth, intrinsics, last, stream.name, pair.stamp))
+            frames.append(self.without_robot(RgbdFrame(pair.color, depth, intrinsics, last, stream.name, pair.stamp)))
         result = average(frames)
         if np.isfinite(result.depth).sum() < 100:
             raise MagicError(
@@ -505,6 +550,22 @@ class Perception(Node):
         """Depth that is no table-top's, or not that of the table under this camera, is of another unit than its encoding says."""
         depths.check_distance(frame.depth, self.topics[stream.name]["depth"], stream.unit, True, REMEDY)
         depths.check_pose(frame, stream.unit, REMEDY, self.parameters.region_low, self.parameters.region_high)
+
+    def without_robot(self, frame: RgbdFrame) -> RgbdFrame:
+        """The frame, blind where the robot is; as it is where that is not known, which the diagnostics then say."""
+        if self.robot is None:
+            return frame
+        try:
+            base = self.robot.robot.base
+            world_from_base = None
+            if base != self.frame:
+                with self.lock:
+                    world_from_base = self.transforms.buffer.lookup(self.frame, base, frame.stamp)
+            frame = self.robot.cut(frame, world_from_base)
+            self.cut[frame.camera] = float(frame.blind.mean()) if frame.blind is not None else 0.0
+        except MagicError as error:
+            self.cut[frame.camera] = error
+        return frame
 
     def publish(self, scene: Scene) -> None:
         """Objects and markers."""
@@ -530,6 +591,8 @@ class Perception(Node):
         if self.done == 0 and code is Code.NO_FRAMES and worst:
             message = f"[100 NO_FRAMES] nothing to look at; {worst[0].message}"
         states.append(pc.status(f"{label(self)}: scene", level, message, code, values))
+        if self.robot is not None:
+            states.append(self.robot_status(self.robot))
         for topic, message in self.unheard.items():
             message = f"[{int(Code.NO_FRAMES)} QoS] {message}"
             states.append(pc.status(f"{label(self)}: topic {topic}", DiagnosticStatus.ERROR, message, Code.NO_FRAMES, {}))
@@ -540,6 +603,21 @@ class Perception(Node):
         for state in states:
             state.hardware_id = self.get_fully_qualified_name()
         return states
+
+    def robot_status(self, robot: RobotInView) -> DiagnosticStatus:
+        """Whether the robot is cut out of the pictures."""
+        name, cut = f"{label(self)}: robot", dict(self.cut)
+        problems = {f"camera {camera}: ": error for camera, error in cut.items() if isinstance(error, MagicError)}
+        if self.joints_problem is not None:
+            problems[""] = self.joints_problem
+        elif not cut and not robot.history.known():
+            problems[""] = MagicError(Code.NO_FRAMES, self.resolve_topic_name("joint_states"), "none received")
+        if problems:
+            where, error = next(iter(problems.items()))
+            message = f"{where}{error.message}; an arm in the pictures is not cut out (parameter self_filter: false where there is none)"
+            return pc.status(name, DiagnosticStatus.WARN, f"[{int(error.code)} {error.code.name}] {message}", error.code, {})
+        values = {f"share of the picture of {camera}": f"{share:.3f}" for camera, share in cut.items()}
+        return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
 
     def camera_status(self, camera: str, now: float) -> DiagnosticStatus:
         """One camera: its problems, else what of it is silent, else OK."""

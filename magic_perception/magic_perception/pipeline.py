@@ -19,6 +19,7 @@ from magic_core.scene import FIXTURE, PICTURE, REGION, Scene, SceneObject
 from magic_core.views import find_view
 from magic_perception import cameras, clusters
 from magic_perception.confidence import Evidence, chance
+from magic_perception.hidden import hangs, veil
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.seen import cut_off, witnessed
@@ -91,7 +92,7 @@ def perceive(
 
     with report.stage("masks"):
         fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
-        labels = segmenter.segment(looks, fixtures, parameters)
+        labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
 
     with report.stage("cameras"):
         pairs = cameras.measure(looks, labels, [frame.world_from_camera for frame in frames], world_from_table, parameters.seed)
@@ -114,7 +115,7 @@ def perceive(
             report.notes.append("whether the cameras agree could not be measured: they see no side of anything in common")
         if len(looks) == 2 and worst is not None and worst.certain:
             looks = cameras.brought_together(looks, worst, world_from_table)
-            labels = segmenter.segment(looks, fixtures, parameters)
+            labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
         report.labels = labels
 
     offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
@@ -123,7 +124,7 @@ def perceive(
 
     def build(label: int) -> _Built | MagicError:
         try:
-            return _build(label, looks, labels, world_from_table, apart, parameters)
+            return _build(label, looks, labels, fixtures, world_from_table, apart, parameters)
         except MagicError as error:
             return error
 
@@ -145,7 +146,14 @@ def perceive(
         for built, item in zip(solids, each(lambda b: _as_object(b, world_from_table), solids, parameters.workers), strict=True):
             # What hides a thing and was left out itself is as nameless as a fixture.
             by = tuple(dict.fromkeys(by if isinstance(by, str) else ids.get(by, FIXTURE) for by in built.cut_off))
-            item = replace(item, id=f"object_{len(objects) + 1}", cut_off=by, seen_share=built.evidence.witnessed.seen)
+            item = replace(
+                item, id=f"object_{len(objects) + 1}", cut_off=by, seen_share=built.evidence.witnessed.seen, hanging=built.hanging
+            )
+            if item.hanging:
+                x, y, z = item.world_from_box[:3, 3]
+                report.notes.append(
+                    f"something hangs above the table, with nothing below that carries it, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+                )
             report.evidence[item.id] = built.evidence
             report.shapes[item.id], report.pixels[item.id] = built.solid.shape, built.pixels
             objects.append(item)
@@ -166,12 +174,14 @@ class _Built:
     pixels: int
     cut_off: list[int | str]
     evidence: Evidence
+    hanging: bool
 
 
 def _build(
     label: int,
     looks: list[Looked],
     labels: list[NDArray[np.int32]],
+    fixtures: tuple[Mesh, ...],
     world_from_table: NDArray[np.float64],
     apart: float,
     parameters: Parameters,
@@ -207,10 +217,10 @@ def _build(
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
-    cut = cut_off(looks, labels, label, parameters)
+    cut, hanging = cut_off(looks, labels, label, parameters), hangs(looks, labels, label, fixtures)
     # A wall, a monitor, a person: no thing on the table.
     across = float(np.ptp(np.percentile(points, [1, 99], axis=0), axis=0).max())
-    if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut):
+    if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut) and not hanging:
         raise MagicError(
             Code.OBJECT_CUT_OFF,
             "extent in metres of something that the picture or the region cuts; motions do not avoid it",
@@ -222,7 +232,7 @@ def _build(
         solid.shape, agreement(solid.mesh, sights), witnessed(solid.mesh, sights), solid.mesh.extents, len(sights), apart, bool(cut)
     )
     best = int(np.argmax(counts))
-    return _Built(solid, points, colors, labels[best] == label, looks[best].frame.camera, counts[best], cut, evidence)
+    return _Built(solid, points, colors, labels[best] == label, looks[best].frame.camera, counts[best], cut, evidence, hanging)
 
 
 def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObject:

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import transforms
+from magic_core import scene, transforms
 from magic_core.mesh import Mesh
 from magic_core.scene import FIXTURE, PICTURE, REGION
+from magic_perception.hidden import ROBOT
 from magic_perception.parameters import Parameters
 from magic_perception.segmentation import Looked
 from magic_perception.sight import Sight
@@ -69,14 +70,15 @@ def cuts(look: Looked, labels: NDArray[np.int32], label: int, parameters: Parame
     low, high = np.asarray(parameters.region_low), np.asarray(parameters.region_high)
     aside = np.zeros(outline.shape, bool)
     aside[rows, columns] = np.any((points[:, :2] < low[:2] + LEAST) | (points[:, :2] > high[:2] - LEAST), axis=1)
-    beyond = (~look.inside[cut] & ~mine).astype(np.uint8)
+    beyond = (~look.inside[cut] & ~mine & (others != ROBOT)).astype(np.uint8)
     add(REGION, aside & (cv2.dilate(beyond, np.ones((5, 5), np.uint8)) > 0))
     near = cv2.dilate(mine.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
     with np.errstate(invalid="ignore"):
         # Of a fixture or the robot there may be no depth.
         front = near & (others != 0) & ~mine & (share > 0) & ((depth < own - NEARER) | ((others < 0) & ~np.isfinite(depth)))
     for by in np.unique(others[front]):
-        add(int(by) if by > 0 else FIXTURE, cv2.dilate((front & (others == by)).view(np.uint8), np.ones((7, 7), np.uint8)) > 0)
+        name = int(by) if by > 0 else scene.ROBOT if by == ROBOT else FIXTURE
+        add(name, cv2.dilate((front & (others == by)).view(np.uint8), np.ones((7, 7), np.uint8)) > 0)
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import cv2
@@ -43,6 +43,11 @@ class Looked:
     inside: NDArray[np.bool_]
     sigma: NDArray[np.float32]
     normal: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+
+    @property
+    def open(self) -> NDArray[np.bool_]:
+        """(H, W): where the scene in the region of interest is seen: inside and not blind."""
+        return self.inside if self.frame.blind is None else self.inside & ~self.frame.blind
 
     def points(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         """World points (..., 3) in metres at pixels, row and column (...) each; NaN without depth."""
@@ -153,7 +158,7 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
     correction = transforms.inverse(_frame_on(plane, world_from_table))
     # Correct the pose, not the heights alone, so that both cameras agree in the table's plane too.
     pose = world_from_table @ correction @ frame.world_from_camera
-    frame = RgbdFrame(frame.color, frame.depth, frame.intrinsics, pose, frame.camera, frame.stamp)
+    frame = replace(frame, world_from_camera=pose)
     k = frame.intrinsics
     table_from_camera = transforms.inverse(world_from_table) @ pose
     z = np.ascontiguousarray(frame.depth, dtype=np.float32)
@@ -266,22 +271,22 @@ def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np
 
 def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it."""
-    h = looked.heights
+    h, inside = looked.heights, looked.open
     valid = np.isfinite(h)
     zero = np.where(valid, h, np.float32(0))
     limit = np.maximum(np.float32(parameters.min_height), np.float32(4.0) * looked.sigma)
-    raised = (zero > limit) & looked.inside
+    raised = (zero > limit) & inside
     raised = cv2.morphologyEx(raised.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(bool)
     if not parameters.use_color:
         return raised
     around = cv2.dilate(raised.view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
-    table = valid & (np.abs(zero) < limit) & looked.inside & ~around
+    table = valid & (np.abs(zero) < limit) & inside & ~around
     if np.count_nonzero(table) < 500:
         return raised
     distance, threshold = color_distance(looked, table)
     if not np.isfinite(threshold):
         return raised
-    other = (distance > threshold) & looked.inside
+    other = (distance > threshold) & inside
     # Of another colour and a little above the table on the average of a window: a thin thing.  A shadow or a print lies at 0.
     near = other & valid & (zero < 0.03)
     total = cv2.blur(np.where(near, looked.raw, np.float32(0)), (9, 9), borderType=cv2.BORDER_CONSTANT)
@@ -333,7 +338,7 @@ def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     small = mask.astype(np.uint8)
     wide = cv2.dilate(small, kernel)
-    band = (wide > 0) & ~(cv2.erode(small, kernel) > 0) & looked.inside
+    band = (wide > 0) & ~(cv2.erode(small, kernel) > 0) & looked.open
     if not band.any():
         return mask
     inner = (cv2.erode(small, np.ones((3, 3), np.uint8)) > 0).astype(np.float32)

@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, JointState
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magic_core import conversions as cv
@@ -671,3 +671,39 @@ def test_what_never_came_is_named_before_what_has_stopped():
         stream.last["depth"] = now - 30.0
         assert "STALE_DATA" in bench.node.camera_status("left", now).message
         assert "color/image_raw" in bench.node.camera_status("left", now).message
+
+
+def test_the_arm_is_cut_out_where_joint_states_tell_of_it(frames):
+    """With the arm before the cameras: without joint states what hangs is told, with them it is gone and the diagnostics are content."""
+    from magic_core.robot import Description
+    from magic_core.robot_pictures import RobotPictures
+
+    robot = Description()
+    joints = np.array([0.0, 0.35, 0.0, -2.1, 0.0, 2.45, np.pi / 4, 0.04, 0.04])
+    meshes = [scenes.shape("cylinder", 2, 0.70, 0.0), *RobotPictures(robot).at(joints)]
+    # Before the arm, as the recorded scenes have it: from behind it hides what is on the table.
+    eyes = {"left": scenes.pose([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": scenes.pose([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
+    views = [scenes.capture(meshes, name, i, world_from_camera=eye)[0] for i, (name, eye) in enumerate(eyes.items())]
+    positions = robot.arm_positions(joints)
+    with Bench(region_low=[0.15, -0.6, -0.05]) as bench:
+        stamped = []
+        for name, eye in eyes.items():
+            t = TransformStamped(child_frame_id=f"{name}_color_optical_frame", transform=cv.transform_to_msg(eye))
+            t.header.frame_id = "panda_link0"
+            stamped.append(t)
+        told = bench.tester.create_publisher(JointState, "joint_states", SENSOR)
+        seconds = [0.0]
+
+        def tick(with_joints):
+            bench.tf.publish(tf2_msgs.TFMessage(transforms=stamped))
+            seconds[0] += 0.15
+            if with_joints:
+                told.publish(JointState(header=cv.header("", 10.0 + seconds[0]), name=list(positions), position=list(positions.values())))
+            for view in views:
+                bench.send(later(view, 10.0 + seconds[0]))
+
+        bench.until(lambda: "SOMETHING_HANGS" in bench.codes(), "word of what hangs", 60, lambda: tick(False))
+        assert any(item.hanging for item in bench.objects[-1].objects)
+        bench.until(lambda: len(bench.objects[-1].objects) == 1, "scene without the arm", 60, lambda: tick(True))
+        assert not bench.objects[-1].objects[0].hanging
+        bench.until(lambda: any(m.endswith("robot: OK") for m in bench.messages()), "content with the robot", 30, lambda: tick(True))

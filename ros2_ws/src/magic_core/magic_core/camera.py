@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,8 @@ class RgbdFrame:
 
     color (H, W, 3) uint8 RGB; depth (H, W) float32 metres, NaN where there is
     none; world_from_camera (4, 4) pose of the colour optical frame; stamp in seconds.
+    blind (H, W) bool: something that is no part of the scene (the robot) stands before
+    it there, so that the pixel tells nothing, neither of things nor of free space.
     """
 
     color: NDArray[np.uint8]
@@ -60,6 +62,7 @@ class RgbdFrame:
     world_from_camera: NDArray[np.float64]
     camera: str = "camera"
     stamp: float = 0.0
+    blind: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
@@ -69,3 +72,10 @@ class RgbdFrame:
             )
         if self.depth.shape != size:
             raise MagicError(Code.BAD_IMAGE, f"depth image of {self.camera}", self.depth.shape, f"{size}, the size of its colour image")
+        if self.blind is not None and self.blind.shape != size:
+            raise MagicError(Code.BAD_IMAGE, f"blind pixels of {self.camera}", self.blind.shape, f"{size}, the size of its colour image")
+
+    def blinded(self, pixels: NDArray[np.bool_]) -> RgbdFrame:
+        """The frame without the depth of these pixels (H, W), which are blind from now on."""
+        blind = pixels if self.blind is None else self.blind | pixels
+        return replace(self, depth=np.where(pixels, np.float32(np.nan), self.depth), blind=blind)

@@ -338,6 +338,7 @@ def object_to_msg(item: SceneObject, header: Header) -> mi.SceneObject:
     msg = mi.SceneObject(id=item.id, source=item.source, camera=item.camera, confidence=float(item.confidence))
     msg.seen_share = float(item.seen_share)
     msg.cut_off = list(item.cut_off)
+    msg.hanging = item.hanging
     msg.pose = pose_to_msg(item.world_from_object)
     msg.mesh = mesh_to_msg(item.mesh)
     msg.pieces = [mesh_to_msg(piece) for piece in item.pieces]
@@ -382,6 +383,7 @@ def object_from_msg(msg: mi.SceneObject) -> SceneObject:
         source=msg.source,
         seen_share=float(msg.seen_share),
         cut_off=tuple(msg.cut_off),
+        hanging=msg.hanging,
     )
 
 

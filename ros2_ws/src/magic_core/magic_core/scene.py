@@ -13,7 +13,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 
 #: What besides an object's id may stand in SceneObject.cut_off: the border of the pictures, of the region of interest, a known object or the robot.
-PICTURE, REGION, FIXTURE = "picture", "region", "fixture"
+PICTURE, REGION, FIXTURE, ROBOT = "picture", "region", "fixture", "robot"
 
 VIEW_KINDS = ("top", "side", "section")
 
@@ -81,11 +81,13 @@ class SceneObject:
     fill the mesh (they are what physics and planning use).  points (N, 3) world
     metres with colors (N, 3) uint8 are the cleaned cloud.  mask (H, W) bool in the
     image of ``camera``.  box_extents (3,) metres along the axes of world_from_box.
+    ``hanging``: it is above the table with nothing below that could carry it: a hand,
+    the arm, a cable, and no thing to plan with.
     ``source`` is ``camera``, or ``known`` for a calibrated fixture or a given mesh.
     ``confidence`` 0..1 is the chance, as measured on known scenes, that mask and solid
     overlap the truth by more than 0.8; ``seen_share`` 0..1 how much of the mesh's surface,
     what rests on the table left out, a camera saw.  ``cut_off`` names what keeps a part out
-    of sight: ``picture``, ``region``, ``fixture``, or ids of objects in front; such a
+    of sight: ``picture``, ``region``, ``fixture``, ``robot``, or ids of objects in front; such a
     thing is no whole tool.
     """
 
@@ -104,6 +106,7 @@ class SceneObject:
     source: str = "camera"
     seen_share: float = 1.0
     cut_off: tuple[str, ...] = ()
+    hanging: bool = False
 
 
 @dataclass(frozen=True)

@@ -162,15 +162,14 @@ class SelfFilter:
         if c0 >= c1 or r0 >= r1:
             return
         # The middle of each block of pixels; rays are one long in depth, so that their length to the hit is the depth.
-        u, v = ((np.arange(*span) + 0.5) * STEP - 0.5 for span in ((c0, c1), (r0, r1)))
-        link_from_camera = transforms.inverse(camera_from_link)
+        u, v = ((np.arange(*span, dtype=np.float32) + 0.5) * STEP - 0.5 for span in ((c0, c1), (r0, r1)))
+        across, down = ((u - np.float32(k.cx)) / np.float32(k.fx))[None, :], ((v - np.float32(k.cy)) / np.float32(k.fy))[:, None]
+        link_from_camera = transforms.inverse(camera_from_link).astype(np.float32)
         rays = np.empty((len(v), len(u), 6), np.float32)
-        rays[..., 3:] = (
-            ((u - k.cx) / k.fx)[None, :, None] * link_from_camera[:3, 0]
-            + ((v - k.cy) / k.fy)[:, None, None] * link_from_camera[:3, 1]
-            + link_from_camera[:3, 2]
-        )
-        rays[..., :3] = link_from_camera[:3, 3] + NEAR * rays[..., 3:]
+        for axis in range(3):
+            x, y, one, eye = link_from_camera[axis]
+            np.add(across * x + one, down * y, out=rays[..., 3 + axis])
+            np.add(rays[..., 3 + axis] * np.float32(NEAR), eye, out=rays[..., axis])
         depth = link.scene.cast_rays(self._o3d.core.Tensor(rays))["t_hit"].numpy() + np.float32(NEAR)  # type: ignore[attr-defined]
         window = (slice(r0, r1), slice(c0, c1))
         np.minimum(drawing.front[window], depth, out=drawing.front[window])

@@ -1,0 +1,170 @@
+"""The arm in the picture is neither thing nor free space, what it hides keeps together, and what hangs is told from what stands."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.robot import Description
+from magic_core.robot_pictures import RobotPictures
+from magic_core.sensor import D435, capture, looking_at, scene_raycaster
+from magic_core.shapes import make
+from magic_perception.averaging import average
+from magic_perception.hidden import ROBOT
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import Report, perceive
+from magic_perception.robot_in_view import RobotInView
+
+CAMERAS = {"left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
+OVER_THE_TABLE = np.array([0.0, 0.35, 0.0, -2.1, 0.0, 2.45, np.pi / 4, 0.04, 0.04])
+REGION = Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5))
+
+
+@pytest.fixture(scope="module")
+def panda():
+    robot = Description()
+    return robot, RobotPictures(robot)
+
+
+def placed(family, seed, x, y, yaw=0.0, **parameters):
+    mesh = make(family, seed, **parameters).mesh
+    return mesh.transformed(transforms.from_rpy(0, 0, yaw, [x, y, -mesh.bounds[0, 2]]))
+
+
+def seen(meshes, seed=0, stamp=10.0):
+    """Frames of both cameras."""
+    caster = scene_raycaster(meshes)
+    return [
+        capture([], D435, pose, [seed, i], camera=name, stamp=stamp, raycaster=caster) for i, (name, pose) in enumerate(CAMERAS.items())
+    ]
+
+
+def told(robot, joints, at=10.0, **settings):
+    """The filter, told of joint positions at a stamp."""
+    view = RobotInView(robot, **settings)
+    positions = robot.arm_positions(joints)
+    view.history.take(list(positions), list(positions.values()), at)
+    return view
+
+
+def things():
+    return [
+        placed("caliper", 4, 0.44, -0.22, 0.5, beam=0.26, opening=0.105, jaw=0.07, width=0.022, thickness=0.018),
+        placed("cylinder", 9, 0.70, 0.0, radius=0.03),
+    ]
+
+
+def middles(scene):
+    return np.array(sorted((o.world_from_box[:2, 3].tolist() for o in scene.objects), key=lambda c: c[1]))
+
+
+def test_the_arm_alone_is_nothing(panda):
+    robot, pictures = panda
+    view = told(robot, OVER_THE_TABLE)
+    scene = perceive([view.cut(frame) for frame in seen(pictures.at(OVER_THE_TABLE))], (), REGION)
+    assert scene.objects == ()
+
+
+def test_things_under_an_arm_are_those_without_it(panda):
+    robot, pictures = panda
+    view = told(robot, OVER_THE_TABLE)
+    with_arm = perceive([view.cut(frame) for frame in seen([*things(), *pictures.at(OVER_THE_TABLE)])], (), REGION)
+    without = perceive(seen(things()), (), REGION)
+    assert len(with_arm.objects) == len(without.objects) == 2
+    np.testing.assert_allclose(middles(with_arm), middles(without), atol=0.005)
+
+
+def test_an_arm_that_is_not_cut_hangs(panda):
+    """Without joint states hand, arm and fingers are seen; they are told from what stands."""
+    _, pictures = panda
+    report = Report()
+    scene = perceive(seen([*things(), *pictures.at(OVER_THE_TABLE)]), (), REGION, report=report)
+    standing = [o for o in scene.objects if not o.hanging]
+    assert len(standing) == 2 and len(scene.objects) > 2
+    np.testing.assert_allclose(
+        np.sort([o.world_from_box[1, 3] for o in standing]), np.sort(middles(perceive(seen(things()), (), REGION))[:, 1]), atol=0.005
+    )
+    assert any("hang" in note for note in report.notes)
+
+
+def test_what_stands_or_hangs_on_a_fixture_does_not_hang():
+    """A mug on its foot, a watch as an arch; a ball on a calibrated post, and the same ball in the air."""
+    standing = [placed("mug", 3, 0.5, -0.3, 1.2), placed("watch", 2, 0.42, 0.24, 2.4)]
+    scene = perceive(seen(standing), (), REGION)
+    assert len(scene.objects) == 2 and not any(o.hanging for o in scene.objects)
+    post = make("cylinder", 1, radius=0.015, half_height=0.1).as_object("post", transforms.make(translation=[0.5, 0.0, 0.1]))
+    ball = make("sphere", 0, radius=0.03).mesh.transformed(transforms.make(translation=[0.5, 0.0, 0.23]))
+    on_it = perceive(seen([post.mesh.transformed(post.world_from_object), ball]), (post,), REGION)
+    floating = perceive(seen([ball]), (), REGION)
+    assert [o.hanging for o in on_it.objects if o.source == "camera"] == [False]
+    assert [o.hanging for o in floating.objects] == [True]
+
+
+def across(frame, start, end, width):
+    """The frame, blind in a stripe between two places of the table."""
+    camera = transforms.inverse(frame.world_from_camera)
+    (u0, v0), (u1, v1) = frame.intrinsics.project(transforms.apply(camera, [start, end]))
+    stripe = np.zeros(frame.depth.shape, np.uint8)
+    cv2.line(stripe, (round(u0), round(v0)), (round(u1), round(v1)), 1, width)
+    return frame.blinded(stripe.astype(bool))
+
+
+def test_a_thing_on_both_sides_of_what_hides_it_is_one():
+    bar = make("cylinder", 1, radius=0.012, half_height=0.15).mesh.transformed(transforms.from_rpy(0, np.pi / 2, 0, [0.5, 0.1, 0.012]))
+    frames = [across(f, [0.5, -0.2, 0.0], [0.5, 0.4, 0.0], 60) for f in seen([bar])]
+    report = Report()
+    scene = perceive(frames, (), REGION, report=report)
+    assert len(scene.objects) == 1
+    assert scene.objects[0].box_extents.max() == pytest.approx(0.30, abs=0.03)
+    assert scene.objects[0].cut_off == ("robot",)
+    assert all((image[frame.blind] == ROBOT).all() for image, frame in zip(report.labels, frames, strict=True))
+
+
+def test_two_things_beside_each_other_stay_two_where_a_camera_sees_between():
+    pair = [
+        placed("cylinder", 1, 0.45, 0.1, radius=0.02, half_height=0.02),
+        placed("cylinder", 1, 0.58, 0.1, radius=0.02, half_height=0.02),
+    ]
+    left, right = seen(pair)
+    assert len(perceive([across(left, [0.515, -0.2, 0.0], [0.515, 0.4, 0.0], 70), right], (), REGION).objects) == 2
+
+
+def test_blind_pixels_are_blind_in_the_mean():
+    frames = seen(things())[:1] * 3
+    stripe = np.zeros(frames[0].depth.shape, bool)
+    stripe[:, 100:150] = True
+    mean = average([frames[0].blinded(stripe), *frames[1:]])
+    assert (mean.blind == stripe).all() and np.isnan(mean.depth[stripe]).all()
+    assert average(frames).blind is None
+
+
+def test_fingers_that_nothing_is_told_of_may_be_anywhere(panda):
+    robot, _ = panda
+    view = RobotInView(robot)
+    view.history.take(robot.names, OVER_THE_TABLE[:7].tolist(), 10.0)
+    widths = {(s["panda_finger_joint1"], s["panda_finger_joint2"]) for s in view.states(10.0)}
+    assert widths == {(0.0, 0.0), (0.02, 0.02), (0.04, 0.04)}
+    view.history.take(["panda_finger_joint1"], [0.03], 10.0)
+    assert {s["panda_finger_joint2"] for s in view.states(10.0)} == {0.03}
+
+
+def test_where_the_joints_are_not_known_is_told(panda):
+    robot, _ = panda
+    frame = seen([])[0]
+    with pytest.raises(MagicError) as nothing:
+        RobotInView(robot).cut(frame)
+    assert nothing.value.code == Code.NO_FRAMES
+    with pytest.raises(MagicError) as stale:
+        told(robot, OVER_THE_TABLE, at=9.0).cut(frame)
+    assert stale.value.code == Code.STALE_DATA and "1.0" in stale.value.message
+    with pytest.raises(MagicError) as absent:
+        told(robot, OVER_THE_TABLE).cut(frame)
+    assert absent.value.code == Code.ROBOT_NOT_THERE
+
+
+def test_joint_states_on_their_way_are_waited_for(panda):
+    view = told(panda[0], OVER_THE_TABLE, at=10.0)
+    assert view.waits(10.1) and not view.waits(10.0) and not view.waits(12.0)
