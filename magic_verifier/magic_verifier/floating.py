@@ -38,18 +38,19 @@ PUSHED_OUT = 0.05
 class Body:
     """An object ready for physics: hull corners in its own frame and its pose; ``mesh``, where it is given, is the exact
     surface that it collides by instead, as long as it is not free; ``centre_shift`` (3,): by how much its centre of mass is
-    off that of the filled hulls, metres in its own frame."""
+    off that of the filled hulls, metres in its own frame; ``known_balls``: what ``balls`` says, where that is known."""
 
     id: str
     hulls: tuple[NDArray[np.float64], ...]
     world_from_object: NDArray[np.float64]
     mesh: Mesh | None = None
     centre_shift: NDArray[np.float64] | None = None
+    known_balls: tuple[tuple[NDArray[np.float64], float] | None, ...] | None = None
 
     @cached_property
     def balls(self) -> tuple[tuple[NDArray[np.float64], float] | None, ...]:
         """Of each hull the ball that it stands for, ``None`` where it is none."""
-        return tuple(sphere_of(hull) for hull in self.hulls)
+        return tuple(sphere_of(hull) for hull in self.hulls) if self.known_balls is None else self.known_balls
 
     @property
     def corners(self) -> NDArray[np.float64]:

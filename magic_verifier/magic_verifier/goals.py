@@ -51,7 +51,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.strategy import Strategy
 from magic_verifier.floating import TARGET, TOOL, fill_world, phase_end, phase_start
-from magic_verifier.simulation import DYNAMIC, KINEMATIC, to_pose
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, World, to_poses
 
 #: Contact is sought this far apart (m): bodies that press on each other rest at up to the solver's slop.
 TOUCH = 0.001
@@ -188,6 +188,7 @@ class Hook(GoalTest):
         self._touching: list[tuple[float, bool]] = []
         self._final: tuple[float, float, float] | None = None
         self._held: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._world: World | None = None
 
     def until(self, run: Any) -> float:
         # The retreat is looked at once, in the scene as given; what is judged is over by then.
@@ -271,7 +272,9 @@ class Hook(GoalTest):
         assert self._held is not None
         tool, target = self._held
         setup, settings = run.setup, run.setup.settings
-        world = self._hold_world(run)
+        if self._world is None:
+            self._world = self._hold_world(run)
+        world = self._world
         world.place(TOOL, tool)
         world.place(TARGET, target)
         along = np.cos(turn) * self.pull + np.sin(turn) * self.sideways
@@ -280,10 +283,13 @@ class Hook(GoalTest):
         steps = int(np.ceil(length / HOLD_SPEED * settings.frequency))
         kick *= np.sqrt(240.0 / settings.frequency)
         before = np.zeros(3)
+        stack = np.repeat(tool[None], steps, axis=0)
+        stack[:, :3, 3] += along * (length * np.arange(1, steps + 1) / steps)[:, None]
+        poses = to_poses(stack)
         for step in range(1, steps + 1):
             if kick > 0:
                 world.set_velocity(TARGET, world.velocity(TARGET) + self.rng.normal(0, kick) * across)
-            world.move_to(TOOL, to_pose(transforms.make(translation=along * length * step / steps) @ tool))
+            world.move_to(TOOL, poses[step - 1])
             world.step()
             if step == 2 * steps // 3:
                 before = transforms.apply(world.pose(TARGET), setup.target.centre) - length * step / steps * along
@@ -291,7 +297,7 @@ class Hook(GoalTest):
         slip = float(np.linalg.norm((after - before)[:2]) / (length / 3))
         return slip if np.isfinite(slip) else 1.0
 
-    def _hold_world(self, run: Any) -> Any:
+    def _hold_world(self, run: Any) -> World:
         """A world of the tool, moved, and the target on the table: what is around them is no part of the question."""
         assert self._held is not None
         tool, target = self._held

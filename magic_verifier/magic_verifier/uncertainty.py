@@ -152,16 +152,19 @@ class ShapeError:
         middle, extent = (low + high) / 2, high - low
         scale = np.clip(1 + self.size / np.maximum(extent, 1e-6), 0.5, 1.5)
         largest = max(float(extent.max()), 1e-6)
-        hulls = []
+        hulls: list[Array] = []
+        balls: list[tuple[Array, float] | None] = []
         for hull, ball in zip(body.hulls, body.balls, strict=True):
             if ball is not None:
-                grown = 1 + (float(self.size.mean()) + self.thickness) / (2 * ball[1])
-                hulls.append(ball[0] + max(grown, THINNEST) * (hull - ball[0]))
+                grown = max(1 + (float(self.size.mean()) + self.thickness) / (2 * ball[1]), THINNEST)
+                hulls.append(ball[0] + grown * (hull - ball[0]))
+                balls.append((ball[0], grown * ball[1]))
                 continue
             points = middle + scale * (_thicker(hull, self.thickness) - middle)
             angles = 2 * np.pi * (points - middle) @ self.vectors.T / largest + self.phases
             hulls.append(points + np.sin(angles) @ self.amplitudes)
-        return replace(body, hulls=tuple(hulls), mesh=None)
+            balls.append(None)
+        return replace(body, hulls=tuple(hulls), mesh=None, known_balls=tuple(balls))
 
 
 def _thicker(hull: Array, by: float) -> Array:
