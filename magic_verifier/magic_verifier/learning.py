@@ -416,7 +416,8 @@ def _shown(demonstration: Demonstration, strategy: Strategy, motion: _Motion, ma
             phases.append(Phase(name, start, until))
             start = until
     plan = MotionPlan("fg", ToolMotion(times, poses, tuple(phases)))
-    return verify(strategy, demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table, None, plan)
+    scene = demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table
+    return verify(strategy, *scene, None, plan, repetitions=1)  # it was made once, in the scene as it was
 
 
 def advice(learned: Learned) -> list[str]:
