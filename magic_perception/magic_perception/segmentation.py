@@ -138,11 +138,12 @@ def find_table(frames: list[RgbdFrame], parameters: Parameters, notes: list[str]
                 f"table found {1000 * centre[2]:.0f} mm from the base's height (region_low z: {1000 * low[2]:.0f} mm): heights are taken from the table found"
             )
     own = []
+    share = float(np.mean(np.abs(both.heights(everything)) < parameters.table_band))
     for cloud in clouds:
         plane = both
         heights = np.abs(both.heights(cloud))
         # Far from the common plane only where little lies near it: a tray's plane is not to be lost to the table's below it.
-        close = np.count_nonzero(heights < parameters.table_band) > 0.3 * both.inliers * len(cloud)
+        close = np.count_nonzero(heights < parameters.table_band) > 0.3 * share * len(cloud)
         near = cloud[heights < (parameters.table_band if close else APART)]
         if len(near) > 300:
             try:

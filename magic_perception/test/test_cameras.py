@@ -89,20 +89,21 @@ def slab(size, centre, color):
     return Mesh(np.asarray(box.vertices) + centre, np.asarray(box.faces)).painted(color)
 
 
-def test_things_on_a_tray_stand_on_the_tray():
-    tray = slab([0.36, 0.44, 0.018], [0.55, 0.0, 0.009], (60, 90, 120))
+@pytest.mark.parametrize("thickness", [0.018, 0.030], ids=["tray", "board"])
+def test_things_on_a_tray_stand_on_the_tray(thickness):
+    tray = slab([0.36, 0.44, thickness], [0.55, 0.0, thickness / 2], (60, 90, 120))
     things = [scenes.shape("l_hook", 1, 0.5, -0.08, 0.4), scenes.shape("cylinder", 1, 0.6, 0.1)]
-    lifted = [mesh.transformed(transforms.make(translation=[0, 0, 0.018])) for mesh in things]
+    lifted = [mesh.transformed(transforms.make(translation=[0, 0, thickness])) for mesh in things]
     caster = sensor.scene_raycaster([tray, *lifted])
     frames = [
         sensor.capture([], scenes.INTRINSICS, pose, [6, i], camera=name, raycaster=caster)
         for i, (name, pose) in enumerate(scenes.POSES.items())
     ]
     scene = perceive(frames, parameters=REGION)
-    assert len(scene.objects) == 2 and scene.table_height == pytest.approx(0.018, abs=0.002)
+    assert len(scene.objects) == 2 and scene.table_height == pytest.approx(thickness, abs=0.002)
     for mesh in lifted:
         found = min(scene.objects, key=lambda o: np.linalg.norm(o.world_from_object[:3, 3] - mesh.bounds.mean(axis=0)))
-        assert found.mesh.transformed(found.world_from_object).bounds[0, 2] == pytest.approx(0.018, abs=0.003)
+        assert found.mesh.transformed(found.world_from_object).bounds[0, 2] == pytest.approx(thickness, abs=0.003)
         np.testing.assert_allclose(np.sort(found.box_extents)[-1], np.sort(mesh.extents)[-1], rtol=0.25)
 
 
