@@ -27,9 +27,10 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
+from magic_core.views import as_it_stands
 from magic_matcher import contour as contours
 from magic_matcher import curvature, features, score
-from magic_matcher.matching import SAME_PLACE, Target, to_contact, tool_view
+from magic_matcher.matching import SAME_PLACE, Target, to_contact
 
 #: Points of a cloud; the voxel of FPFH as a share of the reference's diagonal; RANSAC's draws.
 POINTS, VOXEL, DRAWS = 3000, 0.03, 100_000
@@ -123,7 +124,7 @@ def by_shape(name: str, strategy: Strategy, tools: Sequence[SceneObject], target
     """The demonstrated contact carried over to each tool by one of :data:`ALIGNERS`, best first; raises ``NO_MATCH`` where there is none."""
     candidates = []
     for tool in tools:
-        view = tool_view(tool, strategy.view)
+        view = as_it_stands(tool, strategy.view)
         for tool_from_reference, quality in ALIGNERS[name](strategy.tool_mesh, tool.mesh, seed)[:top_k]:
             frame = tool_from_reference @ strategy.tool_contact.object_from_contact
             pixel = view.pixels(frame[:3, 3])
@@ -154,7 +155,7 @@ def by_curvature(
     ratio = reference.radius * reference.view.metres_per_pixel / of_reference
     found: list[ContactCandidate] = []
     for number, tool in enumerate(tools):
-        view = tool_view(tool, strategy.view)
+        view = as_it_stands(tool, strategy.view)
         contour = contours.extract(view.mask)
         scale = contour.size * view.metres_per_pixel if flat else target.contact.radius
         order = rng.permutation(len(contour.points))

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from magic_core.contact import Contact
 from magic_core.errors import MagicError
-from magic_matcher import drawing, embedded, features, jobs, matching, score, speed
+from magic_matcher import backends, drawing, embedded, jobs, matching, score, speed
 from magic_matcher.contour import Contour
 from magic_matcher.features import Reference, make_reference
 
@@ -128,8 +128,8 @@ def cases(count: int, seed: int = 0, only: str = "", tools: tuple[str, ...] = ()
 def variants(name: str, weights: str, family: str) -> dict[str, matching.Matcher | None]:
     """Matchers by variant for tools of a family; ``None``: the global stage alone, of ``full``."""
     if name == "dinov2":
-        full = features.load("dinov2", weights)
-        single = features.load("dinov2", weights, aggregation="none", components=None)
+        full = backends.load("dinov2", weights)
+        single = backends.load("dinov2", weights, aggregation="none", components=None)
         return {
             "full": matching.Matcher(full),
             "no patch, no PCA": matching.Matcher(single),

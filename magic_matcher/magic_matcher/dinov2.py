@@ -33,6 +33,9 @@ class Dinov2Features:
     """
 
     name = "dinov2"
+    # Cosines after a joint PCA have no common scale; none was fitted, as no trained weights could be reached.
+    floor = 0.0
+    clear = float("inf")
 
     def __init__(
         self,

@@ -54,6 +54,9 @@ SUPPRESSION = 0.08
 #: similarity = exp(-CONTRAST w . d): the fit settles w . d only up to a factor, and the sum with s_curv needs one.  With 0.2
 #: any lambda up to 0.15 leaves the order of clear cases alone and decides between near ones (docs/features.md).
 CONTRAST = 0.2
+#: What is less similar is no analogy, and from what on nothing better need be looked for: fitted to families of tools and of plain things
+#: (``ros2 run magic_matcher bench --controls``, docs/features.md).
+FLOOR, CLEAR = 0.33, 0.5
 
 
 @dataclass(frozen=True)
@@ -308,6 +311,8 @@ class EmbeddedFeatures:
     """Silhouette descriptors in contour frames; needs no weights to download, no GPU, about 20 ms a tool."""
 
     name = "embedded"
+    floor = FLOOR
+    clear = CLEAR
 
     def __init__(self, weight: NDArray[np.float64] | None = None) -> None:
         self._weights = weights() if weight is None else np.asarray(weight, dtype=float)

@@ -1,16 +1,14 @@
 """What a feature backend is: the global stage behind one interface.
 
 A backend looks at the reference once (:meth:`Features.prepare`, cached by the caller)
-and then proposes contact points on any number of new tools.  ``embedded`` ships with
-the package; ``dinov2`` needs weights.  ``auto`` takes ``dinov2`` where weights are
-named and the embedded one everywhere else.
+and then proposes contact points on any number of new tools.  Which there are says
+:mod:`magic_matcher.backends`.
 """
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,9 +18,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
 from magic_core.strategy import Strategy
 from magic_matcher import contour as contours
+from magic_matcher import curvature
 from magic_matcher.contour import Contour
-
-BACKENDS = ("auto", "embedded", "dinov2")
 
 
 @dataclass(frozen=True)
@@ -76,9 +73,15 @@ class GlobalMatch:
 
 
 class Features(Protocol):
-    """The global stage of the matcher."""
+    """The global stage of the matcher.
+
+    floor: the similarity below which a place is no analogy, 0 where the scale of the similarity is not known; clear: that from which on
+    a match in the view of a tool as it stands needs no other view to be looked at, ``inf`` where that is not known.
+    """
 
     name: str
+    floor: float
+    clear: float
 
     def key(self) -> str:
         """A name for everything about this backend that shapes what it prepares, for caches."""
@@ -130,8 +133,6 @@ def make_reference(
 
     ``POINT_OUTSIDE`` where the point is off the picture or farther from the edge of the object than a tenth of its size.
     """
-    from magic_matcher import curvature
-
     contour = contours.extract(view.mask) if contour is None else contour
     pixel = np.asarray(pixel, dtype=float)
     height, width = view.mask.shape
@@ -163,28 +164,3 @@ def from_strategy(strategy: Strategy) -> Reference:
     target = strategy.target_contact
     radius = target.radius / strategy.tool_view.metres_per_pixel if np.isfinite(target.radius) and not target.concave else None
     return make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
-
-
-def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: Any) -> Features:
-    """A backend by name; raises ``UNKNOWN_FEATURES`` or ``FEATURE_WEIGHTS`` saying what was looked for."""
-    if name not in BACKENDS:
-        raise MagicError(Code.UNKNOWN_FEATURES, "features", name, BACKENDS)
-    if name == "dinov2" or (name == "auto" and weights):
-        from magic_matcher.dinov2 import Dinov2Features
-
-        if not weights:
-            raise MagicError(
-                Code.FEATURE_WEIGHTS,
-                "weights",
-                weights,
-                "a hub name such as facebook/dinov2-base, or a folder with config.json and model.safetensors",
-            )
-        folder = Path(weights).expanduser()
-        if folder.is_dir():
-            return Dinov2Features(str(folder), device, **options)
-        if weights.startswith(("/", ".", "~")) or weights.count("/") > 1:  # no hub name looks like this
-            raise MagicError(Code.FEATURE_WEIGHTS, "weights", weights, "a folder that exists, or a hub name such as facebook/dinov2-base")
-        return Dinov2Features(weights, device, **options)
-    from magic_matcher.embedded import EmbeddedFeatures
-
-    return EmbeddedFeatures(**options)

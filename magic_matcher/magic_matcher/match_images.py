@@ -32,8 +32,8 @@ import numpy as np
 
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
+from magic_matcher import backends, curvature, drawing, features, images, matching
 from magic_matcher import contour as contours
-from magic_matcher import curvature, drawing, features, images, matching
 from magic_matcher.cache import Cache
 
 
@@ -92,7 +92,7 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     second = images.load(given.target, given.target_mask)
     reference = _reference(first, np.array(given.reference_point, dtype=float))
     matcher = matching.Matcher(
-        features.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None
+        backends.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None
     )
     contact = matching.to_contact(first.view, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
     result = matcher.match_views(reference, contact, [matching.Tool("target", second.view)], None, given.top, heatmap=True)
@@ -149,7 +149,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--reference-mask", metavar="M.png", help="its mask, 255 on the tool; without one the background must be plain")
     p.add_argument("--target", required=True, metavar="T.png", help="picture of the new tool")
     p.add_argument("--target-mask", metavar="M.png", help="its mask")
-    p.add_argument("--features", default="auto", choices=features.BACKENDS, help="feature backend (default: auto)")
+    p.add_argument("--features", default="auto", choices=backends.BACKENDS, help="feature backend (default: auto)")
     p.add_argument("--weights", default="", help="hub name or folder of weights, for dinov2")
     p.add_argument("--device", default="cpu", help="torch device (default: cpu)")
     p.add_argument("--top", type=int, default=3, metavar="K", help="how many candidates (default: 3)")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,24 +23,29 @@ from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.shapes import section_view
 from magic_core.strategy import Strategy
+from magic_core.views import as_it_stands, own_views, square_on
 from magic_matcher import contour as contours
 from magic_matcher import curvature, features, score
 from magic_matcher.contour import Contour
-from magic_matcher.features import Features, GlobalMatch, Proposal, Reference
+from magic_matcher.features import Features, Proposal, Reference
+from magic_matcher.plausible import Demands, Refusal, demands, refusals
 
-#: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them.
-OVERSAMPLING = 2
+#: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
+#: all of these are refused.
+OVERSAMPLING, RESERVE = 2, 5
 #: Two candidates nearer than this share of the tool's size are the same place.
 SAME_PLACE = 0.06
 #: What faces a direction does so within this angle (rad); narrower ways across (share of the object's size) are the raster's.
 FACING, LEAST_ACROSS = np.deg2rad(30.0), 0.03
+#: By so much a match in another view must be better for the tool to be turned for it.
+WORTH_TURNING = 0.05
 
 
 @dataclass(frozen=True)
 class MatchResult:
     """candidates best first (of all tools together); heatmap (H, W) float32 0..1 over the view
-    of the best candidate's tool, ``None`` unless asked for; views: the view that was matched,
-    for each tool id; target_id: '' where the target came as a view or there was none."""
+    of the best candidate's tool, ``None`` unless asked for; views: the view in which its
+    candidates were found, for each tool id; target_id: '' where the target came as a view or there was none; refused: why other tools have no candidate."""
 
     candidates: tuple[ContactCandidate, ...]
     heatmap: NDArray[np.float32] | None
@@ -49,14 +54,20 @@ class MatchResult:
     features: str
     seconds: float
     target_view: CanonicalView | None = None
+    refused: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Tool:
-    """A tool to consider: its id and the view in which contacts are matched."""
+    """A tool to consider: its id, the view in which contacts are matched, and what draws further ones, where it can be turned.
+
+    askew: the view is not square to the tool, and stands back behind the others.
+    """
 
     id: str
     view: CanonicalView
+    others: Callable[[], Sequence[CanonicalView]] = tuple
+    askew: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,13 +82,23 @@ class Target:
 # ---------------------------------------------------------------- views
 
 
-def tool_view(item: SceneObject, kind: str) -> CanonicalView:
-    """The view of an object that a strategy matches in: the published one, or drawn again from the mesh where the kind differs."""
-    if item.view.kind == kind:
-        return item.view
-    from magic_core.views import find_view
+def tool_of(item: SceneObject, kind: str) -> Tool:
+    """An object as a tool: seen in the view of a kind as it stands, and, where that is not enough, in those of its own shape.
 
-    return find_view(item.mesh, item.pieces, kind)
+    A hanger that lies on the table is edge-on in the side view of how it lies; the plane in which it is used is its own.
+    """
+    try:
+        view = as_it_stands(item, kind)
+    except MagicError as error:
+        if error.code is not Code.BAD_MESH:
+            raise
+        views = own_views(item.mesh, item.pieces, kind)
+        if not views:
+            raise
+        return Tool(item.id, views[0], lambda: views[1:])
+    return Tool(
+        item.id, view, lambda: own_views(item.mesh, item.pieces, kind, view.direction), not square_on(item.mesh, view.direction, kind)
+    )
 
 
 def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
@@ -256,7 +277,15 @@ class Matcher:
         target as a view alone stands in the pose of its view frame's object (the object frame is taken for the world).
         """
         start = time.perf_counter()
-        drawn = [item if isinstance(item, Tool) else Tool(item.id, tool_view(item, strategy.view)) for item in tools]
+        drawn: list[Tool] = []
+        unseen: list[MagicError] = []
+        for item in tools:
+            try:
+                drawn.append(item if isinstance(item, Tool) else tool_of(item, strategy.view))
+            except MagicError as error:  # a mesh that cannot be drawn is no reason to leave out the others
+                unseen.append(MagicError(error.code, f"{item.id}: {error.message}"))
+        if unseen and not drawn:
+            raise unseen[0]
         met: Target | None = None
         if isinstance(target, SceneObject):
             view = target_view(target, strategy)
@@ -264,7 +293,8 @@ class Matcher:
         elif target is not None:
             met = Target("", target, target_contact(strategy, target, np.eye(4)))
         reference = features.from_strategy(strategy)
-        return self.match_views(reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start)
+        found = self.match_views(reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start)
+        return replace(found, refused=(*found.refused, *(error.message for error in unseen)))
 
     def match_views(
         self,
@@ -287,62 +317,118 @@ class Matcher:
         # The radius of the disc that the tool is to hold; what is flat or is met inside is no disc.
         round_target = target is not None and np.isfinite(target.contact.radius) and not target.contact.concave
         use_target = round_target and reference_target_radius is not None and np.isfinite(reference_target_radius)
+        asked = demands(reference, self.backend.floor)
+        reference_scale = reference_target_radius if use_target else reference.contour.size * reference.view.metres_per_pixel
+        ratio = reference.radius * reference.view.metres_per_pixel / reference_scale
+        task = _Task(reference, reference_contact, prepared, asked, ratio, target, bool(round_target), bool(use_target), top_k, heatmap)
         found: list[tuple[ContactCandidate, NDArray[np.float32] | None]] = []
+        views: dict[str, CanonicalView] = {}
         failures: list[MagicError] = []
         for tool in tools:
             try:
-                contour = contours.extract(tool.view.mask)
-                radius = target.contact.radius / tool.view.metres_per_pixel if round_target else None
-                proposals = self.backend.propose(prepared, tool.view, contour, radius, OVERSAMPLING * top_k, heatmap)
-                reference_scale = reference_target_radius if use_target else reference.contour.size * reference.view.metres_per_pixel
-                scale = target.contact.radius if use_target else contour.size * tool.view.metres_per_pixel
-                ratio = reference.radius * reference.view.metres_per_pixel / reference_scale
-                ranked = self._refine(reference, reference_contact, ratio, scale, tool, contour, proposals, target, top_k)
-                found.extend((candidate, proposals.heatmap) for candidate in ranked)
+                seen = self._seen_best(task, tool)
+                views[tool.id] = seen.view
+                found.extend((candidate, seen.heatmap) for candidate in seen.candidates)
             except MagicError as error:
+                views[tool.id] = tool.view
                 failures.append(error)
         if not found:
             if len(failures) == 1:
                 raise failures[0]
-            raise MagicError(
-                Code.NO_MATCH, "tools without a usable contact", "; ".join(f.message for f in failures), "a tool with an edge to follow"
-            )
+            raise MagicError(Code.NO_MATCH, "no tool has a place like the demonstrated contact: " + "; ".join(f.message for f in failures))
         found.sort(key=lambda pair: -pair[0].score)
         return MatchResult(
             candidates=tuple(candidate for candidate, _ in found),
             heatmap=found[0][1],
-            views={tool.id: tool.view for tool in tools},
+            views=views,
             target_id=target.id if target is not None else "",
             features=self.backend.name,
             seconds=time.perf_counter() - start,
             target_view=target.view if target is not None else None,
+            refused=tuple(failure.message for failure in failures),
         )
 
+    def _seen_best(self, task: _Task, tool: Tool) -> _Seen:
+        """The tool's candidates in the one of its views that shows the contact best.
+
+        The view as the tool stands is taken where the match in it is clear, or where no other is better by enough to turn the tool;
+        if it is askew, only where no other shows a contact.  Raises NO_MATCH with what the best place of all views lacks.
+        """
+        failures: list[tuple[float, MagicError]] = []
+
+        def look(view: CanonicalView) -> _Seen | None:
+            try:
+                seen = self._in_view(task, tool.id, view)
+            except MagicError as error:
+                failures.append((-1.0, error))
+                return None
+            if not seen.candidates:
+                failures.append((seen.refusal.similarity if seen.refusal is not None else -1.0, _no_match(tool.id, seen.refusal)))
+                return None
+            return seen
+
+        best = None if tool.askew else look(tool.view)
+        if best is not None and max(c.s_dino for c in best.candidates) >= self.backend.clear:
+            return best
+        value = -np.inf if best is None else best.candidates[0].score + WORTH_TURNING
+        for view in tool.others():
+            seen = look(view)
+            if seen is not None and seen.candidates[0].score > value:
+                best, value = seen, seen.candidates[0].score
+        if best is None and tool.askew:
+            best = look(tool.view)
+        if best is None:
+            raise max(failures, key=lambda failure: failure[0])[1]
+        return best
+
+    def _in_view(self, task: _Task, tool_id: str, view: CanonicalView) -> _Seen:
+        """The best different places of one view that can stand in for the contact."""
+        contour = contours.extract(view.mask)
+        radius = task.target.contact.radius / view.metres_per_pixel if task.target is not None and task.round_target else None
+        proposals = self.backend.propose(task.prepared, view, contour, radius, RESERVE * task.top_k, task.heatmap)
+        first = OVERSAMPLING * task.top_k
+        refused: list[Refusal] = []
+        for some in (proposals.proposals[:first], proposals.proposals[first:]):
+            candidates, why = self._refine(task, tool_id, view, contour, radius, some)
+            refused += why
+            if candidates:
+                break
+        points = np.array([c.tool.pixel for c in candidates]).reshape(-1, 2)
+        order = features.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, task.top_k)
+        worst = max(refused, key=lambda r: r.similarity, default=None)
+        return _Seen(view, [candidates[i] for i in order], worst, proposals.heatmap)
+
     def _refine(
-        self,
-        reference: Reference,
-        reference_contact: Contact,
-        ratio: float,
-        scale: float,
-        tool: Tool,
-        contour: Contour,
-        proposals: GlobalMatch,
-        target: Target | None,
-        top_k: int,
-    ) -> list[ContactCandidate]:
-        """The local stage on each proposal, the score, and the best ``top_k`` different places."""
+        self, task: _Task, tool_id: str, view: CanonicalView, contour: Contour, radius: float | None, proposals: Sequence[Proposal]
+    ) -> tuple[list[ContactCandidate], list[Refusal]]:
+        """The local stage on proposals and the score of those that can stand in for the contact; why the others cannot."""
+        reference, target = task.reference, task.target
+        scale = target.contact.radius if task.use_target and target is not None else contour.size * view.metres_per_pixel
+        starts = np.array([contour.nearest(proposal.pixel) for proposal in proposals], dtype=int)
+        estimates = curvature.estimate_many(contour, starts, reference.concave, two_step=self.two_step)
+        pairs = [(p, e) for p, e in zip(proposals, estimates, strict=True) if e is not None]
+        if not pairs:
+            return [], []
+        refused = refusals(
+            task.asked,
+            contour,
+            np.array([e.point for _, e in pairs]),
+            np.array([e.normal for _, e in pairs]),
+            np.array([e.concave for _, e in pairs]),
+            np.array([p.similarity for p, _ in pairs]),
+            radius,
+            view.metres_per_pixel,
+        )
         candidates: list[ContactCandidate] = []
-        starts = np.array([contour.nearest(proposal.pixel) for proposal in proposals.proposals], dtype=int)
-        found = curvature.estimate_many(contour, starts, reference.concave, two_step=self.two_step)
-        for proposal, local in zip(proposals.proposals, found, strict=True):
-            if local is None:
+        for (proposal, local), refusal in zip(pairs, refused, strict=True):
+            if refusal is not None:
                 continue
-            contact = to_contact(tool.view, local)
-            s_curv = score.curvature_score(ratio, contact.radius / scale, contact.concave == reference.concave)
+            contact = to_contact(view, local)
+            s_curv = score.curvature_score(task.ratio, contact.radius / scale, contact.concave == reference.concave)
             frame = turned_over(contact.object_from_contact) if proposal.flipped else contact.object_from_contact
             candidates.append(
                 ContactCandidate(
-                    tool_id=tool.id,
+                    tool_id=tool_id,
                     tool=contact,
                     target=target.contact if target is not None else None,
                     rotation=features.rotation_between(reference.normal, contact.normal, proposal.flipped),
@@ -350,16 +436,44 @@ class Matcher:
                     s_dino=proposal.similarity,
                     s_curv=s_curv,
                     score=score.combine(proposal.similarity, s_curv, self.weight),
-                    tool_from_reference=frame @ transforms.inverse(reference_contact.object_from_contact),
+                    tool_from_reference=frame @ transforms.inverse(task.reference_contact.object_from_contact),
                 )
             )
-        if not candidates:
-            raise MagicError(
-                Code.NO_MATCH, f"usable contacts on {tool.id or 'the tool'}", 0, "a tool with an edge of at least 5 points to fit"
-            )
-        points = np.array([c.tool.pixel for c in candidates])
-        order = features.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, top_k)
-        return [candidates[i] for i in order]
+        return candidates, [refusal for refusal in refused if refusal is not None]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); round_target: the target is a disc that the tool is to hold."""
+
+    reference: Reference
+    reference_contact: Contact
+    prepared: Any
+    asked: Demands
+    ratio: float
+    target: Target | None
+    round_target: bool
+    use_target: bool
+    top_k: int
+    heatmap: bool
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A tool in one view: its candidates, best first, and why the most similar of the refused places was refused."""
+
+    view: CanonicalView
+    candidates: list[ContactCandidate]
+    refusal: Refusal | None
+    heatmap: NDArray[np.float32] | None
+
+
+def _no_match(tool_id: str, refusal: Refusal | None) -> MagicError:
+    name = tool_id or "the tool"
+    if refusal is None:
+        return MagicError(Code.NO_MATCH, f"usable contacts on {name}", 0, "a tool with an edge of at least 5 points to fit")
+    what = f"{name}: {refusal.what} at its best place (similarity {refusal.similarity:.3f})"
+    return MagicError(Code.NO_MATCH, f"{what}: {refusal.value} (allowed: {refusal.allowed})")
 
 
 def match(
@@ -439,5 +553,5 @@ __all__ = [
     "support_point",
     "target_contact",
     "target_view",
-    "tool_view",
+    "tool_of",
 ]

@@ -21,9 +21,9 @@ from magic_core.strategy import Strategy
 from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
-from magic_matcher import features, matching
+from magic_matcher import backends, features, matching
+from magic_matcher.backends import BACKENDS
 from magic_matcher.cache import Cache
-from magic_matcher.features import BACKENDS
 
 
 class MatcherNode(Node):
@@ -55,7 +55,7 @@ class MatcherNode(Node):
         cache = nodes.parameter(
             self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True
         )
-        self._matcher = matching.Matcher(features.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
+        self._matcher = matching.Matcher(backends.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
         self._scene: Scene | None = None
         self._strategies: dict[str, tuple[int, Strategy]] = {}
         self._lock = threading.Lock()
@@ -169,6 +169,8 @@ class MatcherNode(Node):
         top_k = int(request.top_k) or int(self.get_parameter("top_k").value)
         result = self._matcher.match(found, tools, target, top_k, request.want_heatmap)
         response.code, response.message = int(Code.OK), f"{len(result.candidates)} candidates on {len(tools)} tool(s)"
+        if result.refused:
+            response.message += f"; none on: {'; '.join(result.refused)}"
         response.candidates = [conversions.candidate_to_msg(c, poses.get(c.tool_id)) for c in result.candidates]
         response.target_id = result.target_id
         response.features = result.features

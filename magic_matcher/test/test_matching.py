@@ -12,14 +12,15 @@ from magic_core.contact import turned_over
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import from_trimesh
 from magic_core.scene import CanonicalView, Scene, SceneObject
-from magic_matcher import contour, features, jobs, matching
+from magic_core.views import find_view, view_of_contact
+from magic_matcher import backends, contour, jobs, matching, plain, plausible
 from magic_matcher.cache import Cache
 from magic_matcher.features import make_reference
 
 
 @pytest.fixture(scope="module")
 def matcher():
-    return matching.Matcher(features.load("embedded"))
+    return matching.Matcher(backends.load("embedded"))
 
 
 def reference_of(job, family, region, seed, radius):
@@ -118,10 +119,100 @@ def test_candidates_are_different_places_best_first(matcher):
 
 def test_the_better_tool_is_selected(matcher):
     reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
-    tools = [matching.Tool("letter_i", shapes.make("letter", 0, glyph="I").view()), matching.Tool("hook", shapes.make("l_hook", 8).view())]
+    tools = [matching.Tool(name, shapes.make(name, 8).view()) for name in ("s_hook", "l_hook")]
+    tools.append(matching.Tool("letter_i", shapes.make("letter", 0, glyph="I").view()))
     result = matcher.match_views(reference, contact, tools, jobs.disc_target(0.025, "top"), reference_target_radius=0.025)
-    assert result.candidates[0].tool_id == "hook"
-    assert {c.tool_id for c in result.candidates} == {"letter_i", "hook"}
+    assert result.candidates[0].tool_id == "l_hook"
+    # A letter I has no inner corner: it is no tool for this, however few there are.
+    assert {c.tool_id for c in result.candidates} == {"s_hook", "l_hook"}
+
+
+# ---------------------------------------------------------------- places that are none
+
+
+def ring(inner):
+    """A view of a ring of 8 px stock, inner radius in px of 1 mm."""
+    v, u = np.mgrid[0:161, 0:161] - 80.0
+    distance = np.hypot(u, v)
+    mask = (distance <= inner + 8) & (distance >= inner)
+    return CanonicalView(np.where(mask[..., None], 150, 0).astype(np.uint8).repeat(3, axis=2), mask, 0.001, np.eye(4), "side")
+
+
+@pytest.mark.parametrize(("kind", "family"), [("hooking", "disc"), ("hooking", "bar"), ("hanging", "rod"), ("scooping", "polygon")])
+def test_things_without_a_hollow_are_no_tools(matcher, kind, family):
+    job = jobs.JOBS[kind]
+    source, region = next(iter(job.references.items()))
+    radius = float(np.mean(job.targets))
+    reference, contact = reference_of(kind, source, region, 5001, radius)
+    for seed in range(4):
+        tool = matching.Tool(family, plain.view(family, seed, job.view, rough=seed % 2 == 1))
+        with pytest.raises(MagicError, match=rf"{family}: .* \(similarity 0\.\d+\): .*allowed") as caught:
+            matcher.match_views(reference, contact, [tool], jobs.disc_target(radius, job.view), reference_target_radius=radius)
+        assert caught.value.code == Code.NO_MATCH
+
+
+@pytest.mark.parametrize(("inner", "radius", "fits"), [(20.0, 6.0, True), (30.0, 10.0, True), (10.0, 12.0, False), (8.0, 20.0, False)])
+def test_a_hole_takes_no_target_that_is_wider(matcher, inner, radius, fits):
+    reference, contact = reference_of("hanging", "hanger", "hook", 5001, 0.006)
+    tool, target = matching.Tool("ring", ring(inner)), jobs.disc_target(radius / 1000, "side")
+    if fits:
+        best = matcher.match_views(reference, contact, [tool], target, reference_target_radius=0.006).candidates[0].tool
+        assert best.concave and np.hypot(*(best.pixel - 80)) == pytest.approx(inner, abs=2)
+        return
+    with pytest.raises(MagicError) as caught:
+        matcher.match_views(reference, contact, [tool], target, reference_target_radius=0.006)
+    assert caught.value.code == Code.NO_MATCH
+    # The inside of the ring itself: what is refused there is the room, to the millimetre.
+    c = contour.extract(tool.view.mask)
+    index = c.nearest((80.0, 80.0 - inner))
+    asked = plausible.demands(reference, 0.0)
+    given = (c, c.points[[index]], c.normals[[index]], np.array([True]), np.array([0.9]), radius, 0.001)
+    (refusal,) = plausible.refusals(asked, *given)
+    assert refusal.what == "radius of the free room" and float(refusal.value.split()[0]) == pytest.approx(inner, abs=1.0)
+    assert f"{radius:.1f} mm" in refusal.allowed
+
+
+def test_the_sign_is_the_references(matcher):
+    reference, _ = reference_of("hanging", "hanger", "hook", 5001, 0.006)
+    c = contour.extract(ring(20.0).mask)
+    outside = c.nearest((80.0, 52.0))
+    given = (c, c.points[[outside]], c.normals[[outside]], np.array([False]), np.array([0.9]), 6.0, 0.001)
+    (refusal,) = plausible.refusals(plausible.demands(reference, 0.0), *given)
+    assert refusal.value == "convex" and refusal.allowed.startswith("concave")
+    # Called concave by mistake it is still no hollow for the target.
+    (refusal,) = plausible.refusals(plausible.demands(reference, 0.0), *given[:3], np.array([True]), *given[4:])
+    assert refusal.what == "depth of the hollow" and float(refusal.value.split()[0]) < 0.5
+    # A convex contact asks neither for room nor for a hollow.
+    bump = make_reference(ring(20.0), np.array([80.0, 52.0]), target_radius=6.0)
+    assert plausible.demands(bump, 0.3) == plausible.Demands(False, 0.3, None, None)
+
+
+# ---------------------------------------------------------------- tools in any attitude
+
+
+@pytest.mark.parametrize(("family", "regions"), [("mug", ("handle", "handle_loop")), ("hanger", ("hook",)), ("s_hook", ("upper", "lower"))])
+def test_the_contact_follows_the_tool_in_any_attitude(matcher, demonstration, family, regions):
+    shown = jobs.example("hanging", "hanger", 5001)
+    found = replace(
+        demonstration,
+        view="side",
+        tool_view=shown.view,
+        tool_contact=shown.contact("hook"),
+        target_view=jobs.disc_target(0.006, "side").view,
+        target_contact=jobs.disc_target(0.006, "side").contact,
+    )
+    made = shapes.make(family, 4)
+    target = jobs.disc_target(0.006, "side").view
+    for angles in ((0, 0, 0), (np.pi / 2, 0, 0.3), (0, np.pi / 2, 1.0), (2.0, -0.7, 0.4)):
+        turn = transforms.from_rpy(*angles, (0.1, -0.2, 0.05))
+        mesh, pieces = made.mesh.transformed(turn), tuple(piece.transformed(turn) for piece in made.pieces)
+        item = SceneObject("tool", mesh, pieces, np.eye(4), find_view(mesh, pieces))
+        result = matcher.match(replace(found, target_normal=np.array([1.0, 0, 0])), [item], target, 1)
+        place = (transforms.inverse(turn) @ result.candidates[0].tool.object_from_contact)[:3, 3]
+        assert min(float(made.region(name).distance(place)[0]) for name in regions if name in made.regions) < 0.004
+        # The picture in which it was found can be drawn again from the contact alone.
+        again = view_of_contact(item, "side", result.candidates[0].tool.object_from_contact)
+        assert (again.mask == result.views["tool"].mask).mean() > 0.999
 
 
 # ---------------------------------------------------------------- targets
@@ -214,7 +305,7 @@ def test_target_and_tools_are_chosen_where_none_is_named(demonstration):
         with pytest.raises(MagicError) as caught:
             matching.select(scene, found, ids, name)
         assert caught.value.code == code
-    result = matching.match(found, tools, target, features.load("embedded"))
+    result = matching.match(found, tools, target, backends.load("embedded"))
     assert result.target_id == "cylinder" and result.candidates[0].target.radius > 0
     # Nothing is planned below a hand.
     with pytest.raises(MagicError) as caught:

@@ -81,7 +81,7 @@ def tested(options: Options, tool: str = "") -> dict[str, float]:
 
 @lru_cache(maxsize=4)
 def _matcher(features: str, weights: str, method: str) -> Any:
-    from magic_matcher.features import load
+    from magic_matcher.backends import load
     from magic_matcher.matching import Matcher
 
     if method == "no_feature_pca_patch":
@@ -250,7 +250,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
 def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: int) -> tuple[Sequence[Any], str]:
     """Ranked contacts by the method that is evaluated, and the features that it used."""
     from magic_matcher import baselines
-    from magic_matcher.matching import Target, Tool, target_contact, target_view, tool_view
+    from magic_matcher.matching import Target, target_contact, target_view, tool_of
 
     tools, target = problem.tools, problem.target
     met = met_at(problem.meeting, target, strategy.view) if problem.meeting is not None else None
@@ -265,7 +265,7 @@ def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: 
     if met is None:
         found = matcher.match(strategy, tools, target, top_k)
     else:
-        drawn = [Tool(tool.id, tool_view(tool, strategy.view)) for tool in tools]
+        drawn = [tool_of(tool, strategy.view) for tool in tools]
         reference = _reference(strategy)
         found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.radius)
     return found.candidates, found.features

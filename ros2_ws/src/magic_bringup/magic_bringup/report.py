@@ -184,15 +184,6 @@ def _table(plane: NDArray[np.float64], center: NDArray[np.float64], half: float)
     return Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])).painted((214, 209, 200))
 
 
-def tool_view(item: SceneObject, kind: str) -> CanonicalView:
-    """The object's view of that kind: the published one, or drawn again as the matcher does."""
-    if item.view.kind == kind:
-        return item.view
-    from magic_core.views import find_view
-
-    return find_view(item.mesh, item.pieces, kind)
-
-
 def target_view(item: SceneObject, strategy: strategies.Strategy) -> CanonicalView:
     """The target as the strategy looks at it: along its view direction, world z up (x up from above)."""
     from magic_core.rendering import canonical_view
@@ -335,6 +326,8 @@ def _cameras(record: Record, scene: Scene | None) -> str:
 
 
 def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -> str:
+    from magic_core.views import view_of_contact
+
     figures = [
         _figure(
             contact_picture(strategy.tool_view, strategy.tool_contact),
@@ -350,10 +343,10 @@ def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -
         candidate = conversions.candidate_from_msg(kept.candidate)
         best = conversions.candidate_from_msg(result.candidates[0].candidate)
         tool = scene.find(candidate.tool_id)
-        view = tool_view(tool, strategy.view)
+        view = view_of_contact(tool, strategy.view, candidate.tool.object_from_contact)
         if len(result.heatmap.data):
             heat = conversions.float_image_from_msg(result.heatmap)
-            first = tool_view(scene.find(best.tool_id), strategy.view)
+            first = view_of_contact(scene.find(best.tool_id), strategy.view, best.tool.object_from_contact)
             figures.append(
                 _figure(
                     contact_picture(first, best.tool, heat_picture(first, heat)),

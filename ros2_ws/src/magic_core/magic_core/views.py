@@ -12,11 +12,19 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.rendering import GREY, VIEW_FILL, VIEW_SIZE, Raycaster
-from magic_core.scene import VIEW_KINDS, CanonicalView
+from magic_core.scene import VIEW_KINDS, CanonicalView, SceneObject
 
 #: Horizontal directions tried for the side view, over half a turn, and the pixels of their silhouettes.
 _DIRECTIONS = 24
 _PROBE = 80
+#: Directions tried over half the sphere for the views of an object's own shape: 13 degrees apart.
+_SPHERE = 120
+#: Two views nearer than this show the same.
+_APART = np.deg2rad(25.0)
+#: A silhouette that tells less shows neither hole nor notch.
+_PLAIN = 0.03
+#: Skewness of a surface across a plane of symmetry, at most: reconstructions are not quite symmetric.
+_SKEW = 0.25
 
 
 def find_view(
@@ -40,8 +48,7 @@ def find_view(
         if kind == "section":
             return _section_of_cloud(cloud, size)
         mesh = mesh_of_cloud(cloud)
-    if len(mesh.faces) == 0:
-        raise MagicError(Code.BAD_MESH, "mesh to look at", "no faces", "at least one triangle")
+    _check(mesh)
     if kind is not None and kind not in VIEW_KINDS:
         raise MagicError(Code.BAD_REQUEST_IMAGE, "kind of view", kind, VIEW_KINDS)
     if kind == "top":
@@ -61,6 +68,170 @@ def find_view(
     if told > 1.2 * from_above and told > 0.03:
         return _drawn(mesh, direction, (0, 0, 1), "side", size, confidence)
     return _top(mesh, size, float(np.clip(0.5 + from_above - told, 0.1, 1.0)))
+
+
+def along(
+    mesh: Mesh, pieces: Sequence[Mesh] | None, kind: str, direction: ArrayLike, size: int = VIEW_SIZE, confidence: float = 1.0
+) -> CanonicalView:
+    """Draw an object in a view of a kind along a direction (3,) of its own frame: a silhouette, or (``section``) the cut across it.
+
+    Up in the picture is the object's z, or its y where that is what is looked along.  The same direction gives the same
+    picture, so that a contact's frame, whose z is the view's direction, tells in which picture it was found.
+    Raises ``BAD_MESH`` where there is nothing to see: a sheet seen edge-on, a cut that is empty.
+    """
+    _check(mesh)
+    direction = transforms.unit(direction)
+    up = np.array([0.0, 1.0, 0.0]) if abs(direction[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    if kind == "section":
+        y = transforms.unit((direction @ up) * direction - up)
+        return _cut_across(mesh, pieces, _moments(mesh)[1], np.cross(y, direction), y, size, confidence)
+    return _drawn(mesh, direction, up, kind, size, confidence)
+
+
+def as_it_stands(item: SceneObject, kind: str) -> CanonicalView:
+    """The view of a kind of an object as it lies or stands: the published one, or drawn from its mesh where the kind differs."""
+    return item.view if item.view.kind == kind else find_view(item.mesh, item.pieces, kind)
+
+
+def view_of_contact(item: SceneObject, kind: str, object_from_contact: NDArray[np.float64]) -> CanonicalView:
+    """The view of a kind in which a contact with this frame (4, 4) was found: its z is the view's direction."""
+    direction = object_from_contact[:3, 2]
+    try:
+        view = as_it_stands(item, kind)
+        if view.direction @ direction > 1 - 1e-6:
+            return view
+    except MagicError as error:
+        if error.code is not Code.BAD_MESH:
+            raise
+    return along(item.mesh, item.pieces, kind, direction)
+
+
+def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]:
+    """Directions (K, 3) of an object's own shape in which it may have been meant to be seen, whatever its attitude, best first.
+
+    Silhouettes: of the principal axes of the surface and of directions all over the sphere, those in which holes and
+    notches show most, at most ``count`` and well apart; none for what is convex from everywhere.  A hole shows in the topology of the mask
+    (:func:`holes_of`), how much it tells is its area.  ``section``: the three principal axes; a plane of symmetry is across one of them.
+    They turn with the object; of a direction and its opposite, whose pictures mirror each other, the one that looks down is given.
+    """
+    _check(mesh)
+    axes = _moments(mesh)[0]
+    if kind == "section":
+        return _downwards(axes)
+    caster = Raycaster([mesh])
+    # Fibonacci's spiral in the object's own axes.
+    k = np.arange(_SPHERE) + 0.5
+    height, angle = k / _SPHERE, np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - height**2)
+    tried = np.concatenate([axes, np.column_stack([across * np.cos(angle), across * np.sin(angle), height]) @ axes])
+    told = _told(caster, mesh, tried, axes)
+    found: list[NDArray[np.float64]] = []
+    # Summits alone: the slopes of one show the same, only worse.
+    near = np.abs(tried @ tried.T) > np.cos(0.8 * _APART)
+    left = (told > _PLAIN) & (told >= np.where(near, told, 0.0).max(axis=1))
+    while left.any() and len(found) < count:
+        best = int(np.argmax(np.where(left, told, -1.0)))
+        direction, value = _refined(caster, mesh, tried[best], axes)
+        # Shapes with a plane of symmetry are told best across it, exactly along an axis.
+        nearest = int(np.argmax(np.abs(axes @ direction)))
+        if abs(axes[nearest] @ direction) > np.cos(0.5 * _APART) and told[nearest] >= 0.9 * value:
+            direction = axes[nearest]
+        if all(abs(direction @ other) < np.cos(_APART) for other in found):
+            found.append(direction)
+        left &= (np.abs(tried @ direction) < np.cos(_APART)) & (np.abs(tried @ tried[best]) < np.cos(_APART))
+    return _downwards(np.array(found).reshape(-1, 3))
+
+
+def square_on(mesh: Mesh, direction: ArrayLike, kind: str) -> bool:
+    """Whether a direction (3,) looks at an object squarely: along a principal axis of its surface, to 12 degrees.
+
+    What is seen askew is drawn shorter than it is, and a contact found there lies beside the surface.  A section is square
+    only if the object is as heavy on one side of the plane as on the other, which a spoon is across its plane of symmetry alone.
+    """
+    direction = transforms.unit(direction)
+    axes, centroid = _moments(mesh)
+    if np.abs(axes @ direction).max() < np.cos(0.5 * _APART):
+        return False
+    if kind != "section":
+        return True
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
+    across = (corners.mean(axis=1) - centroid) @ direction
+    second, third = (float(np.average(across**n, weights=area)) for n in (2, 3))
+    return abs(third) < _SKEW * second**1.5
+
+
+def own_views(
+    mesh: Mesh, pieces: Sequence[Mesh] | None, kind: str, apart_from: ArrayLike | None = None, size: int = VIEW_SIZE
+) -> list[CanonicalView]:
+    """The views of a kind along :func:`own_directions`, but for those that show what ``apart_from`` (3,) shows already."""
+    directions = own_directions(mesh, kind)
+    if apart_from is not None:
+        known = transforms.unit(apart_from)
+        directions = directions[np.abs(directions @ known) < np.cos(0.4 * _APART)]
+    result = []
+    for direction in directions:
+        try:
+            result.append(along(mesh, pieces, kind, direction, size, 0.5))
+        except MagicError as error:
+            if error.code is not Code.BAD_MESH:
+                raise
+    return result
+
+
+def _downwards(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions (K, 3), turned round where they look up; level ones where they look along -y, then -x."""
+    sign = [-np.sign(next((v for v in d[::-1] if abs(v) > 1e-6), 1.0)) for d in directions]
+    return directions * np.array(sign).reshape(-1, 1)
+
+
+def _told(caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much the silhouettes along directions (D, 3) tell; the pictures turn with the object's own axes (3, 3)."""
+    up = np.where((np.abs(directions @ axes[0]) > 0.9)[:, None], axes[1], axes[0])
+    return np.array([_tells(mask) for mask in _silhouettes(caster, mesh, directions, up)[0]])
+
+
+def _refined(caster: Raycaster, mesh: Mesh, direction: NDArray[np.float64], axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The direction near the given one that tells most, from a parabola through what its neighbours tell, and how much it tells."""
+    value = 0.0
+    for reach in np.deg2rad([10.0, 5.0]):
+        x = transforms.unit(np.cross(direction, axes[int(np.argmin(np.abs(axes @ direction)))]))
+        y = np.cross(direction, x)
+        angle = np.arange(6) * np.pi / 3
+        steps = reach * np.concatenate([np.zeros((1, 2)), np.column_stack([np.cos(angle), np.sin(angle)])])
+        around = direction + steps @ np.array([x, y])
+        around /= np.linalg.norm(around, axis=1, keepdims=True)
+        told = _told(caster, mesh, around, axes)
+        u, v = (steps / reach).T
+        a, b, c, d, e, value = np.linalg.lstsq(np.column_stack([u * u, v * v, u * v, u, v, np.ones(7)]), told, rcond=None)[0]
+        bend = np.array([[2 * a, c], [c, 2 * b]])
+        if np.linalg.eigvalsh(bend)[-1] < -1e-6:  # a summit
+            move = np.linalg.solve(bend, [-d, -e])
+            move /= max(1.0, float(np.hypot(*move)))
+        else:
+            move = (steps / reach)[int(np.argmax(told))]
+        direction = transforms.unit(direction + reach * move @ np.array([x, y]))
+        value = float(told.max())
+    return direction, value
+
+
+def _moments(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The principal axes (3, 3) of a mesh's surface as rows, the longest first, and its centroid (3,)."""
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
+    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
+    middles = (corners + np.roll(corners, 1, axis=1)) / 2 - centroid
+    axes = np.linalg.eigh(np.einsum("n,nki,nkj->ij", area, middles, middles))[1].T[::-1].copy()
+    if np.linalg.det(axes) < 0:
+        axes[2] *= -1
+    return axes, centroid
+
+
+def _check(mesh: Mesh) -> None:
+    if len(mesh.faces) == 0:
+        raise MagicError(Code.BAD_MESH, "mesh to look at", "no faces", "at least one triangle")
+    if float(mesh.extents.max()) < 1e-6:
+        raise MagicError(Code.BAD_MESH, "size of the mesh to look at", f"{float(mesh.extents.max()):.1e} m", "more than a point")
 
 
 def mesh_of_cloud(points: NDArray[np.float64], colors: NDArray[np.uint8] | None = None, spacing: float | None = None) -> Mesh:
@@ -147,6 +318,8 @@ def _drawn(mesh: Mesh, direction: ArrayLike, up: ArrayLike, kind: str, size: int
     hits = scene.cast_rays(o3d.core.Tensor(rays))
     distance = hits["t_hit"].numpy()
     hit = np.isfinite(distance)
+    if not hit.any():
+        raise MagicError(Code.BAD_MESH, "silhouette of the mesh", "empty", "a mesh with some thickness")
     where = np.flatnonzero(hit)
     face = np.take(hits["primitive_ids"].numpy().ravel(), where)
     corners = mesh.vertices[mesh.faces]
@@ -180,9 +353,9 @@ def _drawn(mesh: Mesh, direction: ArrayLike, up: ArrayLike, kind: str, size: int
 def _silhouettes(
     caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """The masks (D, P, P) of a mesh seen along directions (D, 3), and their metres per pixel (D,)."""
+    """The masks (D, P, P) of a mesh seen along directions (D, 3), and their metres per pixel (D,); up (3,), or (D, 3) one for each."""
     count = len(directions)
-    y = -(up - (directions @ up)[:, None] * directions)
+    y = -(up - np.sum(directions * up, axis=1, keepdims=True) * directions)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     axes = np.stack([np.cross(y, directions), y, directions], axis=1)  # rows: right, down, into the picture
     local = axes @ mesh.vertices.T
@@ -233,6 +406,8 @@ def _best_side(mesh: Mesh) -> tuple[NDArray[np.float64], float, float]:
     angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
     directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
     masks, scales = _silhouettes(caster, mesh, directions, up)
+    if not masks.any(axis=(1, 2)).all():
+        raise MagicError(Code.BAD_MESH, "silhouette of the mesh from the side", "empty", "a mesh with some thickness")
     told = np.array([_tells(mask) for mask in masks])
     widths = masks.any(axis=1).sum(axis=1) * scales
     # Width decides between directions that tell the same: smoothing makes the middle of a good range win.
@@ -274,27 +449,38 @@ def _plan(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _section(mesh: Mesh, pieces: Sequence[Mesh] | None, size: int) -> CanonicalView:
-    import shapely
-
     axis, centre = _plan(mesh)
     side = np.array([-axis[1], axis[0], 0.0])
     lateral = (mesh.vertices - centre) @ side
-    along = (mesh.vertices - centre) @ axis
-    middle = centre
+    along_axis = (mesh.vertices - centre) @ axis
     # The wider end, where the bowl is, goes to the right.
-    half = (along.min() + along.max()) / 2
-    if np.ptp(lateral[along < half], axis=0) > np.ptp(lateral[along >= half], axis=0):
+    half = (along_axis.min() + along_axis.max()) / 2
+    if np.ptp(lateral[along_axis < half], axis=0) > np.ptp(lateral[along_axis >= half], axis=0):
         axis = -axis
-    shape = _cut(mesh, middle, axis, side)
+    confidence = float(np.clip(1 - np.ptp(mesh.vertices[:, 2]) / max(np.ptp(along_axis), 1e-9), 0.2, 1.0))
+    return _cut_across(mesh, pieces, centre, axis, np.array([0.0, 0.0, -1.0]), size, confidence)
+
+
+def _cut_across(
+    mesh: Mesh,
+    pieces: Sequence[Mesh] | None,
+    centre: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    size: int,
+    confidence: float,
+) -> CanonicalView:
+    """The cut through a point by the plane of x and y (3,), drawn filled with x to the right and y down."""
+    import shapely
+
+    shape = _cut(mesh, centre, x, y)
     if shape.is_empty and pieces:
-        shape = shapely.union_all([_cut(piece, middle, axis, side) for piece in pieces])
+        shape = shapely.union_all([_cut(piece, centre, x, y) for piece in pieces])
     if shape.is_empty:
-        raise MagicError(Code.BAD_MESH, "section along the long axis", "empty", "a mesh that the upright plane through its middle cuts")
-    # The picture: x along the axis, y down, z = x cross y.
-    x, y = axis, np.array([0.0, 0.0, -1.0])
-    x0, z0, x1, z1 = shape.bounds
-    mid = np.array([(x0 + x1) / 2, (z0 + z1) / 2])
-    scale = max(x1 - x0, z1 - z0, 1e-6) / (VIEW_FILL * size)
+        raise MagicError(Code.BAD_MESH, "section through the middle", "empty", "a mesh with an inside that the plane cuts")
+    left, top, right, bottom = shape.bounds
+    middle = np.array([(left + right) / 2, (top + bottom) / 2])
+    scale = max(right - left, bottom - top, 1e-6) / (VIEW_FILL * size)
     mask = np.zeros((size, size), np.uint8)
     shift = 8
     for polygon in getattr(shape, "geoms", [shape]):
@@ -302,7 +488,7 @@ def _section(mesh: Mesh, pieces: Sequence[Mesh] | None, size: int) -> CanonicalV
             continue
         rings = []
         for ring in (polygon.exterior, *polygon.interiors):
-            p = (np.asarray(ring.coords) - mid) * [1, -1] / scale + (size - 1) / 2
+            p = (np.asarray(ring.coords) - middle) / scale + (size - 1) / 2
             rings.append(np.round(p * (1 << shift)).astype(np.int32))
         drawn = np.zeros_like(mask)
         cv2.fillPoly(drawn, rings, 1, shift=shift)
@@ -311,33 +497,23 @@ def _section(mesh: Mesh, pieces: Sequence[Mesh] | None, size: int) -> CanonicalV
     color = GREY if mesh.colors is None else np.median(mesh.colors, axis=0).astype(np.uint8)
     image = np.zeros((size, size, 3), np.uint8)
     image[mask] = np.maximum(color, 60)
-    origin = middle + axis * mid[0] + np.array([0, 0, mid[1] - middle[2]])
-    object_from_view = transforms.make(np.column_stack([x, y, np.cross(x, y)]), origin)
-    depth = np.where(mask, np.float32(0), np.float32(np.nan))
-    return CanonicalView(
-        image,
-        mask,
-        scale,
-        object_from_view,
-        "section",
-        depth,
-        float(np.clip(1 - np.ptp(mesh.vertices[:, 2]) / max(np.ptp(along), 1e-9), 0.2, 1.0)),
-    )
+    object_from_view = transforms.make(np.column_stack([x, y, np.cross(x, y)]), centre + middle[0] * x + middle[1] * y)
+    return CanonicalView(image, mask, scale, object_from_view, "section", np.where(mask, np.float32(0), np.float32(np.nan)), confidence)
 
 
-def _cut(mesh: Mesh, origin: NDArray[np.float64], axis: NDArray[np.float64], normal: NDArray[np.float64]) -> object:
-    """The filled section (shapely) of a mesh by an upright plane; coordinates (metres along axis from origin, world z)."""
+def _cut(mesh: Mesh, origin: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> object:
+    """The filled section (shapely) of a mesh by the plane through ``origin`` with axes x and y (3,); coordinates in metres along them."""
     import shapely
 
     cut = mesh.to_trimesh()
     cut.merge_vertices()
-    segments = cut.section(plane_origin=origin, plane_normal=normal)
+    segments = cut.section(plane_origin=origin, plane_normal=np.cross(x, y))
     if segments is None:
         return shapely.Polygon()
     rings = []
     for line in segments.discrete:
         if len(line) >= 4:
-            ring = shapely.Polygon(np.column_stack([(line - origin) @ axis, line[:, 2]]))
+            ring = shapely.Polygon((line - origin) @ np.column_stack([x, y]))
             rings.append(ring if ring.is_valid else ring.buffer(0))
     rings.sort(key=lambda r: -r.area)
     shape = shapely.Polygon()

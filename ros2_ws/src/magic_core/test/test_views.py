@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from magic_core import shapes
+from magic_core import shapes, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.views import find_view, holes_of, long_axis
+from magic_core.views import along, find_view, holes_of, long_axis, own_directions, own_views, square_on
 
 
 @pytest.mark.parametrize("seed", [1, 3, 8])
@@ -62,6 +62,61 @@ def test_a_kind_can_be_given():
     with pytest.raises(MagicError) as error:
         find_view(Mesh(np.zeros((0, 3)), np.zeros((0, 3))))
     assert error.value.code is Code.BAD_MESH
+
+
+@pytest.mark.parametrize(("family", "normal"), [("mug", (0, 1, 0)), ("hanger", (0, 0, 1)), ("scissors", (0, 0, 1)), ("s_hook", (0, 0, 1))])
+def test_a_shapes_own_view_turns_with_it(family, normal):
+    made = shapes.make(family, 2).mesh
+    for angles in ((0, 0, 0), (1.2, 0.4, -2.0), (np.pi / 2, 0, 0), (0.1, -1.4, 0.9)):
+        turn = transforms.from_rpy(*angles, (0.1, 0.0, -0.3))
+        mesh = made.transformed(turn)
+        directions = own_directions(mesh, "side")
+        # The plane of symmetry is across the first of them, whichever way the thing lies.
+        assert abs(directions[0] @ turn[:3, :3] @ np.array(normal)) > np.cos(np.deg2rad(1.0))
+        assert len(directions) <= 3 and np.all(directions[:, 2] <= 1e-6)
+        assert square_on(mesh, directions[0], "side") and not square_on(mesh, turn[:3, :3] @ transforms.unit([1, 1, 1]), "side")
+
+
+@pytest.mark.parametrize("family", ["sphere", "cylinder"])
+def test_what_is_convex_from_everywhere_has_no_view_of_its_own(family):
+    assert len(own_directions(shapes.make(family, 1).mesh, "side")) == 0
+
+
+def test_a_spoon_is_cut_along_its_plane_of_symmetry_however_it_lies():
+    made = shapes.make("ladle", 2)
+    upright = find_view(made.mesh, made.pieces, "section")
+    turn = transforms.from_rpy(1.0, 0.5, 2.0)
+    mesh = made.mesh.transformed(turn)
+    views = own_views(mesh, None, "section")
+    across = [abs(view.direction @ turn[:3, :3] @ upright.direction) for view in views]
+    best = views[int(np.argmax(across))]
+    assert max(across) > 0.999 and square_on(mesh, best.direction, "section")
+    area = best.mask.sum() * best.metres_per_pixel**2
+    assert area == pytest.approx(upright.mask.sum() * upright.metres_per_pixel**2, rel=0.03)
+    assert [square_on(mesh, view.direction, "section") for view in views].count(True) == 1
+
+
+@pytest.mark.parametrize("kind", [None, "top", "side", "section"])
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)],
+        [(0, 0, 0), (0.1, 0, 0), (0, 0, 0.1)],
+        [(0, 0, 0), (0.1, 0, 0), (0.2, 0, 0)],
+        [(0, 0, 0), (0, 0, 0), (0, 0, 0)],
+    ],
+)
+def test_a_sheet_a_needle_and_a_point_are_seen_or_refused(kind, corners):
+    mesh = Mesh(np.array(corners, dtype=float), np.array([[0, 1, 2]]))
+    for look in (
+        lambda: [find_view(mesh, None, kind)],
+        lambda: own_views(mesh, None, kind or "side"),
+        lambda: [along(mesh, None, kind or "side", (1, 0, 0))],
+    ):
+        try:
+            assert all(view.mask.any() for view in look())
+        except MagicError as error:
+            assert error.code is Code.BAD_MESH
 
 
 def cloud_of(family, seed, count=8000):
