@@ -19,7 +19,9 @@ tool nor as reference.  The variants leave out what Table III of the paper leave
 
 Writes ``bench.json``, ``bench.md`` and the contact sheet ``bench.png`` (a row for each
 pair of families; frames green: first, yellow: among the first three, red: missed).
-``--speed`` measures speed and memory instead.
+``--speed`` measures speed and memory instead.  ``--controls`` counts how many things that can do none of the jobs are refused
+(:mod:`magic_matcher.plain`: families on which the floor of the score was fitted, and others), and tools that are too small for
+the drawn target; writes ``controls.json`` and ``controls.md``.
 """
 
 from __future__ import annotations
@@ -38,8 +40,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.contact import Contact
-from magic_core.errors import MagicError
-from magic_matcher import backends, drawing, embedded, jobs, matching, score, speed
+from magic_core.errors import Code, MagicError
+from magic_core.scene import CanonicalView
+from magic_matcher import backends, drawing, embedded, jobs, matching, plain, score, speed
+from magic_matcher import contour as contours
 from magic_matcher.contour import Contour
 from magic_matcher.features import Reference, make_reference
 
@@ -214,6 +218,82 @@ def run(
     return sorted(rows, key=lambda row: list(next(iter(matchers.values()))).index(row.variant)), contact_sheet(sheet, count)
 
 
+@dataclass(frozen=True)
+class Control:
+    """Things of a family that cannot do a job: how many, how many were refused, and the greatest similarity of those that were not."""
+
+    job: str
+    family: str
+    fitted: bool
+    count: int
+    refused: int
+    most: float
+
+
+def controls(name: str = "embedded", weights: str = "", count: int = 6, seed: int = 0, only: str = "") -> list[Control]:
+    """Refusals of plain things and of tools that no target of the drawn size fits, with the weights that ship."""
+    matcher = matching.Matcher(backends.load(name, weights))
+    rows = []
+    for job in jobs.JOBS.values():
+        if only and job.name != only:
+            continue
+        # Every tool of a bowl's job has a bowl.
+        for family in (*plain.FITTED, *plain.HELD_OUT, *(job.regions if job.needs != "region" else ())):
+            random = np.random.default_rng([seed, 9, *family.encode()])
+            similarities: list[float] = []
+            made = 0
+            for k, (source, region) in ((k, item) for k in range(3 * count) for item in job.references.items()):
+                shown = jobs.example(job.name, source, REFERENCES + 10 * seed + int(random.integers(3)))
+                old, new = random.uniform(*job.targets, size=2)
+                contact = shown.contact(region)
+                if made == count or not shown.works(contact.pixel[None], contact.normal[None], old / shown.view.metres_per_pixel).all():
+                    continue
+                view, true = _control(job, family, TOOLS + 100 * seed + k, k % 2 == 1)
+                radius = new / view.metres_per_pixel
+                if job.needs != "region" and jobs.holds(job, true, true.points[::3], true.normals[::3], radius).any():
+                    continue
+                made += 1
+                reference = make_reference(shown.view, contact.pixel, contact.normal, old / shown.view.metres_per_pixel, shown.contour)
+                target = jobs.disc_target(new, job.view)
+                try:
+                    found = matcher.match_views(reference, contact, [matching.Tool(family, view)], target, 3, False, old)
+                    similarities.append(max(c.s_dino for c in found.candidates))
+                except MagicError as error:
+                    if error.code is not Code.NO_MATCH:
+                        raise
+            if made:
+                most = max(similarities, default=0.0)
+                rows.append(Control(job.name, family, family in plain.FITTED, made, made - len(similarities), most))
+    return rows
+
+
+def _control(job: jobs.Job, family: str, seed: int, rough: bool) -> tuple[CanonicalView, Contour]:
+    """The view of a plain thing, or of a tool of the job, and its true outline."""
+    if family in job.regions:
+        tool = jobs.example(job.name, family, seed, rough)
+        return tool.view, tool.true
+    return plain.view(family, seed, job.view, rough), contours.extract(plain.view(family, seed, job.view).mask)
+
+
+def controls_table(rows: list[Control]) -> str:
+    """The refusals as Markdown, sums by kind first."""
+    kinds = {
+        "plain things, fitted families": [r for r in rows if r.fitted],
+        "plain things, families held out": [r for r in rows if r.family in plain.HELD_OUT],
+        "tools too small for the target": [r for r in rows if not r.fitted and r.family not in plain.HELD_OUT],
+    }
+    lines = ["| controls | hooking | hanging | scooping | all |", "| --- | --- | --- | --- | --- |"]
+    for kind, part in kinds.items():
+        cells = []
+        for job in (*jobs.JOBS, ""):
+            some = [r for r in part if not job or r.job == job]
+            cells.append(f"{sum(r.refused for r in some)} of {sum(r.count for r in some)}" if some else "")
+        lines.append(f"| {kind} | " + " | ".join(cells) + " |")
+    lines += ["", "| job | family | n | refused | greatest similarity of the others |", "| --- | --- | --- | --- | --- |"]
+    lines += [f"| {r.job} | {r.family} | {r.count} | {r.refused} | {f'{r.most:.2f}' if r.refused < r.count else ''} |" for r in rows]
+    return "\n".join(lines)
+
+
 def contact_sheet(sheet: dict[tuple[str, str, str], list[NDArray[np.uint8]]], columns: int) -> NDArray[np.uint8]:
     """One row of tiles for each pair of families, its names in front."""
     lines = []
@@ -268,12 +348,16 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--tool", nargs="*", default=(), help="only these families of tools")
     parser.add_argument("--out", type=Path, help="folder for bench.json, bench.md and bench.png (or speed.json)")
     parser.add_argument("--speed", action="store_true", help="measure speed and memory instead")
+    parser.add_argument("--controls", action="store_true", help="count the refusals of things that can do none of the jobs instead")
     parser.add_argument("--requests", type=int, default=1000, help="requests over which --speed watches the memory (default: 1000)")
     given = parser.parse_args(argv)
     try:
         if given.speed:
             data = speed.measure(given.weights, given.requests)
             text = json.dumps(data, indent=1)
+        elif given.controls:
+            refused = controls(given.features, given.weights, given.count, given.seed, given.job)
+            text, data = controls_table(refused), {"rows": [asdict(row) for row in refused]}
         else:
             start = time.process_time()
             rows, sheet = run(given.features, given.weights, given.count, given.seed, given.job, tuple(given.tool))
@@ -293,9 +377,11 @@ def main(argv: list[str] | None = None) -> None:
     print(text)
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
-        (given.out / ("speed.json" if given.speed else "bench.json")).write_text(json.dumps(data, indent=1) + "\n")
+        name = "speed" if given.speed else "controls" if given.controls else "bench"
+        (given.out / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
         if not given.speed:
-            (given.out / "bench.md").write_text(text + "\n")
+            (given.out / f"{name}.md").write_text(text + "\n")
+        if name == "bench":
             cv2.imwrite(str(given.out / "bench.png"), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
 
 

@@ -151,14 +151,19 @@ class Example:
             right = self.near(points, normals, self.contour.size / 50)
             right[right] = self.admits(points[right], normals[right], radius)
             return right
-        held = self.held(points, normals, radius)
-        if self.job.needs == "press":
-            return (held.gap <= GAP) & (held.drift <= DRIFT) & (held.press[:, 0] >= DEPTH)
-        return (held.gap <= GAP) & (held.start >= DEPTH)
+        return holds(self.job, self.true, points, normals, radius)
 
     def held(self, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float) -> holding.Held:
         """Press discs against contacts, on the outline as it truly is."""
         return holding.hold(self.true, points, normals, radius)
+
+
+def holds(job: Job, true: Contour, points: NDArray[np.float64], normals: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
+    """Which contacts (N, 2) of an outline hold a disc of ``radius`` px as a job needs it: pressed, or hung."""
+    held = holding.hold(true, points, normals, radius)
+    if job.needs == "press":
+        return (held.gap <= GAP) & (held.drift <= DRIFT) & (held.press[:, 0] >= DEPTH)
+    return (held.gap <= GAP) & (held.start >= DEPTH)
 
 
 def roughen(mask: NDArray[np.bool_], seed: int) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,10 @@ from magic_planner.workspace import Workspace
 Array = NDArray[np.float64]
 #: Ways to follow the task with one grasp that are tried.
 WAYS = 3
+#: A tool that is tipped by more (rad) from how it lies to how it is used asks for a grasp that serves both attitudes.
+TIPPED = np.deg2rad(20.0)
+#: What becomes of a request for which there is no such grasp.
+_REACHES = (Code.NO_GRASP, Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION)
 
 
 class ArmPlanner:
@@ -90,11 +95,33 @@ class ArmPlanner:
         those before.  A tool's retreat that the arm cannot follow is left out.
 
         Raises NO_GRASP, NO_IK, JOINT_LIMIT, START_IN_COLLISION, PATH_IN_COLLISION, NO_PATH, DYNAMIC_LIMIT,
-        TIME_PARAMETERISATION, PLANNING_TIMEOUT, CANCELED, each naming the stage and the waypoint, pair or limit.
+        TIME_PARAMETERISATION, PLANNING_TIMEOUT, CANCELED, each naming the stage and the waypoint, pair or limit, and by how much a tool
+        has to be tipped that lies otherwise than it is used.
         """
         budget = budget or Budget()
         given = (strategy, tool, target, candidate, reflection)
         rest = (table, obstacles, start, attempt, seed, budget, feedback)
+        try:
+            return self._with_ending(strategy, given, motion, rest, feedback)
+        except MagicError as error:
+            angle = tipping(tool.world_from_object, motion.world_from_tool[0])
+            if error.code not in _REACHES or angle < TIPPED:
+                raise
+            raise MagicError(
+                error.code,
+                f"{error.message}; {tool.id} has to be tipped by {np.degrees(angle):.0f} degrees from how it lies to how it is used, "
+                "and is not set down on the way to be grasped anew: one grasp has to serve both",
+            ) from error
+
+    def _with_ending(
+        self,
+        strategy: Strategy,
+        given: tuple[Any, ...],
+        motion: ToolMotion,
+        rest: tuple[Any, ...],
+        feedback: Callable[[str, str], None],
+    ) -> MotionPlan:
+        """The plan of the whole motion, or without the tool's retreat where that is what fails."""
         try:
             return self._plan(*given, motion, *rest)
         except MagicError as error:
@@ -227,6 +254,11 @@ class ArmPlanner:
         come = self.free.come(request, pick[0][0])
         request.feedback("timing", "time parameterisation")
         return self.schedule.timed(request, branch, come, pick, carry, task, retreat)
+
+
+def tipping(lying: Array, used: Array) -> float:
+    """The angle (rad) by which a tool is tipped out of one pose (4, 4) in the world for another; turns about the vertical do not count."""
+    return float(np.arccos(np.clip(lying[2, :3] @ used[2, :3], -1.0, 1.0)))
 
 
 def _alike(a: Array, b: Array) -> bool:
