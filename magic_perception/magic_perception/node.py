@@ -487,7 +487,9 @@ class Perception(Node):
     def place(self, stream: Stream, now: float) -> tuple[list[Placed], float, MagicError | None]:
         """A camera's pairs with where it was at their stamps; the first stamp whose transform may still come (infinite: none); why it no longer may for a later pair than these."""
         found: list[Placed] = []
-        pending, wrong = math.inf, None
+        pending = math.inf
+        wrong: MagicError | None = None
+        last: MagicError | None = None
         for pair in stream.pairs:
             try:
                 pose = self.given.get(stream.name)
@@ -499,12 +501,19 @@ class Perception(Node):
                     pending = min(pending, pair.stamp)
                 else:
                     wrong = error
+                last = error
                 continue
             if self.robot is not None and self.robot.waits(pair.stamp) and now - pair.arrived < self.robot.age:
                 pending = min(pending, pair.stamp)
                 continue
             found.append(Placed(pair, pose, moved))
             wrong = None
+        if found or not stream.pairs:
+            stream.unplaced = math.inf
+        else:
+            # Of a camera that was never placed the newest frames are always young, and those of a short bag are again and again.
+            stream.unplaced = min(stream.unplaced, now)
+            wrong = last if now - stream.unplaced >= self.transform_timeout else wrong
         return found, pending, self.transforms.explain(wrong) if wrong is not None else None
 
     def frame_of(self, stream: Stream, placed: list[Placed]) -> RgbdFrame:

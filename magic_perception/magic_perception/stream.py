@@ -47,7 +47,7 @@ class Stream:
     """The state of one camera.
 
     tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept, in the order of their stamps.  unit: of
-    the newest depth image's numbers.
+    the newest depth image's numbers.  unplaced: since when no pair's transform is known (infinite: one is).
     Times called ``now`` are monotonic seconds.
     """
 
@@ -55,6 +55,7 @@ class Stream:
     tolerance: float = 0.02
     keep: int = 5
     unit: str = "mm"
+    unplaced: float = math.inf
     intrinsics: Intrinsics | None = None
     depth_intrinsics: Intrinsics | None = None
     pairs: list[Pair] = field(default_factory=list)

@@ -428,6 +428,17 @@ def test_an_image_later_than_every_transform_is_refused_by_name(frames):
         assert not bench.objects
 
 
+def test_a_short_bag_without_transforms_is_not_waited_for_without_end(frames):
+    """Played in a loop its frames are young again and again."""
+    with Bench(cameras=["left"], transform_timeout=1.0) as bench:
+        clock = iter([10.0, 10.2, 10.4] * 1000)
+        bench.until(
+            lambda: bench.node.outcome[1].name == "NO_TRANSFORM",
+            "the missing transform",
+            tick=lambda: bench.send(later(frames[0], next(clock))),
+        )
+
+
 def test_static_transforms_of_volatile_publishers_are_heard_and_bad_rotations_named(frames):
     from rclpy.qos import QoSProfile
 
