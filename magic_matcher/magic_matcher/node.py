@@ -104,15 +104,15 @@ class MatcherNode(Node):
         if not name:
             raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, "the name of an installed strategy or the path of a strategy folder")
         if "/" in name:
-            path = Path(name) / "strategy.yaml"
+            folder = Path(name)
         else:
             try:
-                path = (Path(self._root) if self._root else strategy.installed_folder()) / name / "strategy.yaml"
+                folder = (Path(self._root) if self._root else strategy.installed_folder()) / name
             except LookupError as error:
                 raise MagicError(
                     Code.UNKNOWN_STRATEGY, "strategy", name, "the path of a strategy folder (magic_bringup is not installed)"
                 ) from error
-        stamp = path.stat().st_mtime_ns if path.is_file() else 0
+        stamp = strategy.stamp(folder)
         with self._lock:
             kept = self._strategies.get(name)
         if kept is not None and kept[0] == stamp:

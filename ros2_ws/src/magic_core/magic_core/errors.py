@@ -92,6 +92,10 @@ class Code(IntEnum):
     INTERNAL = 599
 
 
+#: Longer texts are cut in messages: the start tells which they are.
+LONGEST = 200
+
+
 class MagicError(Exception):
     """A request that cannot be served, with the code and a sentence for the caller.
 
@@ -102,7 +106,9 @@ class MagicError(Exception):
     def __init__(self, code: Code, what: str, value: Any = None, allowed: Any = None) -> None:
         self.code = Code(code)
         message = what
-        if value is not None:
+        if isinstance(value, str) and len(value) > LONGEST:
+            message += f": {value[:LONGEST]!r}... ({len(value)} characters)"
+        elif value is not None:
             message += f": {value!r}" if isinstance(value, str) else f": {value}"
         if allowed is not None:
             if isinstance(allowed, (list, tuple, set, frozenset)):

@@ -176,11 +176,19 @@ def _check(strategy: Strategy) -> None:
         raise ValueError("; ".join(broken))
 
 
+def stamp(folder: str | Path) -> int:
+    """When the file of a strategy was changed, in ns; 0 where there is none, or where no file can have such a name."""
+    try:
+        return (Path(folder) / "strategy.yaml").stat().st_mtime_ns
+    except (OSError, ValueError):  # ValueError: a NUL in the name
+        return 0
+
+
 def load(folder: str | Path) -> Strategy:
     """Read a strategy folder; ``BAD_STRATEGY`` says which key or file is wrong."""
     folder = Path(folder)
     path = folder / "strategy.yaml"
-    if not path.is_file():
+    if not stamp(folder):
         raise MagicError(Code.UNKNOWN_STRATEGY, "strategy folder", str(folder), "a folder with a strategy.yaml")
     try:
         data = yaml.load(path.read_text(), Loader=SafeLoader)

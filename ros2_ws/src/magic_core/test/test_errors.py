@@ -35,3 +35,8 @@ def test_messages(arguments, text):
 def test_a_number_that_is_no_code_is_refused():
     with pytest.raises(ValueError, match="7"):
         MagicError(7, "what")
+
+
+def test_long_values_are_cut_in_messages():
+    error = MagicError(Code.UNKNOWN_STRATEGY, "strategy", "x" * 5000, "another")
+    assert len(error.message) < 400 and "5000 characters" in error.message and "another" in error.message

@@ -181,3 +181,11 @@ def test_what_is_no_yaml(folder):
     with pytest.raises(MagicError) as error:
         strategies.load(folder)
     assert error.value.code == Code.BAD_STRATEGY
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "/" + "x" * 5000, "/a\0b", "a\0b", "../../etc/passwd", "~", ""])
+def test_names_that_no_file_can_have_are_unknown_strategies(tmp_path, name):
+    with pytest.raises(MagicError) as caught:
+        strategies.find(name, tmp_path)
+    assert caught.value.code is Code.UNKNOWN_STRATEGY
+    assert strategies.stamp(tmp_path / name) == 0
