@@ -79,7 +79,7 @@ class Part:
             self.cases, self.memory = stored["cases"], stored["memory"]
             self.kinds, self.seconds, self.worst = Counter(stored["kinds"]), stored["seconds"], stored["worst"]
         self._began = time.monotonic()
-        self._saved = 0.0
+        self._saved = self._said = 0.0
 
     @property
     def left(self) -> Iterator[tuple[int, random.Random]]:
@@ -95,7 +95,7 @@ class Part:
         self.worst = max(self.worst, seconds)
         if wrong:
             say(f"{self.name} {len(self.cases)}: {wrong}")
-        if time.monotonic() - self._saved > 2.0 or len(self.cases) == self.size:
+        if time.monotonic() - self._saved > 5.0 or len(self.cases) == self.size:
             self.save()
 
     def save(self) -> None:
@@ -107,7 +107,9 @@ class Part:
         temporary = self.path.with_suffix(".tmp")
         temporary.write_text(json.dumps({**content, "kinds": dict(self.kinds)}, indent=1))
         temporary.replace(self.path)
-        say(f"{self.name}: {len(self.cases)} of {self.size}, {sum(map(bool, self.cases))} wrong")
+        if now - self._said > 30.0 or len(self.cases) == self.size:
+            self._said = now
+            say(f"{self.name}: {len(self.cases)} of {self.size}, {sum(map(bool, self.cases))} wrong")
 
     def remember(self, graph: Graph, first: dict[str, float]) -> None:
         """Note what the processes of a graph hold now beside what they held first."""

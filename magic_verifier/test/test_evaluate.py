@@ -227,3 +227,38 @@ def test_a_cup_holds_what_is_inside_it():
 
     assert held(trimesh.util.concatenate([cup, bottom])) == pytest.approx(np.pi * 0.03**2 * 0.076, rel=0.08)
     assert held(cup) == 0.0  # open below
+
+
+def test_meshes_that_are_no_bodies_have_their_code_and_the_others_go_on(tmp_path):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    shapes.mug_of_set(0).mesh.save(folder / "mug.obj")
+    (folder / "one_triangle.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n")
+    angles = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    ring = [f"v {r * np.cos(a):.5f} 0 {r * np.sin(a):.5f}" for r in (0.03, 0.05) for a in angles]
+    faces = [f"f {i + 1} {(i + 1) % 24 + 1} {i + 25}\nf {(i + 1) % 24 + 1} {(i + 1) % 24 + 25} {i + 25}" for i in range(24)]
+    (folder / "sheet_ring.obj").write_text("\n".join([*ring, *faces]) + "\n")
+    (folder / "empty.obj").write_text("")
+    summary = ev.evaluate(
+        Options("hanging", objects=str(folder), strategies=STRATEGIES), tmp_path / "out", films=False, log=lambda text: None
+    )
+    results = {c["object"]: c for c in json.loads((tmp_path / "out/results.json").read_text())["cases"]}
+    assert {name: results[name]["reason"] for name in results} == {
+        "empty": "BAD_MESH",
+        "mug": "OK",
+        "one_triangle": "BAD_MESH",
+        "sheet_ring": "BAD_MESH",
+    }
+    assert (summary["cases"], summary["successes"]) == (4, 1)
+
+
+def test_a_case_that_breaks_does_not_end_the_others(tmp_path, monkeypatch):
+    def run_case(options, case, film=None):
+        raise ZeroDivisionError("in the middle")
+
+    monkeypatch.setattr(ev, "run_case", run_case)
+    summary = ev.evaluate(
+        Options("hooking", variant="fg_no_selection", strategies=STRATEGIES), tmp_path, limit=2, films=False, log=lambda text: None
+    )
+    assert summary["reasons"] == {"INTERNAL": 2}
+    assert "in the middle" in json.loads((tmp_path / "results.json").read_text())["cases"][0]["candidates"][0]["message"]

@@ -29,7 +29,7 @@ from magic_core.errors import Code, MagicError
 POLL = 0.1
 
 #: At the end: how long messages that have arrived already may take to be written, and after which silence none is left, s.
-DRAIN, SILENCE = 5.0, 0.3
+DRAIN, SILENCE = 1.0, 0.2
 
 
 @dataclass(frozen=True)

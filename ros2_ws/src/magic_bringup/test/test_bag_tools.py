@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 DOMAIN = str(1 + (os.getpid() * 7 + 11) % 100)
@@ -224,6 +225,91 @@ def test_player_refuses_in_one_line(tmp_path: Path) -> None:
         assert result.returncode == 1
         assert words in result.stderr and str(Code.BAD_BAG.value) in result.stderr and path in result.stderr
         assert len(result.stderr.strip().splitlines()) == 1
+
+
+def long_bag(path: Path, count: int = 120) -> tuple[Path, list[bytes]]:
+    """A bag of several chunks: its one file, and its messages."""
+    writer = bag_file.BagWriter(path)
+    writer.add_topic("/noise", "sensor_msgs/msg/Image", (profile(False, False),))
+    messages = []
+    for number in range(count):
+        data = np.random.default_rng(number).integers(0, 256, 48 * 1024, dtype=np.uint8).tobytes()
+        messages.append(serialize_message(Image(height=1, width=len(data), encoding="mono8", step=len(data), data=data)))
+        writer.write("/noise", 10**9 + number * 10**7, messages[-1])
+    writer.close()
+    return next(path.glob("*.mcap")), messages
+
+
+@pytest.mark.parametrize("share", [0.4, 0.7, 0.999])
+@pytest.mark.parametrize("where", ["file", "folder", "folder with metadata"])
+def test_a_bag_that_was_cut_off_is_played_as_far_as_it_goes(tmp_path: Path, share: float, where: str) -> None:
+    file, messages = long_bag(tmp_path / "bag")
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    if where != "folder with metadata":
+        (tmp_path / "bag/metadata.yaml").unlink()
+    bag = file if where == "file" else tmp_path / "bag"
+    found = content(bag)["/noise"]
+    assert found == messages[: len(found)]
+    assert len(found) >= int(share * len(messages)) - 25, "more was lost than the last chunk"
+    info = bag_file.info(bag)
+    assert (info.count, info.topics[0].qos) == (len(found), (profile(False, False),))
+    assert "was cut off" in info.note and str(len(found)) in info.note and info.note in info.format()
+
+
+def test_a_whole_bag_and_rubbish_are_not_taken_for_bags_that_were_cut_off(tmp_path: Path) -> None:
+    file, _ = long_bag(tmp_path / "bag", 3)
+    assert bag_file.info(file).note == "" == bag_file.info(tmp_path / "bag").note
+    data = file.read_bytes()
+    for name, broken in (("early", data[:20]), ("flipped", data[:200] + bytes(100) + data[300:-8])):
+        (tmp_path / f"{name}.mcap").write_bytes(broken)
+        with pytest.raises(MagicError) as caught, bag_file.open_bag(tmp_path / f"{name}.mcap") as reader:
+            list(reader.messages())
+            raise MagicError(Code.BAD_BAG, f"{reader.message_count} messages")  # an empty one is refused by who plays it
+        assert caught.value.code is Code.BAD_BAG
+
+
+def test_what_a_killed_recorder_leaves_of_several_files_is_answered_with_what_to_do(tmp_path: Path) -> None:
+    file, _ = long_bag(tmp_path / "bag", 3)
+    (tmp_path / "bag/metadata.yaml").unlink()
+    (tmp_path / "bag/bag_1.mcap").write_bytes(file.read_bytes())
+    with pytest.raises(MagicError, match="reindex"), bag_file.open_bag(tmp_path / "bag"):
+        pass
+
+
+def test_topics_are_renamed_from_the_command_line(node, tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag")
+    heard: list[bytes] = []
+    node.create_subscription(Image, "/renamed", heard.append, SENSOR, raw=True)
+    command = [sys.executable, "-m", "magic_bringup.bag_player", str(bag), "-m", "/camera/left/color/image_raw:=/renamed", "-d", "1.0"]
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True) as player:
+        deadline = time.monotonic() + 30
+        while len(heard) < 10 and time.monotonic() < deadline:
+            rclpy.spin_once(node, timeout_sec=0.05)
+        assert player.wait(20) == 0, player.stderr.read()
+    assert heard == expected()["/camera/left/color/image_raw"]
+
+
+def test_a_message_is_not_lost_by_a_signal_between_its_taking_and_its_writing(node, tmp_path: Path) -> None:
+    """The signal comes while the recorder is at work on a message that it has taken already."""
+    slow = (
+        "import os, signal, sys, time\n"
+        "from magic_bringup import bag_recorder\n"
+        "write = bag_recorder.BagWriter.write\n"
+        "def slowly(self, *args):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(0.2)\n"
+        "    write(self, *args)\n"
+        "bag_recorder.BagWriter.write = slowly\n"
+        "bag_recorder.main(sys.argv[1:])\n"
+    )
+    words = node.create_publisher(String, "/words", LATCHED)
+    words.publish(String(data="kept"))
+    bag = tmp_path / "bag"
+    result = subprocess.run(
+        [sys.executable, "-c", slow, "-o", str(bag), "/words"], env=environment(), capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 0, result.stderr
+    assert [deserialize_message(data, String).data for data in content(bag)["/words"]] == ["kept"]
 
 
 def test_bad_options_are_named(tmp_path: Path) -> None:

@@ -479,6 +479,44 @@ def test_missing_server_and_missing_objects(folder):
         bench.close()
 
 
+def test_another_namespaces_diagnostics_are_not_read(folder):
+    bench = Bench(folder)
+    try:
+        for name in ("robot_2/perception: left", "perception_2: left", "perception: left"):
+            status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name=name, message=name)
+            bench.diagnostics.publish(DiagnosticArray(status=[status]))
+        bench.until(lambda: bench.server.complaint() is not None)
+        assert set(bench.server._complaints) == {"perception: left"}
+    finally:
+        bench.close()
+
+
+def test_a_simulated_clock_that_is_silent_is_said_in_diagnostics_and_in_the_answer(folder):
+    bench = Bench(folder, use_sim_time=True)
+    try:
+        said = []
+        bench.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: said.extend(m.status), qos.RELIABLE)
+        result, _ = bench.run()
+        assert result.code == Code.NO_OBJECTS
+        assert "use_sim_time" in result.message and "/clock" in result.message
+        # By a timer of the wall clock: the node's own stands still.
+        bench.until(lambda: any(s.name == "strategy_server: clock" and s.level == DiagnosticStatus.ERROR for s in list(said)))
+        assert any(s.name == "strategy_server: readiness" and s.hardware_id == "/strategy_server" for s in list(said))
+    finally:
+        bench.close()
+
+
+def test_results_are_not_kept_for_long(shared):
+    # As rcl has it: with the 900 s of rclpy a server keeps hundreds of plans.
+    from magic_core.node import RESULT_TIMEOUT
+
+    assert RESULT_TIMEOUT <= 10
+    shared.fakes.clear()
+    assert shared.run()[0].code == Code.OK
+    kept = shared.server._server._goal_handles
+    shared.until(lambda: not kept, timeout=RESULT_TIMEOUT + DEADLINE)
+
+
 def test_complaint_codes():
     def status(value):
         return DiagnosticStatus(values=[KeyValue(key="code", value=value)])

@@ -71,6 +71,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, terminate)
     try:
         status = dispatch(sys.argv[1:])
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is said: an interrupt of Python's own end would leave a traceback
         sys.stdout.flush()
         return status
     except CommandError as error:
