@@ -43,7 +43,7 @@ def replay(
     target_object = target.as_object("target", world_from_target)
     motion = plan_tool_motion(strategy, tool.as_object("tool", np.eye(4)), target_object, candidate, obstacles=obstacles)
     tool_object = tool.as_object("tool", motion.world_from_tool[0])
-    return verify(strategy, tool_object, target_object, obstacles, TABLE, candidate, MotionPlan("fg", motion))
+    return verify(strategy, tool_object, target_object, obstacles, TABLE, candidate, MotionPlan("fg", motion), repetitions=1)
 
 
 def test_the_files_are_those_of_the_script(strategy: Strategy, tmp_path: Path) -> None:
