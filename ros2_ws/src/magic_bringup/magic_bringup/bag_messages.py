@@ -10,6 +10,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 
 from magic_bringup.bag_file import open_bag
+from magic_core.errors import Code, MagicError
 
 
 def message_class(type_name: str) -> Any | None:
@@ -30,4 +31,13 @@ def messages(bag: Path, wanted: Callable[[str, str], bool] = lambda topic, type_
         for connection, stamp, data in reader.messages():
             kind = message_class(connection.msgtype)
             if kind is not None and wanted(connection.topic, connection.msgtype):
-                yield connection.topic, stamp, deserialize_message(bytes(data), kind)
+                try:
+                    message = deserialize_message(bytes(data), kind)
+                except RuntimeError as error:  # RMWError: the type has had other fields when the bag was recorded
+                    raise MagicError(
+                        Code.BAD_BAG,
+                        f"message of {connection.topic} in {bag}",
+                        str(error),
+                        f"{connection.msgtype} as installed: record the bag again",
+                    ) from error
+                yield connection.topic, stamp, message
