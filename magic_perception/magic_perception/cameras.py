@@ -77,7 +77,8 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class _Witness:
-    """What one camera tells: points (N, 3) on things and their normals (N, 3); pictures of its distance (m at unit depth) to its masks, its depth, its points and normals."""
+    """What one camera tells: points (N, 3) on things and their normals (N, 3); pictures of the distance to its masks (H, W), m at unit depth,
+    and of the normals around them (h, w, 3), which begin at row and column ``corner``."""
 
     camera_from_world: NDArray[np.float64]
     look: Looked

@@ -149,8 +149,8 @@ class Perception(Node):
     def _algorithm(self) -> Parameters:
         """The parameters that :func:`magic_perception.pipeline.perceive` is told."""
         p = partial(parameter, self, read_only=True)
-        low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box in `frame`, m")
-        high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box in `frame`, m")
+        low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box, m: x and y in `frame`, z from the table found")
+        high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box, m: x and y in `frame`, z from the table found")
         if len(low) != 3 or len(high) != 3:
             raise MagicError(Code.BAD_REQUEST, "parameters region_low, region_high", f"{list(low)}, {list(high)}", "three numbers each")
         return Parameters(
