@@ -16,15 +16,12 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import check_solid
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
-from magic_core.robot import RobotConfig
+from magic_core.robot import Description, RobotConfig
 from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
 from magic_planner.giving_way import GAP, GAP_IN_HAND
 from magic_planner.object_motion import plan_tool_motion
-
-#: The frame of objects that do not name theirs: the Panda's base.
-WORLD = "panda_link0"
 
 
 class PlannerNode(Node):
@@ -69,6 +66,8 @@ class PlannerNode(Node):
                 self, "robot.acceleration_scale", 0.2, "Share of the acceleration limits that is used.", low=0.01, high=1.0
             ),
         )
+        #: The frame of everything that comes and goes.
+        self._base = Description(config).base_frame
         grasping = GraspSettings(
             agreement=parameter(self, "grasp.agreement", 0.9, "Least cosine between the normals at the two fingers.", low=0.0, high=1.0),
             samples=parameter(self, "grasp.samples", 500, "Surface points tried for a grasp.", low=10, high=20000),
@@ -103,8 +102,7 @@ class PlannerNode(Node):
         goal, started = handle.request, time.monotonic()
         try:
             plan = self._plan(handle)
-            # In the frame of the objects, of which the cloud says what it is.
-            result.plan = convert.plan_to_msg(plan, goal.tool.id, goal.tool.cloud.header.frame_id or WORLD)
+            result.plan = convert.plan_to_msg(plan, goal.tool.id, self._base)
             end = (plan.arm_motion or plan.tool_motion).times[-1]
             result.code, result.message = int(Code.OK), f"a motion of {end:.1f} s in {len(plan.tool_motion.phases)} phases"
         except Exception as error:  # into the answer, and into the log with the goal's name
@@ -125,6 +123,7 @@ class PlannerNode(Node):
 
         feedback("motion", f"moving {goal.tool.id} by strategy {goal.strategy}")
         strategy = strategies.find(goal.strategy, self._strategies or None)
+        convert.check_frames(self._base, (goal.tool, goal.target, *goal.obstacles))
         tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
         for item, what in ((tool, "tool"), (target, "target")):
             check_solid(item.mesh, f"the {what} {item.id}")

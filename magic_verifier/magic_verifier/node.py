@@ -150,6 +150,8 @@ class VerifierNode(Node):
         if not (np.isfinite(goal.timeout) and goal.timeout >= 0):
             raise MagicError(Code.BAD_REQUEST, "timeout", goal.timeout, "0 or a number of seconds above it")
         strategy = strategies.find(goal.strategy, self._strategies or None)
+        trajectories = goal.plan.tool_trajectory, goal.plan.arm_trajectory
+        convert.check_frames(self._robot.base_frame, (goal.tool, goal.target, *goal.obstacles), *trajectories)
         tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
         for item, what in ((tool, "tool"), (target, "target")):
             check_solid(item.mesh, f"the {what} {item.id}")

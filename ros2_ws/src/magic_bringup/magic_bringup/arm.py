@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,7 +14,6 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from magic_bringup import execution
-from magic_bringup.joints import JointStates, check_start
 from magic_bringup.remote import RemoteAction, Token
 from magic_core.conversions import duration_to_msg, time_from_msg
 from magic_core.errors import Code, MagicError
@@ -57,11 +55,7 @@ class Arm:
     they are: what to do with a tool in the hand is for a person to decide.
     """
 
-    def __init__(
-        self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, joints: JointStates, group: CallbackGroup
-    ) -> None:
-        self._node = node
-        self._joints = joints
+    def __init__(self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, group: CallbackGroup) -> None:
         self.settings = settings
         self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group, Code.EXECUTION_FAILED)
         self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group, Code.EXECUTION_FAILED)
@@ -70,11 +64,17 @@ class Arm:
         """The servers that are missing."""
         return [f"{r.server} ({r.name})" for r in (self._mover, self._gripper) if not r.ready()]
 
-    def execute(self, plan: MotionPlan, token: Token, tell: Callable[[str], None]) -> None:
+    def servers(self) -> dict[str, frozenset[bytes]]:
+        """Those who serve it, by what they do."""
+        return {r.server: r.servers() for r in (self._mover, self._gripper)}
+
+    def execute(self, plan: MotionPlan, token: Token, tell: Callable[[str], None], ask: Callable[[int, int], None]) -> None:
         """Carry out a plan.
 
-        Everything that can be checked is checked before anything moves.  Raises BAD_MOTION, NO_FRAMES, STALE_DATA,
-        SERVER_UNAVAILABLE (before the first move), EXECUTION_FAILED, GRASP_FAILED, SERVER_TIMEOUT, CANCELED.
+        Everything that can be checked is checked before anything moves.  ``ask(point, moved)`` is called there and before each
+        move, with the point of the trajectory at which it begins, and what has been moved on purpose by then (0: nothing, 1: the
+        tool is in the hand, 2: the task has been done with it); it raises what speaks against it.  Raises BAD_MOTION, SERVER_UNAVAILABLE (before the first move), EXECUTION_FAILED, GRASP_FAILED,
+        SERVER_TIMEOUT, CANCELED, and what ``ask`` does.
         """
         settings, trajectory = self.settings, plan.arm_trajectory
         times = [time_from_msg(p.time_from_start) for p in trajectory.points]
@@ -83,28 +83,19 @@ class Arm:
         )
         for remote in (self._mover, self._gripper):
             remote.require(settings.presence, token)
-            remote.check_alone()
-        self._check_start(trajectory, 0)
+        ask(0, 0)
+        moved = 0
         for number, action in enumerate(actions, 1):
             where = f"step {number} of {len(actions)}"
             if isinstance(action, execution.Move):
                 tell(f"{where}: the arm moves for {(times[action.last] - times[action.first]) / settings.speed:.1f} s")
-                self._check_start(trajectory, action.first)
+                ask(action.first, moved)
                 self._move(trajectory, times, action, token)
+                moved = 2 if moved else 0
             else:
                 tell(f"{where}: the fingers {'close on the tool' if action.close else 'open'}")
                 self._fingers(action, token)
-
-    def _check_start(self, trajectory: JointTrajectory, index: int) -> None:
-        check_start(
-            trajectory.joint_names,
-            trajectory.points[index].positions,
-            self._joints.all(),
-            self._node.get_clock().now().nanoseconds * 1e-9,
-            time.monotonic(),
-            self.settings.start_tolerance,
-            self.settings.state_age,
-        )
+                moved = max(moved, int(action.close))
 
     def _move(self, trajectory: JointTrajectory, times: list[float], move: execution.Move, token: Token) -> None:
         speed = self.settings.speed

@@ -24,6 +24,7 @@ from typing import Any
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, peak_memory
 from magic_bringup.pipeline import split_metrics
+from magic_bringup.record import Record
 from magic_core import environment
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
@@ -73,16 +74,6 @@ class Options:
     cameras: tuple[str, ...] = ()
     topics: tuple[tuple[str, str], ...] = ()
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
-
-
-@dataclass
-class Record:
-    """What a run left behind, in messages; the report is drawn from it."""
-
-    summary: dict[str, Any]
-    images: dict[str, Any] = field(default_factory=dict)  # topic -> sensor_msgs/Image
-    scene: Any = None  # magic_interfaces/SceneObjectArray
-    result: Any = None  # magic_interfaces/action/RunStrategy.Result
 
 
 def empty_summary(options: Options) -> dict[str, Any]:
@@ -384,7 +375,8 @@ class Demo:
         os.environ.update({k: env[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
         parameters: dict[str, dict[str, object]] = {
             "matcher": {"features": options.features},
-            "strategy_server": {"objects_timeout": 5.0},
+            # The bag's last scene is what there is, however long the run takes.
+            "strategy_server": {"objects_timeout": 5.0, "recorded": True},
         }
         if options.cameras:
             parameters["perception"] = {"cameras": json.dumps(options.cameras)}

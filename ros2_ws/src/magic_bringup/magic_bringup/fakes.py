@@ -138,6 +138,12 @@ class FakeServers(Node):
         if "verify" in services:
             self._servers.append(self._action(VerifyMotion, "verify_motion", lambda g, c: self.on_verify(g, c), group))
 
+    def destroy_node(self) -> None:
+        """Take the action servers down with the node."""
+        for server in self._servers:
+            server.destroy()
+        super().destroy_node()
+
     def publish(self, of: Scene) -> None:
         """Publish a scene as perception would, as seen just now."""
         stamp = self.get_clock().now().nanoseconds * 1e-9
@@ -165,7 +171,17 @@ class FakeServers(Node):
     @staticmethod
     def verify(goal: Any, canceled: Callable[[], bool]) -> Any:
         """Every motion passes."""
-        return VerifyMotion.Result(code=0, message="passed", success=True, success_rate=1.0, metric_names=["pulled"], metric_values=[0.25])
+        return VerifyMotion.Result(
+            code=0,
+            message="passed",
+            success=True,
+            success_rate=1.0,
+            rate_low=0.86,
+            rate_high=1.0,
+            rollouts=1,
+            metric_names=["pulled"],
+            metric_values=[0.25],
+        )
 
     @staticmethod
     def until_canceled(result: Any) -> Callable[[Any, Callable[[], bool]], Any]:

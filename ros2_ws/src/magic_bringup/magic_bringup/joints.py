@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from magic_core import robot
 from magic_core.errors import Code, MagicError
 
 #: A joint that is faster than this moves, rad/s.
 STANDSTILL = 0.05
+#: How far beyond its limit a joint may be heard to stand, rad or m: as much as the planner takes.
+RANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,18 @@ class JointStates:
             return dict(self._joints)
 
 
+def check_range(arm: Iterable[robot.Joint], joints: Mapping[str, Joint]) -> None:
+    """Refuse an arm that stands outside its own limits, where nothing that is planned could begin; raises JOINT_LIMIT."""
+    for joint in arm:
+        if joint.name in joints and not joint.lower - RANGE <= joints[joint.name].position <= joint.upper + RANGE:
+            raise MagicError(
+                Code.JOINT_LIMIT,
+                f"the arm stands with {joint.name} at",
+                round(joints[joint.name].position, 4),
+                f"{joint.lower:g} to {joint.upper:g}",
+            )
+
+
 def check_start(
     names: Sequence[str],
     first: Sequence[float],
@@ -56,13 +71,14 @@ def check_start(
     now: float,
     tolerance: float,
     max_age: float,
+    by_stamp: bool = True,
 ) -> None:
     """Refuse a trajectory whose start is not where the arm stands.
 
     names, first: joints of the trajectory and their positions at its first point, rad.  joints: what is known of them.
     clock, now: the time, s, by the clock of the stamps and by the monotonic clock.  Raises NO_FRAMES (no joint state),
-    STALE_DATA (older than ``max_age`` s by stamp or arrival, or from the future) and BAD_MOTION (a joint is missing, not
-    finite, farther than ``tolerance`` rad off, or moving).
+    STALE_DATA (older than ``max_age`` s by arrival or, with ``by_stamp``, by stamp, or from the future) and BAD_MOTION (a joint
+    is missing, not finite, farther than ``tolerance`` rad off, or moving).
     """
     if not names or len(names) != len(first):
         raise MagicError(
@@ -73,9 +89,8 @@ def check_start(
     missing = [name for name in names if name not in joints]
     if missing:
         raise MagicError(Code.BAD_MOTION, "joint_states", f"nothing about {', '.join(missing)}", f"positions of {', '.join(names)}")
-    age = max(
-        (a for n in names for a in (clock - joints[n].stamp, now - joints[n].came)), key=lambda a: math.inf if math.isnan(a) else abs(a)
-    )
+    ages = [now - joints[n].came for n in names] + ([clock - joints[n].stamp for n in names] if by_stamp else [])
+    age = max(ages, key=lambda a: math.inf if math.isnan(a) else abs(a))
     if not abs(age) <= max_age:
         raise MagicError(
             Code.STALE_DATA, "age of joint_states in s", round(age, 3), f"at most {max_age:g}, by its stamp and by its arrival"

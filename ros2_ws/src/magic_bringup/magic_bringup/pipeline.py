@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from magic_bringup.permission import Verdict
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS
 
@@ -38,11 +39,19 @@ FATAL = frozenset(
         Code.BUSY,
         Code.NOT_VERIFIABLE,
         Code.BAD_REQUEST,
+        Code.NOT_ALONE,
+        # The arm stands where it stands, whatever is tried next.
+        Code.START_IN_COLLISION,
     }
 )
 
 #: Failures of planning after which the next attempt would fail in the same way.
 EXHAUSTED = frozenset({Code.NO_GRASP, Code.BAD_MESH, Code.BAD_MOTION, Code.INTERNAL})
+
+
+class HopelessError(MagicError):
+    """A failure that no other candidate can mend, whatever its code: it ends the run."""
+
 
 #: Failures of the grasp alone: the same contact gets its next grasp at once.
 GRASP_ONLY = frozenset({Code.GRASP_SLIPPED})
@@ -102,23 +111,15 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What the verifier answered; OK means that the goal test passed."""
-
-    code: Code
-    message: str = ""
-    simulations: int = 1
-
-
-@dataclass(frozen=True)
 class Report:
-    """What became of one trial: the last stage that it reached, with code and reason there."""
+    """What became of one trial: the last stage that it reached, with code and reason there, and what the verifier said if it was asked."""
 
     trial: Trial
     stage: str
     code: Code
     message: str
     plan: Any = None
+    verdict: Verdict | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended.  ``verified`` says that physics agreed; only then may the plan be published.
+    """How a run ended.  ``verified`` says that physics agreed, by ``verdict``; only then may the plan be published.
 
     ``plan`` is also filled in for the best match of a strategy that simulation cannot judge; its code is OK only if the caller allowed that.
     ``seconds`` holds the wall time of each stage and ``total``.
@@ -143,6 +144,7 @@ class Outcome:
     code: Code
     message: str
     verified: bool = False
+    verdict: Verdict | None = None
     plan: Any = None
     tool_id: str = ""
     target_id: str = ""
@@ -321,23 +323,26 @@ class Run:
         self._tell("verify", trial.index, what)
         self._simulations += 1
         verdict = self._attempt("verify", trial, lambda left: self._stages.verify(request, matches, trial, planned.plan, left), Verdict)
-        self._simulations += max(0, verdict.simulations - 1)
+        self._simulations += max(0, verdict.rollouts - 1)
+        report = Report(trial, "verify", verdict.code, verdict.message, planned.plan, verdict)
         if verdict.code != Code.OK:
-            return self._drop(Report(trial, "verify", verdict.code, verdict.message, planned.plan)), verdict.code
-        self._reports.append(Report(trial, "verify", Code.OK, verdict.message, planned.plan))
+            return self._drop(report), verdict.code
+        self._reports.append(report)
         self._tell("verify", trial.index, f"verified: {verdict.message}")
-        return self._outcome(Code.OK, verdict.message, verified=True, plan=planned.plan, trial=trial), Code.OK
+        return self._outcome(Code.OK, verdict.message, verdict=verdict, plan=planned.plan, trial=trial), Code.OK
 
     def _attempt(self, stage: str, trial: Trial, work: Callable[[float], Any], failure: Callable[[Code, str], Any]) -> Any:
         """Run a stage for one trial; an error that is the trial's own becomes its failure, others end the run."""
+        hopeless = False
         try:
             result = self._timed(stage, work)
         except MagicError as error:
             result = failure(error.code, error.message)
+            hopeless = isinstance(error, HopelessError)
         except Exception as error:
             code, message = self._describe(error)
             result = failure(Code(code), message)
-        if result.code in FATAL:
+        if hopeless or result.code in FATAL:
             self._reports.append(Report(trial, stage, result.code, result.message))
             raise MagicError(result.code, result.message)
         return result
@@ -377,14 +382,15 @@ class Run:
         count = len(self._matches.candidates) if self._matches else 0
         self._notify(Progress(stage, index, count, message, tuple(self._reports)))
 
-    def _outcome(self, code: Code, message: str, verified: bool = False, plan: Any = None, trial: Trial | None = None) -> Outcome:
+    def _outcome(self, code: Code, message: str, verdict: Verdict | None = None, plan: Any = None, trial: Trial | None = None) -> Outcome:
         matches = self._matches
         first = matches.candidates[0] if matches and matches.candidates else None
         chosen = trial.candidate if trial else first
         return Outcome(
             code=code,
             message=message,
-            verified=verified,
+            verified=verdict is not None,
+            verdict=verdict,
             plan=plan,
             tool_id=chosen.tool_id if chosen is not None else self._request.tool_id,
             target_id=matches.target_id if matches else self._request.target_id,

@@ -10,18 +10,22 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
+from magic_bringup.permission import Exchange, check_single
 from magic_core import presence
 from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
 
 #: Between looks at whether a server is still there, s; discovery gives no event for it in rclpy.
 PRESENCE_PERIOD = 0.1
+#: The service of an action that takes its goals, after the action's name.
+SEND_GOAL = "/_action/send_goal"
 
 
 class Token:
@@ -29,7 +33,7 @@ class Token:
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._canceled = False
+        self._canceled = self._ended = False
         self._closing = False
 
     def cancel(self, closing: bool = False) -> None:
@@ -38,6 +42,19 @@ class Token:
             self._canceled = True
             self._closing = self._closing or closing
             self._condition.notify_all()
+
+    def request_cancel(self) -> bool:
+        """Cancel, where there is still something to cancel: not after :meth:`end`."""
+        with self._condition:
+            if not self._ended:
+                self.cancel()
+            return not self._ended
+
+    def end(self) -> bool:
+        """What it was for is over, and no cancel comes any more; false where one has come."""
+        with self._condition:
+            self._ended = not self._canceled
+            return self._ended
 
     @property
     def canceled(self) -> bool:
@@ -81,6 +98,15 @@ class _Gone(MagicError):
     """Those who were asked have gone."""
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What came back: the response or result, an action goal's ``status``, and the one ``server`` that there was to answer."""
+
+    result: Any
+    server: bytes
+    status: int = GoalStatus.STATUS_UNKNOWN
+
+
 class _Remote:
     """What service and action calls share: the server's name and whether it is there."""
 
@@ -92,24 +118,41 @@ class _Remote:
         self.server = server
         self._node = node
 
+    def servers(self) -> frozenset[bytes]:
+        """Those who serve it now."""
+        return servers_of(self._node, self.name + self.ASKED)
+
     def ready(self) -> bool:
         """Whether the server can be seen now."""
         raise NotImplementedError
 
     def require(self, timeout: float, token: Token) -> None:
-        """Wait for the server; raises SERVER_UNAVAILABLE naming it."""
-        if not token.wait(self.ready, time.monotonic() + timeout, alive=lambda: None):
+        """Wait for the server, and until it is alone: one that was killed stays in sight for a moment.
+
+        Raises SERVER_UNAVAILABLE naming it, NOT_ALONE.
+        """
+
+        def one() -> bool:
+            return self.ready() and len(self.servers()) <= 1
+
+        if not token.wait(one, time.monotonic() + timeout, alive=lambda: None):
+            check_single({self.name: self.servers()})
             raise MagicError(
                 Code.SERVER_UNAVAILABLE, f"the {self.server} does not answer: nothing serves {self.name} (waited {timeout:.1f} s)"
             )
 
-    def watch(self) -> Callable[[], None]:
-        """What raises SERVER_UNAVAILABLE once those who serve now have gone, be there others by then: they know nothing of what was asked."""
+    def watch(self, exchange: Exchange | None = None) -> Callable[[], None]:
+        """What raises SERVER_UNAVAILABLE once those who serve now have gone, be there others by then: they know nothing of what was asked.
+
+        ``exchange`` is told who is in sight meanwhile.
+        """
         servers = presence.Watch(lambda: presence.servers(self._node, self.name + self.ASKED))
         seen = self.ready()
 
         def still_there() -> None:
             nonlocal seen
+            if exchange is not None:
+                exchange.look(self.servers())
             if servers.gone() or (seen and not servers.begun and not self.ready()):
                 raise _Gone(Code.SERVER_UNAVAILABLE, f"the {self.server} has gone: what served {self.name} does not any more")
             seen = seen or self.ready()
@@ -141,18 +184,20 @@ class RemoteService(_Remote):
         return self._client.service_is_ready()
 
     def call(self, request: Any, timeout: float, token: Token, presence: float = 5.0) -> Any:
-        """The response; raises SERVER_UNAVAILABLE, SERVER_TIMEOUT or CANCELED."""
+        """The response; raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, CANCELED, or NOT_ALONE (several serve it)."""
         return self._asked_again(lambda left: self._call(request, left, token, presence), timeout)
 
     def _call(self, request: Any, timeout: float, token: Token, presence: float) -> Any:
         deadline = time.monotonic() + timeout
         self.require(min(presence, timeout), token)
-        still_there = self.watch()
+        exchange = Exchange(self.name, self.servers())
+        still_there = self.watch(exchange)
         future = self._client.call_async(request)
         future.add_done_callback(token.poke)
         try:
             if not token.wait(future.done, deadline, alive=still_there):
                 raise self._late("did not answer", timeout)
+            exchange.end(self.servers())
             return future.result()
         finally:
             if not future.done():
@@ -164,7 +209,7 @@ class RemoteAction(_Remote):
 
     #: How long a canceled or late goal is given to end by itself, s.
     CANCEL_PATIENCE = 2.0
-    ASKED = "/_action/send_goal"
+    ASKED = SEND_GOAL
 
     def __init__(self, node: Node, kind: Any, name: str, server: str, group: CallbackGroup, refusal: Code = Code.BUSY) -> None:
         super().__init__(node, name, server)
@@ -174,10 +219,6 @@ class RemoteAction(_Remote):
     def ready(self) -> bool:
         return self._client.server_is_ready()
 
-    def check_alone(self) -> None:
-        """As the function of that name, for this action."""
-        check_alone(self._node, self.name)
-
     def call(
         self,
         goal: Any,
@@ -186,29 +227,32 @@ class RemoteAction(_Remote):
         presence: float = 5.0,
         grace: float = 0.0,
         feedback: Callable[[Any], None] | None = None,
-    ) -> Any:
-        """The result of a goal, of one of this project's actions.
+    ) -> Answer:
+        """The answer to a goal, of one of this project's actions.
 
         ``timeout`` is what the server itself is given; ``grace`` what is waited
         beyond it for the answer.  Raises what :meth:`respond` does.
         """
         # Of this project's actions none changes anything but its answer: a goal may be sent again.
-        response = self._asked_again(lambda left: self.respond(goal, left, token, presence, feedback), timeout + grace)
-        if response.status != GoalStatus.STATUS_SUCCEEDED and response.result.code == 0:
+        answer: Answer = self._asked_again(lambda left: self.respond(goal, left, token, presence, feedback), timeout + grace)
+        if answer.status != GoalStatus.STATUS_SUCCEEDED and answer.result.code == 0:
             # rclpy answers an empty result where a server's handler raised.
-            raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {response.status} and no result")
-        return response.result
+            raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {answer.status} and no result")
+        return answer
 
-    def respond(self, goal: Any, timeout: float, token: Token, presence: float = 5.0, feedback: Callable[[Any], None] | None = None) -> Any:
-        """The response to a goal, of any action: its ``status`` and ``result``.
+    def respond(
+        self, goal: Any, timeout: float, token: Token, presence: float = 5.0, feedback: Callable[[Any], None] | None = None
+    ) -> Answer:
+        """The answer to a goal, of any action.
 
-        A cancel, and a timeout, are forwarded to the goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, CANCELED, or
-        BUSY (``refusal``); the message says where the goal, canceled, may still be at work.
+        A cancel, and a timeout, are forwarded to the goal.  Raises SERVER_UNAVAILABLE, SERVER_TIMEOUT, CANCELED, NOT_ALONE
+        (several serve it), or BUSY (``refusal``); the message says where the goal, canceled, may still be at work.
         """
         deadline = time.monotonic() + timeout
         self.require(min(presence, timeout), token)
         token.check()
-        still_there = self.watch()
+        exchange = Exchange(self.name, self.servers())
+        still_there = self.watch(exchange)
         callback = None if feedback is None else (lambda message: feedback(message.feedback))
         accepting = self._client.send_goal_async(goal, feedback_callback=callback)
         accepting.add_done_callback(token.poke)
@@ -222,11 +266,13 @@ class RemoteAction(_Remote):
             future.add_done_callback(token.poke)
             if not token.wait(future.done, deadline, alive=still_there):
                 raise self._late("did not finish", timeout)
+            server = exchange.end(self.servers())
         except MagicError as error:
             if isinstance(error, _Gone) or self._cancel(accepting, token, still_there):
                 raise
             raise MagicError(error.code, f"{error.message}; the {self.server} did not say that its goal has ended") from error
-        return future.result()
+        response = future.result()
+        return Answer(response.result, server, response.status)
 
     def _cancel(self, accepting: Any, token: Token, still_there: Callable[[], None]) -> bool:
         """Cancel a goal that nobody waits for any more, be it accepted only later; true where it is known to have ended."""
@@ -254,8 +300,7 @@ class RemoteAction(_Remote):
             return False
 
 
-def check_alone(node: Node, action: str) -> None:
-    """Refuse an action (its full name) that several nodes serve: each of them would carry every goal out.  Raises EXECUTION_FAILED."""
-    count = node.count_services(f"{action}/_action/send_goal")
-    if count > 1:
-        raise MagicError(Code.EXECUTION_FAILED, f"servers of {action}", count, 1)
+def servers_of(node: Node, service: str) -> frozenset[bytes]:
+    """Those who serve a service, given by its full name; as many unnamed ones as there are where the middleware does not tell who."""
+    count = node.count_services(service)
+    return presence.servers(node, service) or frozenset(b"unnamed %d" % i for i in range(count))

@@ -12,12 +12,13 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_bringup.record import Record
 from magic_core import conversions, transforms
 from magic_core import strategy as strategies
 from magic_core.camera import Intrinsics
@@ -25,9 +26,6 @@ from magic_core.contact import Contact
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView, Scene, SceneObject
-
-if TYPE_CHECKING:
-    from magic_bringup.demo import Record
 
 Image = NDArray[np.uint8]
 
@@ -515,7 +513,6 @@ def load(folder: Path) -> Record:
     from rclpy.serialization import deserialize_message
     from sensor_msgs.msg import Image as ImageMsg
 
-    from magic_bringup.demo import Record
     from magic_interfaces.action import RunStrategy
     from magic_interfaces.msg import SceneObjectArray
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,28 +23,40 @@ def _directions(count: int = 200) -> NDArray[np.float64]:
 DIRECTIONS = _directions()
 
 
-def hull(item: SceneObject) -> NDArray[np.float64]:
-    """How far an object reaches, in metres of the world, along each of ``DIRECTIONS``: the support function of its convex hull."""
-    points = transforms.apply(item.world_from_object, item.mesh.vertices)
-    return (points @ DIRECTIONS.T).max(axis=0)
+def hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far points (N, 3) m reach along each of ``DIRECTIONS``: the support function of their convex hull; NaN without points."""
+    return (points @ DIRECTIONS.T).max(axis=0) if len(points) else np.full(len(DIRECTIONS), np.nan)
 
 
-def distance(before: SceneObject, after: SceneObject) -> float:
-    """How far an object has moved, m: the Hausdorff distance of its convex hulls.
+def hulls(objects: Iterable[SceneObject]) -> dict[str, NDArray[np.float64]]:
+    """The hull of each object in the world, by its id."""
+    return {o.id: hull(transforms.apply(o.world_from_object, o.mesh.vertices)) for o in objects}
+
+
+def distance(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
+    """How far an object has moved, m: the Hausdorff distance of two :func:`hull`.
 
     It does not depend on how the object's own frame and mesh were chosen, which another look may choose otherwise.
     """
-    return float(np.abs(hull(before) - hull(after)).max())
+    return float(np.abs(before - after).max())
 
 
-def check(before: Iterable[SceneObject], after: Iterable[SceneObject], tolerance: float) -> None:
-    """Refuse a scene in which an object is gone, has come, or has moved by more than ``tolerance`` m; raises STALE_DATA."""
-    old, new = {o.id: o for o in before}, {o.id: o for o in after}
-    for what, ids in (("gone since the plan", old.keys() - new.keys()), ("come since the plan", new.keys() - old.keys())):
+def check(
+    before: Mapping[str, NDArray[np.float64]],
+    after: Mapping[str, NDArray[np.float64]],
+    tolerance: float,
+    meant: Collection[str] = (),
+) -> None:
+    """Refuse a scene in which an object is gone, has come, or has moved by more than ``tolerance`` m; raises STALE_DATA.
+
+    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.
+    """
+    old, new = before.keys() - set(meant), after.keys() - set(meant)
+    for what, ids in (("gone since the plan", old - new), ("come since the plan", new - old)):
         if ids:
-            raise MagicError(Code.STALE_DATA, f"objects {what}", ", ".join(sorted(ids)), ", ".join(sorted(old)))
-    for name, item in old.items():
-        moved = distance(item, new[name])
+            raise MagicError(Code.STALE_DATA, f"objects {what}", ", ".join(sorted(ids)), ", ".join(sorted(before)))
+    for name in sorted(old):
+        moved = distance(before[name], after[name])
         if not moved <= tolerance:
             raise MagicError(
                 Code.STALE_DATA, f"{name} has moved since the plan, in mm", round(1000 * moved, 1), f"at most {1000 * tolerance:g}"

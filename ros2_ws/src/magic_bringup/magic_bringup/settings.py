@@ -17,8 +17,9 @@ class Settings:
     strategies: folder of the strategies, empty: the installed ones.  top_k: candidates where the goal names no number.
     attempts: grasps for one contact.  repetitions: rollouts of one motion at most, 0: the verifier's own number.  timeout: s for
     a whole run where the goal says nothing.  presence: s to wait for a server that is not there.  objects, match, plan, verify:
-    s for each.  grace: s that an answer may come late.  objects_age: s that objects may be old where the arm begins to move.
-    object_tolerance: m that they may have moved by then.
+    s for each.  grace: s that an answer may come late.  required_rate: least lower end of the success rate's interval;
+    objects_age: s that objects may be old, and object_tolerance: m that they may have moved, where a trajectory is published or
+    the arm begins to move.  recorded: what comes in is a recording.
     """
 
     strategies: str
@@ -38,6 +39,8 @@ class Settings:
     gripper_action: str
     objects_age: float
     object_tolerance: float
+    required_rate: float
+    recorded: bool
 
 
 def read(node: Node) -> Settings:
@@ -81,9 +84,21 @@ def read(node: Node) -> Settings:
         gripper_action=parameter(
             node, "gripper_action", "panda_gripper/gripper_action", "action of the gripper (control_msgs/GripperCommand)", read_only=True
         ),
-        objects_age=seconds("objects_age", 5.0, "s that the objects may be old where the arm begins to move"),
+        objects_age=seconds("objects_age", 5.0, "s that the objects may be old where a trajectory is published or the arm begins to move"),
         object_tolerance=parameter(
             node, "object_tolerance", 0.02, "m that an object may have moved since it was planned for", low=0.0, high=0.5, read_only=True
+        ),
+        required_rate=parameter(
+            node,
+            "required_rate",
+            0.7,
+            "least lower end of the success rate's 95 % interval; the verifier requires its own besides",
+            low=0.0,
+            high=0.99,
+            read_only=True,
+        ),
+        recorded=parameter(
+            node, "recorded", False, "what comes in is a recording: it gets no older, and no arm is moved by it", read_only=True
         ),
     )
 

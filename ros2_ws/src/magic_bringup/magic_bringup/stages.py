@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Image, JointState
 
 from magic_bringup import pipeline
-from magic_bringup.remote import Token
+from magic_bringup.joints import JointStates, check_range
+from magic_bringup.permission import Verdict, check_single
+from magic_bringup.remote import RemoteAction, RemoteService, Token
+from magic_bringup.settings import Settings
 from magic_core import conversions
 from magic_core.errors import Code, MagicError
+from magic_core.robot import Description
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import ContactCandidate, MotionPlan, SceneObject, SceneObjectArray
 from magic_interfaces.srv import MatchContact
-
-if TYPE_CHECKING:
-    from magic_bringup.strategy_server import StrategyServer
 
 #: How much later than here the same objects may arrive at the matcher, s.
 OBJECTS_LAG = 5.0
@@ -26,27 +28,62 @@ OBJECTS_LAG = 5.0
 SAME_POINT = 1e-6
 
 
-class Stages:
-    """The stages of :mod:`magic_bringup.pipeline`, done by the other nodes; messages pass through as they came."""
+class Server(Protocol):
+    """What the stages need of the strategy server, a node."""
 
-    def __init__(self, server: StrategyServer, token: Token, needs_verifier: bool, heatmap: bool) -> None:
+    settings: Settings
+    robot: Description
+    matcher: RemoteService
+    planner: RemoteAction
+    verifier: RemoteAction
+    scene: SceneObjectArray | None
+    joints: JointStates
+    objects_topic: str
+
+    def in_base(self, scene: SceneObjectArray) -> SceneObjectArray: ...
+
+    def servers(self) -> dict[str, frozenset[bytes]]: ...
+
+    def objects_watch(self) -> Callable[[], None]: ...
+
+    def complaint(self) -> DiagnosticStatus | None: ...
+
+    def count_publishers(self, topic: str) -> int: ...
+
+    def get_logger(self) -> Any: ...
+
+
+class Stages:
+    """The stages of :mod:`magic_bringup.pipeline`, done by the other nodes; messages pass through as they came.
+
+    scene: the objects of this run, in the robot's base frame.  state_known: whether the last plan began where the arm was heard
+    to be; else it began at home.
+    """
+
+    def __init__(self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool) -> None:
         self._server = server
+        self._run = run
         self._heatmap = heatmap
         self._token = token
         self._needs_verifier = needs_verifier
+        self.strategy = ""
+        self._seen: SceneObjectArray | None = None  # the same objects as they came
         self.scene: SceneObjectArray | None = None
+        self.state_known = False
         self.matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
         self._last_code = 0
 
     def perceive(self, request: pipeline.Request, timeout: float) -> None:
         """Take the objects there are, or wait for them; see that every server is there."""
-        server = self._server
+        server, self.strategy = self._server, request.strategy
         # First the servers: a run that cannot be verified is not begun.
         deadline = time.monotonic() + min(timeout, server.settings.presence)
         needed = (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else []))
         for remote in needed:
             remote.require(max(0.0, deadline - time.monotonic()), self._token)
+        if not self._token.wait(lambda: all(len(s) <= 1 for s in server.servers().values()), deadline, alive=lambda: None):
+            check_single(server.servers())
         wait = min(timeout, server.settings.objects)
 
         def enough() -> bool:
@@ -68,10 +105,26 @@ class Stages:
         scene = server.scene
         if not came:
             raise self._no_objects(scene, wait)
-        self.scene = scene
         unknown = self._unknown(scene, request)
         if unknown:
             raise MagicError(Code.UNKNOWN_OBJECT, unknown[0], unknown[1], [o.id for o in scene.objects])
+        self._take(scene, time.monotonic() + wait)
+
+    def _take(self, scene: SceneObjectArray, deadline: float) -> None:
+        """Make a scene this run's own, told in the robot's base frame; waits a little for the transform.  Raises NO_TRANSFORM."""
+
+        def carried() -> bool:
+            try:
+                self.scene, self._seen = self._server.in_base(scene), scene
+            except MagicError as error:
+                if error.code != Code.NO_TRANSFORM or time.monotonic() >= deadline:
+                    raise
+                return False
+            return True
+
+        # Until the deadline is past, so that the last try says why.
+        while not self._token.wait(carried, time.monotonic() + 0.1):
+            pass
 
     @staticmethod
     def _unknown(scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
@@ -87,9 +140,11 @@ class Stages:
         topic = server.objects_topic
         if scene is not None:
             ids = [o.id for o in scene.objects]
+            seen = sum(o.source == SceneObject.CAMERA for o in scene.objects)
             code, what = (
                 Code.NO_OBJECTS,
-                f"{topic} holds {len(ids)} objects {ids} (allowed: a tool that a camera sees, and a target), waited {wait:.1f} s",
+                f"objects on {topic}: {len(ids)} ({', '.join(ids) or 'none'}), {seen} of them seen by a camera "
+                f"(allowed: at least two, a tool that a camera sees, and a target), waited {wait:.1f} s",
             )
         else:
             publishers = server.count_publishers(topic)
@@ -136,11 +191,21 @@ class Stages:
         Perception goes on meanwhile, and an object's own frame, in which contacts are given, may be another one in the next
         scene: its axis may point the other way.  The contacts' points in the world tell.
         """
-        for scene in (self.scene, self._server.scene):
+        for scene in (self._seen, self._server.scene):
             if all(_stands_in(scene, c, answer.target_id) for c in answer.candidates):
-                self.scene = scene
+                if scene is not self._seen:
+                    self._take(scene, time.monotonic())
+                for candidate in answer.candidates:
+                    self._carry_point(candidate)
                 return True
         return False
+
+    def _carry_point(self, candidate: ContactCandidate) -> None:
+        """Tell a candidate's point in the robot's base frame, as the objects are."""
+        if not np.isnan(candidate.point.x):
+            tool = conversions.pose_from_msg(self._find(candidate.tool_id).pose)
+            x, y, z = (tool @ conversions.pose_from_msg(candidate.tool.object_from_contact))[:3, 3]
+            candidate.point.x, candidate.point.y, candidate.point.z = float(x), float(y), float(z)
 
     def _other_objects(self, answer: MatchContact.Response) -> MagicError:
         if answer.code != Code.OK:
@@ -173,25 +238,32 @@ class Stages:
         )
         joints = server.joints.all()
         goal.start = JointState(name=list(joints), position=[j.position for j in joints.values()])
-        result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+        self.state_known = bool(joints)
+        result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace).result
         if result.code == Code.OK:
             self._check_plan(result.plan, request.variant)
+        elif result.code == Code.JOINT_LIMIT:
+            # Of the way that was planned, or of where the arm stands already, which is the same whatever is tried next.
+            try:
+                check_range(server.robot.arm, joints)
+            except MagicError as error:
+                raise pipeline.HopelessError(error.code, error.message) from error
         return pipeline.Planned(code_of(result.code), result.message, result.plan)
 
     def _check_plan(self, plan: MotionPlan, variant: str) -> None:
-        """A plan must be what was asked for, and in the frame in which the objects are."""
+        """A plan must be what was asked for, and in the robot's base frame."""
         if plan.variant != variant:
             raise MagicError(Code.UNKNOWN_VARIANT, "variant of the plan", plan.variant, variant)
         trajectories = (plan.tool_trajectory, plan.arm_trajectory) if variant == MotionPlan.ARM else (plan.tool_trajectory,)
         for frame in {t.header.frame_id for t in trajectories}:
             if frame != self.scene.header.frame_id:
                 raise MagicError(
-                    Code.BAD_REQUEST, "frame of the objects", self.scene.header.frame_id, f"{frame}, in which the planner works"
+                    Code.BAD_REQUEST, "frame of the plan", frame, f"{self.scene.header.frame_id}, the robot's base frame and the objects'"
                 )
 
     def verify(
         self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, plan: MotionPlan, timeout: float
-    ) -> pipeline.Verdict:
+    ) -> Verdict:
         """Ask the verifier for one planned motion."""
         server = self._server
         timeout = min(timeout, server.settings.verify)
@@ -207,13 +279,24 @@ class Stages:
             seed=request.seed,
             timeout=timeout,
         )
-        result = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+        answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+        result = answer.result
         self._last_goal, self._last_code = goal, result.code
         code = code_of(result.code)
         if code == Code.OK and not result.success:
             code = Code.GOAL_NOT_REACHED
         message = pipeline.with_metrics(result.message, list(zip(result.metric_names, result.metric_values)))
-        return pipeline.Verdict(code, message, max(1, result.rollouts))
+        return Verdict(
+            code,
+            message,
+            result.success_rate,
+            result.rate_low,
+            result.rate_high,
+            result.rollouts,
+            tuple(result.failures),
+            answer.server,
+            self._run,
+        )
 
     def film(self, outcome_code: Code) -> Image | None:
         """The film strip of the last simulation: the verifier draws it from what it recorded when it gets the same goal again.
@@ -225,7 +308,7 @@ class Stages:
             return None
         goal.want_film = True
         try:
-            result = server.verifier.call(goal, server.settings.verify, self._token, server.settings.presence, server.settings.grace)
+            result = server.verifier.call(goal, server.settings.verify, self._token, server.settings.presence, server.settings.grace).result
         except MagicError as error:
             server.get_logger().warning(f"no film: {error.message}")
             return None

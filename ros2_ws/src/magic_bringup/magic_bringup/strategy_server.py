@@ -6,29 +6,34 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import Image, JointState
-from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from magic_bringup import markers, pipeline, scene_change
 from magic_bringup import settings as parameters
 from magic_bringup.arm import Arm
 from magic_bringup.joints import JointStates
-from magic_bringup.remote import RemoteAction, RemoteService, Token, check_alone
+from magic_bringup.outlet import Motion, Outlet
+from magic_bringup.permission import RECORDED, Claim, Limits, Look, NotYet, Purpose, Verdict, World, permit
+from magic_bringup.publication import Publication
+from magic_bringup.remote import SEND_GOAL, RemoteAction, RemoteService, Token, servers_of
 from magic_bringup.stages import Stages, complaint_code
-from magic_core import conversions, presence, qos
+from magic_core import conversions, presence, qos, transforms
 from magic_core import strategy as strategies
 from magic_core.diagnostics import Diagnostics, clock_complaint, status
 from magic_core.errors import Code, MagicError
-from magic_core.node import RESULT_TIMEOUT, describe, run
+from magic_core.node import RESULT_TIMEOUT, describe, robot_parameters, run
+from magic_core.robot import Description, RobotConfig
+from magic_core.tf_listener import TransformListener
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObjectArray, StageTimes
 from magic_interfaces.srv import MatchContact
@@ -39,20 +44,25 @@ PERCEPTION = "perception"
 COMPLAINT_AGE = 30.0
 #: Where a run ends so, a clock that stands still may be why.
 OUT_OF_TIME = (Code.NO_FRAMES, Code.NO_OBJECTS, Code.STALE_DATA)
+#: The node that plays a bag, the project's as rosbag2's: what comes in while it is there has stamps of another time.
+PLAYER = "rosbag2_player"
+#: Between two questions whether a trajectory may be published or the arm may move, where that takes waiting, s.
+ASKING_PERIOD = 0.1
 
 
 class StrategyServer(Node):
     """Action ``run_strategy``: perceive, match, plan, verify, publish.
 
     Subscribes
-        objects (SceneObjectArray, latched), joint_states (JointState, where the arm is), /diagnostics (why no objects come)
+        objects (SceneObjectArray, latched), joint_states (JointState, where the arm is), /diagnostics (why no objects come);
+        where objects come in another frame than the robot's base, /tf and /tf_static, by which they are carried into it
     Calls
         match_contact (service), plan_motion (action), verify_motion (action)
     Publishes
         verified_trajectory (JointTrajectory, latched, variant arm), verified_tool_trajectory (MultiDOFJointTrajectory,
-        latched, variant fg), strategy/markers (MarkerArray, latched), /diagnostics at 1 Hz.
-        A trajectory is published only after the verifier has answered OK for it; the next run begins by taking it back, by
-        an empty one.
+        latched, variant fg), verified_motion (VerifiedMotion, latched, at 1 Hz besides), strategy/markers (MarkerArray, latched),
+        /diagnostics at 1 Hz.  A trajectory is published, and the arm moves, only where :mod:`magic_bringup.permission` says so;
+        it is taken back, by an empty one, at the start, when the next run begins, when objects or arm are elsewhere, at the end.
     With ``execute``, calls also
         ``trajectory_action`` (control_msgs/FollowJointTrajectory) and ``gripper_action`` (control_msgs/GripperCommand): arm and
         gripper carry out a plan of the variant arm that the verifier has passed, where the arm stands at its start.
@@ -65,14 +75,30 @@ class StrategyServer(Node):
         super().__init__("strategy_server")
         settings = self.settings = parameters.read(self)
         arm = parameters.read_arm(self, settings.presence)
+        if settings.execute and settings.recorded:
+            raise MagicError(
+                Code.BAD_REQUEST, "parameters execute and recorded", "both true", "one of them: no arm is moved by a recording"
+            )
+        self.robot = Description(RobotConfig(**robot_parameters(self)))
+        self._limits = Limits(
+            self.robot.base_frame,
+            settings.required_rate,
+            settings.objects_age,
+            settings.object_tolerance,
+            arm.state_age,
+            arm.start_tolerance,
+        )
         group = ReentrantCallbackGroup()
         self._lock = threading.Lock()
         self._token: Token | None = None
+        self._run_id = ""
         self._goals: dict[bytes, Token] = {}
         self._complaints: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._waiting: list[str] | None = None
         self._closing = False
-        self._published: dict[Publisher, JointTrajectory | MultiDOFJointTrajectory] = {}
+        self._group = group
+        self._transforms: TransformListener | None = None
+        self._look: tuple[SceneObjectArray, Look] | None = None
         self.scene: SceneObjectArray | None = None
         self.scene_came = -math.inf
         self.joints = JointStates()
@@ -80,14 +106,15 @@ class StrategyServer(Node):
         self.matcher = RemoteService(self, MatchContact, "match_contact", "matcher", group)
         self.planner = RemoteAction(self, PlanMotion, "plan_motion", "planner", group)
         self.verifier = RemoteAction(self, VerifyMotion, "verify_motion", "verifier", group)
-        self._arm = Arm(self, settings.trajectory_action, settings.gripper_action, arm, self.joints, group) if settings.execute else None
+        self._arm = Arm(self, settings.trajectory_action, settings.gripper_action, arm, group) if settings.execute else None
+        self._server_name = self.resolve_service_name("run_strategy")
+        self._outlet = Outlet(self, self.robot.base_frame)
+        self.publication = Publication(self._outlet, self._world, self._limits)
         self.objects_topic = self.create_subscription(
             SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=group
         ).topic_name
         self.create_subscription(JointState, "joint_states", self._on_joints, qos.SENSOR, callback_group=group)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=group)
-        self._arm_pub = self.create_publisher(JointTrajectory, "verified_trajectory", qos.LATCHED)
-        self._tool_pub = self.create_publisher(MultiDOFJointTrajectory, "verified_tool_trajectory", qos.LATCHED)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self._server = ActionServer(
             self,
@@ -99,7 +126,6 @@ class StrategyServer(Node):
             callback_group=group,
             result_timeout=RESULT_TIMEOUT,
         )
-        self._server_name = self.resolve_service_name("run_strategy")
         self._diagnostics = Diagnostics(self, self._report, group)
         self._diagnostics.publish()
 
@@ -107,7 +133,10 @@ class StrategyServer(Node):
 
     def _on_objects(self, message: SceneObjectArray) -> None:
         self.scene, self.scene_came = message, time.monotonic()
+        if self._frame_of(message) != self.robot.base_frame and self._transforms is None:
+            self._transforms = TransformListener(self, self._group)
         self._poke()
+        self.publication.look()
 
     def _on_joints(self, message: JointState) -> None:
         stamp = conversions.time_from_msg(message.header.stamp)
@@ -135,6 +164,59 @@ class StrategyServer(Node):
 
         return still_there
 
+    @staticmethod
+    def _frame_of(scene: SceneObjectArray) -> str:
+        return scene.header.frame_id.lstrip("/")
+
+    def in_base(self, scene: SceneObjectArray) -> SceneObjectArray:
+        """Objects told in the robot's base frame; raises NO_TRANSFORM, BAD_REQUEST where they name no frame."""
+        frame, base = self._frame_of(scene), self.robot.base_frame
+        if frame == base:
+            return scene
+        if not frame:
+            raise MagicError(
+                Code.BAD_REQUEST, f"frame of {self.objects_topic}", frame, f"{base}, the robot's base frame, or one that TF knows"
+            )
+        if self._transforms is None:
+            raise NotYet(Code.NO_TRANSFORM, f"no transform yet from {frame!r}, the objects' frame, to {base!r}, the robot's base frame")
+        with self._transforms.lock:
+            try:
+                base_from_frame = self._transforms.buffer.lookup(base, frame, conversions.time_from_msg(scene.header.stamp))
+            except MagicError as error:
+                raise NotYet(
+                    error.code, f"objects in {frame!r} cannot be told in {base!r}, the robot's base frame: {error.message}"
+                ) from error
+        return conversions.carried(scene, base, base_from_frame)
+
+    def look(self) -> Look | None:
+        """The newest objects, as the rule wants to know them; raises NO_TRANSFORM, BAD_REQUEST, BAD_MESH."""
+        scene, came, kept = self.scene, self.scene_came, self._look
+        if scene is None:
+            return None
+        if kept is None or kept[0] is not scene:
+            kept = self._look = scene, look_at(self.in_base(scene))
+        return replace(kept[1], came=came, stamp=conversions.time_from_msg(scene.header.stamp))
+
+    def servers(self) -> dict[str, frozenset[bytes]]:
+        """Those who serve what a run needs, by what they do."""
+        found = {r.server: r.servers() for r in (self.matcher, self.planner, self.verifier)}
+        return {**found, "strategy server": servers_of(self, self._server_name + SEND_GOAL)}
+
+    def _world(self, claim: Claim) -> World:
+        """What there is at this moment."""
+        token = self._token
+        return World(
+            clock=self.get_clock().now().nanoseconds * 1e-9,
+            now=time.monotonic(),
+            run=self._run_id,
+            canceled=token is not None and token.canceled,
+            servers=self.servers(),
+            scene=self.look(),
+            joints=self.joints.all(),
+            recorded=self.settings.recorded,
+            replaying=PLAYER in self.get_node_names(),
+        )
+
     def _poke(self) -> None:
         token = self._token
         if token is not None:
@@ -146,14 +228,28 @@ class StrategyServer(Node):
         waiting += self._arm.ready() if self._arm is not None else []
         if self.scene is None:
             waiting.append(f"perception ({self.objects_topic})")
-        if self.count_services(f"{self._server_name}/_action/send_goal") > 1:
-            waiting.append(f"the end of other servers of {self._server_name}")
+        waiting += [f"the end of other servers of {name}" for name, there in self.servers().items() if len(there) > 1]
         if waiting != self._waiting:
             self._waiting = waiting
             self.get_logger().info("waiting for " + ", ".join(waiting) if waiting else "ready: all servers are there and objects have come")
         level = DiagnosticStatus.WARN if waiting else DiagnosticStatus.OK
         message = "waiting for " + ", ".join(waiting) if waiting else "ready"
-        return [status(self, "readiness", level, message, {"running": str(self._token is not None).lower()})]
+        self.publication.look()
+        self._outlet.beat()
+        values = {"running": str(self._token is not None).lower(), "published": self._standing(), "joint_states": self._arm_state()}
+        return [status(self, "readiness", level, message, values)]
+
+    def _standing(self) -> str:
+        """What stands published, and what it rests on."""
+        state = self._outlet.state
+        if not state.valid:
+            return f"nothing: {state.reason}"
+        return "; ".join([f"{state.strategy} ({state.variant}) of run {state.run_id}", *state.notes])
+
+    def _arm_state(self) -> str:
+        if not any(name in self.joints.all() for name in self.robot.names):
+            return "none came: motions of the arm are planned from its home configuration, and none is carried out"
+        return "heard"
 
     def complaint(self) -> DiagnosticStatus | None:
         """Perception's worst recent diagnostic, where it has one; among equals one that says more than that nothing comes."""
@@ -163,9 +259,11 @@ class StrategyServer(Node):
     # ------------------------------------------------------------ the action
 
     def _on_cancel(self, handle: Any) -> CancelResponse:
-        token = self._goals.get(bytes(handle.goal_id.uuid))
-        if token is not None:
-            token.cancel()
+        key = bytes(handle.goal_id.uuid)
+        token = self._goals.get(key)
+        if token is not None and not token.request_cancel():
+            return CancelResponse.REJECT  # it has just ended, with its result
+        self.publication.take_back("its run was canceled", key.hex())
         return CancelResponse.ACCEPT
 
     def _execute(self, handle: Any) -> RunStrategy.Result:
@@ -183,12 +281,19 @@ class StrategyServer(Node):
                     self._token = token
             if not mine:
                 raise MagicError(Code.BUSY, "another run is at work; cancel it or wait for its result")
+            self._run_id = key.hex()
             self._run(handle, token, result)
         except Exception as error:
             result.code, result.message = describe(self, error)
+            result.verified = False
         finally:
             if mine:
-                self._token = None
+                self._token, self._run_id = None, ""
+        if not token.end() and result.code == Code.OK:  # canceled when all was done
+            result.code, result.message = int(Code.CANCELED), f"canceled: {result.message}"
+        if result.code == Code.CANCELED:
+            result.verified = False
+            self.publication.take_back("its run was canceled", key.hex())
         if result.code in OUT_OF_TIME and (complaint := clock_complaint(self)):
             result.message += f"; {complaint}"
         self._finish(handle, result)
@@ -217,10 +322,10 @@ class StrategyServer(Node):
 
     def _run(self, handle: Any, token: Token, result: RunStrategy.Result) -> None:
         goal = handle.request
-        self._withdraw()
+        self.publication.take_back("a new run has begun")
         strategy = strategies.find(goal.strategy, self.settings.strategies or None)
         request = self._request(goal)
-        stages = Stages(self, token, needs_verifier=strategy.simulatable, heatmap=goal.want_pictures)
+        stages = Stages(self, token, self._run_id, needs_verifier=strategy.simulatable, heatmap=goal.want_pictures)
         notify = self._notifier(handle)
         outcome = pipeline.Run(
             request,
@@ -235,13 +340,12 @@ class StrategyServer(Node):
         fill(result, outcome)
         # First what somebody waits for, then the pictures.
         if outcome.code == Code.OK:
-            token.check()
-            if outcome.verified:
-                self._publish(outcome.plan)
             # What physics has not passed moves the arm only where goal and server both say so; it is published nowhere.
-            wanted = outcome.verified or (goal.allow_unverified and self.settings.execute_unverified)
-            if self._arm is not None and wanted and outcome.plan.variant == MotionPlan.ARM:
-                self._carry_out(self._arm, outcome, stages, token, result, notify)
+            waived = goal.allow_unverified and self.settings.execute_unverified
+            claim = self._claim(outcome, stages, waived)
+            published = outcome.verified and self._publish(claim, token, result)
+            if self._arm is not None and (published or (waived and not outcome.verified)) and outcome.plan.variant == MotionPlan.ARM:
+                self._carry_out(self._arm, claim, outcome, stages, token, result, notify)
         self._show(stages, outcome)
         if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()
@@ -282,18 +386,48 @@ class StrategyServer(Node):
 
         return notify
 
-    def _publish(self, plan: MotionPlan) -> None:
-        publisher, trajectory = (
-            (self._arm_pub, plan.arm_trajectory) if plan.variant == MotionPlan.ARM else (self._tool_pub, plan.tool_trajectory)
+    def _claim(self, outcome: pipeline.Outcome, stages: Stages, waived: bool) -> Claim:
+        """What the rule is to know of a motion that is to be published or carried out."""
+        plan = outcome.plan
+        arm = plan.arm_trajectory if plan.variant == MotionPlan.ARM else None
+        trajectories = (plan.tool_trajectory, *([arm] if arm is not None else []))
+        return Claim(
+            run=self._run_id,
+            frames=frozenset(t.header.frame_id for t in trajectories),
+            scene=look_at(stages.scene),
+            verdict=outcome.verdict,
+            waived=waived,
+            joints=tuple(arm.joint_names) if arm is not None else (),
+            start=tuple(arm.points[0].positions) if arm is not None and arm.points else (),
+            state_known=stages.state_known,
+            motion=Motion(plan, stages.strategy, outcome.tool_id, outcome.target_id, stages.scene.header.stamp),
         )
-        self._published[publisher] = trajectory
-        publisher.publish(trajectory)
 
-    def _withdraw(self) -> None:
-        """Take the last run's trajectories back, which late subscribers would still get: an empty one says that none is valid."""
-        for publisher, trajectory in self._published.items():
-            publisher.publish(type(trajectory)(header=trajectory.header))
-        self._published.clear()
+    def _when_allowed(self, ask: Callable[[], Any], token: Token) -> Any:
+        """What ``ask`` returns, which asks the rule; waits a little where that may help.  Raises what the rule does."""
+        deadline = time.monotonic() + self.settings.objects
+        while True:
+            token.check()
+            try:
+                return ask()
+            except NotYet:
+                if time.monotonic() >= deadline:
+                    raise
+            token.wait(lambda: False, min(deadline, time.monotonic() + ASKING_PERIOD))
+
+    def _publish(self, claim: Claim, token: Token, result: RunStrategy.Result) -> bool:
+        """Publish a verified motion, if that is allowed, and write into the result how that went."""
+        sentence, metrics = pipeline.split_metrics(result.message)
+        try:
+            result.notes = list(self._when_allowed(lambda: self.publication.offer(claim), token))
+            # Who has told the server that all is recorded need not be told in each sentence.
+            sentence = "; ".join([sentence, *(n for n in result.notes if n != RECORDED or not self.settings.recorded)])
+        except Exception as error:
+            result.code, message = describe(self, error)
+            sentence = f"verified ({sentence}), but not published: {message}"
+            result.verified = False
+        result.message = pipeline.with_metrics(sentence, list(metrics.items()))
+        return result.verified
 
     def _show(self, stages: Stages, outcome: pipeline.Outcome) -> None:
         """Markers of what was tried; where they cannot be drawn, the run has still ended as it has."""
@@ -310,6 +444,7 @@ class StrategyServer(Node):
     def _carry_out(
         self,
         arm: Arm,
+        claim: Claim,
         outcome: pipeline.Outcome,
         stages: Stages,
         token: Token,
@@ -322,13 +457,25 @@ class StrategyServer(Node):
             index = outcome.reports[-1].trial.index
             notify(pipeline.Progress("execute", index, len(stages.matches.candidates), text, outcome.reports))
 
+        points = outcome.plan.arm_trajectory.points
+        moved_by = {0: (), 1: (outcome.tool_id,), 2: (outcome.tool_id, outcome.target_id)}
+
+        def ask(point: int, moved: int) -> None:
+            asked = replace(claim, start=tuple(points[point].positions), meant=frozenset(moved_by[moved]))
+
+            def allowed() -> None:
+                world = self._world(asked)
+                permit(asked, replace(world, servers={**world.servers, **arm.servers()}), self._limits, Purpose.MOVE)
+
+            self._when_allowed(allowed, token)
+            # Nobody else is to begin what is being carried out.
+            self.publication.take_back("the strategy server carries it out itself", claim.run)
+
         sentence, metrics = pipeline.split_metrics(result.message)
         try:
-            check_alone(self, self._server_name)
-            self._check_scene(stages.scene, token)
             kind = "verified" if outcome.verified else "UNVERIFIED"
-            self.get_logger().warning(f"the arm is about to move: carrying out the {kind} plan")
-            arm.execute(outcome.plan, token, tell)
+            self.get_logger().warning(f"the arm is about to move, if it may: carrying out the {kind} plan")
+            arm.execute(outcome.plan, token, tell, ask)
             result.executed = True
             sentence += "; carried out by the arm"
         except Exception as error:
@@ -336,21 +483,6 @@ class StrategyServer(Node):
             sentence = f"{'verified' if outcome.verified else 'planned'} ({sentence}), but not carried out to the end: {message}"
             self.get_logger().error(sentence)
         result.message = pipeline.with_metrics(sentence, list(metrics.items()))
-
-    def _check_scene(self, planned: SceneObjectArray, token: Token) -> None:
-        """The objects must have been seen just now, and where the plan believes them.  Waits a little for perception."""
-        limit = self.settings.objects_age
-        if not token.wait(lambda: self._scene_age() <= limit, time.monotonic() + self.settings.objects, alive=self.objects_watch()):
-            raise MagicError(
-                Code.STALE_DATA, "age of the objects in s", round(self._scene_age(), 1), f"at most {limit:g}, by stamp and by arrival"
-            )
-        before, now = (conversions.scene_from_msg(s).objects for s in (planned, self.scene))
-        scene_change.check(before, now, self.settings.object_tolerance)
-
-    def _scene_age(self) -> float:
-        """Seconds since the newest objects were seen, by their stamp or by their arrival, whichever is worse."""
-        by_stamp = self.get_clock().now().nanoseconds * 1e-9 - conversions.time_from_msg(self.scene.header.stamp)
-        return max(abs(by_stamp), time.monotonic() - self.scene_came)
 
     def wind_down(self) -> bool:
         """Take no more goals and cancel the run at work, with all that it has begun; true once its client has the answer.
@@ -360,6 +492,7 @@ class StrategyServer(Node):
         if self._goals and not self._closing:
             self.get_logger().warning("winding down: the run at work is being canceled")
         self._closing = True
+        self.publication.close()
         for token in list(self._goals.values()):
             token.cancel()
         return not self._goals
@@ -386,7 +519,24 @@ def report_to_msg(report: pipeline.Report) -> CandidateReport:
     )
     if report.plan is not None:
         message.grasp = report.plan.tool_from_tcp
+    if report.verdict is not None:
+        tell_rates(message, report.verdict)
     return message
+
+
+def tell_rates(message: CandidateReport | RunStrategy.Result, verdict: Verdict) -> None:
+    """Write the verifier's rates into a message that has VerifyMotion's fields for them."""
+    message.success_rate, message.rate_low, message.rate_high = verdict.success_rate, verdict.rate_low, verdict.rate_high
+    message.rollouts, message.failures = verdict.rollouts, list(verdict.failures)
+
+
+def look_at(scene: SceneObjectArray) -> Look:
+    """The objects of a message as the rule wants to know them; ``came`` is not filled in."""
+    reaches = {}
+    for item in scene.objects:
+        vertices = np.array([(p.x, p.y, p.z) for p in item.mesh.vertices]).reshape(-1, 3)
+        reaches[item.id] = scene_change.hull(transforms.apply(conversions.pose_from_msg(item.pose), vertices))
+    return Look(reaches, scene.header.frame_id.lstrip("/"), conversions.time_from_msg(scene.header.stamp), -math.inf)
 
 
 def fill(result: RunStrategy.Result, outcome: pipeline.Outcome) -> None:
@@ -394,6 +544,8 @@ def fill(result: RunStrategy.Result, outcome: pipeline.Outcome) -> None:
     result.code = int(outcome.code)
     result.message = outcome.message
     result.verified = outcome.verified
+    if outcome.verdict is not None:
+        tell_rates(result, outcome.verdict)
     if outcome.plan is not None:
         result.plan = outcome.plan
     result.tool_id, result.target_id = outcome.tool_id, outcome.target_id

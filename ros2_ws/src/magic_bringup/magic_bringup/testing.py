@@ -102,7 +102,12 @@ class Bench:
 def started(
     logs: Path, bag: Path | None = None, parameters: dict[str, dict[str, object]] | None = None, leave_out: tuple[str, ...] = ()
 ) -> Iterator[Bench]:
-    """A graph in a domain of its own; everything is stopped in the end."""
+    """A graph in a domain of its own; everything is stopped in the end.
+
+    Its strategy server is told that it sees a recording, unless it is to move an arm.
+    """
+    server = (parameters or {}).get("strategy_server", {})
+    parameters = {**(parameters or {}), "strategy_server": {"recorded": not server.get("execute", False), **server}}
     env = isolated()
     before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
     os.environ.update({k: env[k] for k in before})

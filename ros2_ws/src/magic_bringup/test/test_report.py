@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from magic_bringup import fakes, report
-from magic_bringup.demo import Options, Record, candidate_summary, empty_summary
+from magic_bringup.demo import Options, candidate_summary, empty_summary
+from magic_bringup.record import Record
 from magic_core import conversions
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError

@@ -1,5 +1,7 @@
 """The strategy server against stand-ins of the other nodes."""
 
+import os
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -15,6 +17,8 @@ from visualization_msgs.msg import MarkerArray
 
 from magic_bringup import fakes, pipeline
 from magic_bringup.domain import free_domain
+from magic_bringup.graph import Process, executable
+from magic_bringup.permission import ARM_UNKNOWN
 from magic_bringup.remote import Token
 from magic_bringup.strategy_server import StrategyServer, complaint_code
 from magic_core import conversions, qos, transforms
@@ -23,6 +27,7 @@ from magic_core.actions import ActionClient
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
+from magic_interfaces.msg import VerifiedMotion
 from magic_interfaces.srv import MatchContact
 
 DEADLINE = 15.0
@@ -34,7 +39,14 @@ class Bench:
     def __init__(self, folder, services=("match", "plan", "verify"), **parameters):
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=free_domain())  # two benches may be open at once
-        values = {"strategies": str(folder), "server_timeout": 2.0, "objects_timeout": 1.0, "grace": 0.5, **parameters}
+        values = {
+            "strategies": str(folder),
+            "server_timeout": 2.0,
+            "objects_timeout": 1.0,
+            "grace": 0.5,
+            "objects_age": 600.0,
+            **parameters,
+        }
         arguments = ["--ros-args"] + [x for k, v in values.items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
         original = Node.__init__
         context = self.context
@@ -53,12 +65,13 @@ class Bench:
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.feedback = []
         self.heard = threading.Condition()
-        self.messages = {"arm": [], "tool": [], "markers": []}
+        self.messages = {"arm": [], "tool": [], "markers": [], "state": []}
         self.valid = dict.fromkeys(("arm", "tool"))  # the trajectories that have not been taken back
         for key, kind, topic in (
             ("arm", JointTrajectory, "verified_trajectory"),
             ("tool", MultiDOFJointTrajectory, "verified_tool_trajectory"),
             ("markers", MarkerArray, "strategy/markers"),
+            ("state", VerifiedMotion, "verified_motion"),
         ):
             self.node.create_subscription(kind, topic, lambda m, k=key: self._hear(k, m), qos.LATCHED)
         self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -73,7 +86,7 @@ class Bench:
         with self.heard:
             if key in self.valid:
                 self.valid[key] = message if message.points else None
-            if key == "markers" or message.points:
+            if key not in self.valid or message.points:
                 self.messages[key].append(message)
             self.heard.notify_all()
 
@@ -180,6 +193,266 @@ def test_nothing_unverified_is_published(bench):
     assert not bench.messages["arm"]
 
 
+def test_what_stands_published_says_what_it_rests_on(bench):
+    handle = bench.send(variant="arm")
+    result = bench.result(handle.get_result_async()).result
+    assert (result.success_rate, result.rate_low, result.rate_high, result.rollouts) == (1.0, 0.86, 1.0, 1)
+    assert (result.candidates[-1].rate_low, result.candidates[-1].rollouts) == (0.86, 1)
+    assert result.notes == [ARM_UNKNOWN]  # nobody tells joint_states here
+    assert ARM_UNKNOWN in result.message
+    bench.wait(lambda: bench.valid["arm"] and bench.messages["state"] and bench.messages["state"][-1].valid)
+    state, trajectory = bench.messages["state"][-1], bench.valid["arm"]
+    assert state.run_id == bytes(handle.goal_id.uuid).hex()
+    assert state.stamp == trajectory.header.stamp
+    assert trajectory.header.stamp.sec > 0
+    assert trajectory.header.frame_id == state.header.frame_id == "panda_link0"
+    assert (state.strategy, state.variant, state.tool_id, state.target_id) == ("fake", "arm", "object_1", "object_2")
+    assert (state.rate_low, state.rollouts, state.notes, state.reason) == (0.86, 1, [ARM_UNKNOWN], "")
+    # It is said again and again: who hears nothing any more knows that the server has gone.
+    count = len(bench.messages["state"])
+    bench.wait(lambda: len(bench.messages["state"]) > count + 1)
+    assert bench.messages["state"][-1].header.stamp != state.header.stamp
+
+
+def elsewhere(scene, by):
+    """The scene with its first object moved along x, m."""
+    first = scene.objects[0]
+    pose = transforms.make(translation=[by, 0.0, 0.0]) @ first.world_from_object
+    return replace(scene, objects=(replace(first, world_from_object=pose), *scene.objects[1:]))
+
+
+def sees(bench, scene):
+    """Wait until the server has heard of a scene."""
+    came = bench.server.scene_came
+    bench.fakes.publish(scene)
+    bench.until(lambda: bench.server.scene_came > came)
+
+
+@pytest.mark.parametrize(
+    "now, says",
+    [
+        (lambda bench: sees(bench, elsewhere(fakes.scene(), 0.4)), "object_1 has moved since the plan, in mm: 39"),
+        (lambda bench: sees(bench, fakes.scene(("object_2",))), "objects gone since the plan: 'object_1'"),
+        (lambda bench: setattr(bench.server.scene.header.stamp, "sec", 10**9), "age of the objects in s, by stamp"),
+        (lambda bench: setattr(bench.server.scene.header.stamp, "sec", 2 * 10**9), "age of the objects in s, by stamp: -"),
+        (lambda bench: setattr(bench.server, "scene_came", bench.server.scene_came - 700.0), "age of the objects in s, by arrival"),
+    ],
+    ids=["moved", "gone", "of 2001", "of the future", "not seen any more"],
+)
+def test_a_scene_that_is_another_one_by_then_is_not_published_for(bench, now, says):
+    def verify(goal, canceled):
+        now(bench)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    sees(bench, fakes.scene())
+    bench.fakes.on_verify = verify
+    try:
+        result, status = bench.run()
+        assert (result.code, result.verified, status) == (Code.STALE_DATA, False, GoalStatus.STATUS_ABORTED), result.message
+        assert result.message.startswith("verified (passed), but not published: ")
+        assert says in result.message
+        assert not bench.valid["tool"]
+    finally:
+        bench.fakes.clear()
+        sees(bench, fakes.scene())
+    bench.run()  # proves that the channel works and that nothing came before it
+    bench.wait(lambda: bench.messages["tool"])
+    assert len(bench.messages["tool"]) == 1
+
+
+def test_what_stands_published_is_taken_back_when_the_scene_is_another_one(bench):
+    sees(bench, fakes.scene())
+    try:
+        bench.run()
+        bench.wait(lambda: bench.valid["tool"])
+        sees(bench, elsewhere(fakes.scene(), 0.01))
+        assert bench.server.publication.standing is not None
+        sees(bench, elsewhere(fakes.scene(), 0.05))
+        bench.wait(lambda: not bench.valid["tool"] and not bench.messages["state"][-1].valid)
+        assert "object_1 has moved" in bench.messages["state"][-1].reason
+    finally:
+        sees(bench, fakes.scene())
+
+
+@pytest.mark.parametrize("service", ["match", "plan", "verify"])
+def test_of_two_servers_nobody_knows_whose_answer_comes(bench, service):
+    """Published nine times of ten against the true verifier's no, it was."""
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+    other = fakes.FakeServers("other", services=(service,), context=bench.context)
+    bench.executor.add_node(other)
+    name = {"match": "matcher", "plan": "planner", "verify": "verifier"}[service]
+    try:
+        bench.until(lambda: len(bench.server.servers()[name]) == 2)
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NOT_ALONE, False)
+        assert "servers of /" in result.message
+        assert "2 (allowed: 1)" in result.message
+        assert not bench.fakes.goals
+        assert not bench.messages["tool"]
+    finally:
+        bench.executor.remove_node(other)
+        other.destroy_node()
+        bench.until(lambda: len(bench.server.servers()[name]) == 1)
+
+
+def test_a_second_verifier_that_comes_meanwhile_ends_the_run(bench):
+    others = []
+
+    def verify(goal, canceled):
+        others.append(fakes.FakeServers("other", services=("verify",), context=bench.context))
+        bench.until(lambda: len(bench.server.servers()["verifier"]) == 2)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    try:
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NOT_ALONE, False), result.message
+        assert not bench.messages["tool"]
+    finally:
+        for other in others:
+            other.destroy_node()
+        bench.until(lambda: len(bench.server.servers()["verifier"]) == 1)
+
+
+def test_a_verifier_that_was_replaced_since_is_not_the_one_that_judged(bench, monkeypatch):
+    execute = pipeline.Run.execute
+
+    def replaced_afterwards(run):
+        outcome = execute(run)
+        return replace(outcome, verdict=replace(outcome.verdict, server=b"another"))
+
+    monkeypatch.setattr(pipeline.Run, "execute", replaced_afterwards)
+    result, _ = bench.run()
+    assert (result.code, result.verified) == (Code.NOT_ALONE, False), result.message
+    assert not bench.messages["tool"]
+
+
+def test_an_arm_that_starts_in_a_collision_is_not_tried_again(bench):
+    bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(code=int(Code.START_IN_COLLISION), message="hand in the table")
+    result, _ = bench.run(variant="arm")
+    assert (result.code, result.message) == (Code.START_IN_COLLISION, "hand in the table")
+    assert len(result.candidates) == 1
+
+
+def test_an_arm_beyond_its_own_limits_is_not_tried_again(folder):
+    from sensor_msgs.msg import JointState
+
+    bench = Bench(folder)
+    states = bench.node.create_publisher(JointState, "joint_states", qos.RELIABLE)
+    try:
+        bench.fakes.publish(fakes.scene())
+        bench.until(lambda: states.get_subscription_count() > 0)
+        states.publish(JointState(name=list(fakes.JOINTS), position=[0.0] * 3 + [0.5] + [0.0] * 3))
+        bench.until(lambda: bench.server.joints.all())
+        bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(code=int(Code.JOINT_LIMIT), message="start, panda_joint4")
+        result, _ = bench.run(variant="arm")
+        assert (result.code, len(result.candidates)) == (Code.JOINT_LIMIT, 1)
+        assert "panda_joint4 at: 0.5 (allowed: -3.0718 to -0.0698)" in result.message
+    finally:
+        bench.close()
+
+
+def test_a_success_rate_below_the_required_one_is_not_published(folder):
+    bench = Bench(folder, required_rate=0.9)
+    try:
+        bench.fakes.publish(fakes.scene())
+        result, _ = bench.run()
+        assert (result.code, result.verified, result.rate_low) == (Code.NOT_SURE_ENOUGH, False, 0.86)
+        assert "0.86" in result.message
+        assert not bench.messages["tool"]
+    finally:
+        bench.close()
+
+
+def test_objects_in_another_frame_are_carried_into_the_robots_base(folder):
+    from geometry_msgs.msg import TransformStamped
+    from tf2_msgs.msg import TFMessage
+
+    bench = Bench(folder)
+    static = bench.node.create_publisher(TFMessage, "/tf_static", qos.STATIC_TF)
+    world_from_base = transforms.from_rpy(0.0, 0.0, np.deg2rad(10.0), [0.05, -0.06, 0.0])
+    seen = fakes.scene()
+    told = [replace(o, world_from_object=world_from_base @ o.world_from_object) for o in seen.objects]
+    # The table of the objects' own frame lies 20 mm lower there; only a turn about z, so that its normal stays.
+    in_world = replace(seen, objects=tuple(told), table=np.array([0.0, 0.0, 1.0, 0.02]), frame_id="world")
+
+    def match(request):
+        found = conversions.candidate_to_msg(fakes.candidate(), told[0].world_from_object)  # the matcher sees them as they come
+        return MatchContact.Response(candidates=[found], target_id="object_2", features="fake")
+
+    try:
+        bench.fakes.on_match = match
+        bench.fakes.publish(in_world)
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NO_TRANSFORM, False)
+        assert "'world'" in result.message
+        assert "'panda_link0'" in result.message
+        for frame, code in (("", Code.BAD_REQUEST), ("world", Code.OK)):
+            head = conversions.header("world")
+            pose = conversions.transform_to_msg(world_from_base)
+            static.publish(TFMessage(transforms=[TransformStamped(header=head, child_frame_id="panda_link0", transform=pose)]))
+            sees(bench, replace(in_world, frame_id=frame))
+            bench.fakes.goals.clear()
+            result, _ = bench.run()
+            assert result.code == code, result.message
+        goal = next(goal for name, goal in bench.fakes.goals if name == "verify_motion")
+        for message, item in zip((goal.tool, goal.target), seen.objects):
+            np.testing.assert_allclose(conversions.pose_from_msg(message.pose), item.world_from_object, atol=1e-9)
+            assert message.cloud.header.frame_id == "panda_link0"
+        np.testing.assert_allclose(goal.table.coef, [0.0, 0.0, 1.0, 0.02], atol=1e-12)
+        contact = seen.objects[0].world_from_object @ fakes.candidate().tool.object_from_contact
+        np.testing.assert_allclose([goal.candidate.point.x, goal.candidate.point.y, goal.candidate.point.z], contact[:3, 3], atol=1e-9)
+        bench.wait(lambda: bench.valid["tool"])
+        assert bench.valid["tool"].header.frame_id == "panda_link0"
+    finally:
+        bench.close()
+
+
+def test_a_killed_server_takes_back_what_it_published_when_it_starts_again(folder, tmp_path):
+    """Until then its silence says so, and who comes late gets nothing of it."""
+    bench = Bench(folder)
+    process = None
+    try:
+        # The server of the bench is put out of the way: the one at work here is a process, which can be killed.
+        bench.executor.remove_node(bench.server)
+        bench.server._server.destroy()
+        bench.server.destroy_node()
+        context = bench.context.get_domain_id()
+        env = {**os.environ, "ROS_DOMAIN_ID": str(context)}
+        command = [str(executable("magic_bringup", "strategy_server")), "--ros-args"]
+        command += ["-p", f"strategies:={folder}", "-p", "objects_age:=600.0"]
+
+        def start():
+            states = len(bench.messages["state"])
+            process = Process.start("strategy_server", command, tmp_path / "server.log", env)
+            bench.until(lambda: len(bench.messages["state"]) > states, 60.0)
+            bench.until(bench.client.server_is_ready, 60.0)
+            return process
+
+        process = start()
+        bench.fakes.publish(fakes.scene())
+        result, _ = bench.run()
+        assert result.verified, result.message
+        bench.wait(lambda: bench.valid["tool"] and bench.messages["state"][-1].valid)
+        process.signal(signal.SIGKILL)
+        assert process.wait(10.0) == -signal.SIGKILL
+        assert bench.valid["tool"]  # nobody has taken it back
+        process = start()
+        bench.wait(lambda: not bench.valid["tool"])
+        assert "has just started" in bench.messages["state"][-1].reason
+        # And at an orderly end it takes back itself.
+        bench.run()
+        bench.wait(lambda: bench.valid["tool"])
+        process.signal(signal.SIGINT)
+        bench.wait(lambda: not bench.valid["tool"])
+        assert process.wait(20.0) == 0
+    finally:
+        if process is not None:
+            process.signal(signal.SIGKILL)
+            process.wait(10.0)
+        bench.close()
+
+
 @pytest.mark.parametrize(
     "second", [{"variant": "fg"}, {"variant": "arm"}, {"strategy": "juggling"}], ids=["verified", "not verified", "bad goal"]
 )
@@ -233,7 +506,7 @@ def test_what_is_canceled_when_it_has_just_been_verified_is_not_published(bench,
 
     monkeypatch.setattr(pipeline.Run, "execute", canceled_afterwards)
     result, _ = bench.run()
-    assert result.code == Code.CANCELED, result.message
+    assert (result.code, result.verified) == (Code.CANCELED, False), result.message
     monkeypatch.undo()
     bench.run()
     bench.wait(lambda: bench.messages["tool"])

@@ -6,8 +6,10 @@ reference to the message's buffer.  Bad content raises :class:`MagicError`.
 
 from __future__ import annotations
 
+import copy
 import math
 import struct
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -426,6 +428,39 @@ def scene_from_msg(msg: mi.SceneObjectArray) -> Scene:
         float(msg.camera_angle),
         tuple(msg.notes),
     )
+
+
+def check_frames(base: str, objects: Iterable[mi.SceneObject], *trajectories: JointTrajectory | MultiDOFJointTrajectory) -> None:
+    """Refuse objects and trajectories in another frame than the robot's base, whose name is ``base``; raises BAD_REQUEST naming both.
+
+    An object's frame is that of its cloud, the array's.  An empty name means the base frame.
+    """
+    named = [(f"object {o.id}", o.cloud.header.frame_id) for o in objects]
+    named += [(f"the trajectory of {', '.join(t.joint_names)}", t.header.frame_id) for t in trajectories if t.points]
+    for what, frame in named:
+        if frame.lstrip("/") not in ("", base):
+            raise MagicError(Code.BAD_REQUEST, f"frame of {what}", frame, f"{base}, the robot's base frame")
+
+
+def carried(msg: mi.SceneObjectArray, frame_id: str, frame_from_own: NDArray[np.float64]) -> mi.SceneObjectArray:
+    """A scene told in another frame: poses, boxes, clouds and table moved by (4, 4) ``frame_from_own``; the rest is shared, not copied."""
+
+    def moved(pose: Pose) -> Pose:
+        return pose_to_msg(frame_from_own @ pose_from_msg(pose))
+
+    table = plane_from_msg(msg.table)
+    normal = frame_from_own[:3, :3] @ table[:3]
+    result = copy.copy(msg)
+    result.header = Header(stamp=msg.header.stamp, frame_id=frame_id)
+    result.table = plane_to_msg(np.array([*normal, table[3] - normal @ frame_from_own[:3, 3]]))
+    result.objects = []
+    for item in msg.objects:
+        own = copy.copy(item)
+        own.pose, own.box_pose = moved(item.pose), moved(item.box_pose)
+        points, colors = cloud_from_msg(item.cloud)
+        own.cloud = cloud_to_msg(transforms.apply(frame_from_own, points), colors, Header(stamp=item.cloud.header.stamp, frame_id=frame_id))
+        result.objects.append(own)
+    return result
 
 
 # ---------------------------------------------------------------- contacts

@@ -89,6 +89,7 @@ class Code(IntEnum):
     BAD_REQUEST = 506
     EXECUTION_FAILED = 507
     GRASP_FAILED = 508
+    NOT_ALONE = 509
     INTERNAL = 599
 
 

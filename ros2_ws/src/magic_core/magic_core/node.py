@@ -42,7 +42,7 @@ RESULT_TIMEOUT = 10
 ROBOT_PARAMETERS = frozenset(
     "robot." + name
     for name in (
-        *("urdf", "srdf", "package_root", "move_group", "closing_axis", "opening", "home"),
+        *("urdf", "srdf", "package_root", "move_group", "closing_axis", "opening", "home", "base_frame"),
         *("acceleration", "velocity_scale", "acceleration_scale"),
     )
 )
@@ -195,6 +195,9 @@ def robot_parameters(node: Node) -> dict[str, Any]:
         "srdf": parameter(node, "robot.srdf", default.srdf, "SRDF with the pairs of links that may touch."),
         "package_root": parameter(
             node, "robot.package_root", default.package_root, "Folder that package:// stands for; empty: found from the URDF's place."
+        ),
+        "base_frame": parameter(
+            node, "robot.base_frame", default.base_frame, "Name of the frame of the URDF's root link; empty: that link's name."
         ),
         "move_group": parameter(node, "robot.move_group", default.move_group, "Link between the fingertips, z out of the hand."),
         "closing_axis": parameter(

@@ -43,7 +43,8 @@ class RobotConfig:
     the share folder of the ROS package.  move_group: the link between the fingertips, z out of the hand.
     closing_axis: along which axis of that link the fingers close.  opening: metres between the open fingers.
     home: joint positions.  acceleration: limits in rad/s^2, one for each joint or one for all.  scales: share
-    of the limits used.
+    of the limits used.  base_frame: the name that objects, trajectories and TF have for the frame of the URDF's root
+    link; empty: that link's own name.
     """
 
     urdf: str = ""
@@ -56,6 +57,7 @@ class RobotConfig:
     acceleration: tuple[float, ...] = PANDA_ACCELERATION
     velocity_scale: float = 0.3
     acceleration_scale: float = 0.2
+    base_frame: str = ""
 
     def __post_init__(self) -> None:
         if self.closing_axis not in ("x", "y"):
@@ -130,7 +132,8 @@ class Description:
     arm: the moving joints from the root to the move group, in order, their ranges no wider than half a turn either side of home:
     a turn more is the same to the hand, and takes a planner round in circles.  fingers: two sliding joints beyond the last of these,
     closed (2,) and opened (2,) their positions in metres.  finger_links: what moves with the fingers; foot: what never moves.
-    moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
+    base: the root link; base_frame: what its frame is called outside the URDF, the frame of everything that is planned and
+    verified.  moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
     may touch.
     """
 
@@ -160,6 +163,14 @@ class Description:
         self.base = roots[0] if roots else ""
         if len(roots) != 1 or len(self._above) != len(self.joints) or len(self._beyond(self.base)) != len(self._links):
             raise MagicError(Code.BAD_REQUEST, f"links of {self.urdf}", f"roots {roots}", "one tree with one root")
+        self.base_frame = config.base_frame.lstrip("/") or self.base
+        if self.base_frame != self.base and self.base_frame in self._links:
+            raise MagicError(
+                Code.BAD_REQUEST,
+                "robot.base_frame",
+                self.base_frame,
+                f"the URDF's root link {self.base}, or another name for the same frame; this is another link of {self.urdf}",
+            )
         self.arm = self._chain()
         if len(config.home) != len(self.arm):
             raise MagicError(Code.BAD_REQUEST, "home configuration", list(config.home), f"{len(self.arm)} joint positions")

@@ -264,6 +264,50 @@ def test_scenes():
     assert error.value.code == Code.UNKNOWN_OBJECT
 
 
+@given(poses)
+@fast
+def test_a_scene_told_in_another_frame_is_the_same_scene(frame_from_own):
+    """What was on the table is on it, what was apart is as far apart, and what is shared is not copied."""
+    mesh = Mesh(np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), np.array([[0, 1, 2]]))
+    mask = np.ones((2, 2), bool)
+    view = CanonicalView(np.zeros((2, 2, 3), np.uint8), mask, 0.01, np.eye(4))
+    pose, box = tf.from_rpy(0.1, 0.2, 0.3, [0.4, 0.5, 0.6]), tf.from_rpy(0.0, 0.0, 1.0, [0.4, 0.5, 0.0])
+    points = np.array([[0.4, 0.5, 0.02], [0.1, 0.2, 0.02]])
+    item = SceneObject("a", mesh, (), pose, view, points, np.full((2, 3), 7, np.uint8), world_from_box=box)
+    msg = cv.scene_to_msg(Scene((item,), np.array([0.0, 0.0, 1.0, -0.02]), 12.5, "world"))
+    told = cv.carried(msg, "base", frame_from_own)
+    assert (told.header.frame_id, told.objects[0].cloud.header.frame_id, msg.header.frame_id) == ("base", "base", "world")
+    assert told.objects[0].mesh is msg.objects[0].mesh
+    back = cv.scene_from_msg(told)
+    np.testing.assert_allclose(back.objects[0].world_from_object, frame_from_own @ pose, atol=1e-9)
+    np.testing.assert_allclose(back.objects[0].world_from_box, frame_from_own @ box, atol=1e-9)
+    np.testing.assert_allclose(back.objects[0].points, tf.apply(frame_from_own, points), atol=1e-5)
+    np.testing.assert_array_equal(back.objects[0].colors, item.colors)
+    heights = tf.apply(frame_from_own, points) @ back.table[:3] + back.table[3]
+    np.testing.assert_allclose(heights, 0.0, atol=1e-6)
+    np.testing.assert_allclose(cv.scene_from_msg(msg).objects[0].world_from_object, pose, atol=1e-9)  # as it was
+
+
+def test_what_is_told_in_another_frame_is_refused():
+    from magic_interfaces.msg import SceneObject as SceneObjectMsg
+
+    def named(frame):
+        item = SceneObjectMsg(id="cup")
+        item.cloud.header.frame_id = frame
+        return item
+
+    trajectory = cv.arm_motion_to_msg(ArmMotion(np.zeros(1), ("j",), *[np.zeros((1, 1))] * 3, np.eye(4), 0.0, 0.0), "world")
+    cv.check_frames("base", [named("base"), named("/base"), named("")], type(trajectory)())
+    for objects, trajectories, says in (
+        ([named("base"), named("map")], (), "frame of object cup: 'map' (allowed: base"),
+        ([], (trajectory,), "frame of the trajectory of j: 'world' (allowed: base"),
+    ):
+        with pytest.raises(MagicError) as caught:
+            cv.check_frames("base", objects, *trajectories)
+        assert caught.value.code == Code.BAD_REQUEST
+        assert says in caught.value.message
+
+
 def test_mesh_colours_of_the_wrong_length():
     msg = cv.scene_to_msg(Scene((SceneObject("a", tetrahedron(), (), np.eye(4), view()),), np.array([0, 0, 1.0, 0])))
     msg.objects[0].mesh_colors = msg.objects[0].mesh_colors[:-1]

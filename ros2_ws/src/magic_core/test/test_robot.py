@@ -39,6 +39,16 @@ def test_the_panda_is_the_default():
     assert [joint.effort for joint in robot.arm] == [87, 87, 87, 87, 12, 12, 12]
 
 
+def test_the_base_frame_is_the_root_link_or_another_name_for_it(config):
+    assert Description().base_frame == "panda_link0"
+    assert Description(replace(config, base_frame="/left/foot")).base_frame == "left/foot"
+    assert Description(replace(config, base_frame="foot")).base_frame == Description(config).base_frame == "foot"
+    with pytest.raises(MagicError) as caught:
+        Description(replace(config, base_frame="tip"))
+    assert caught.value.code == Code.BAD_REQUEST
+    assert "'tip' (allowed: the URDF's root link foot" in caught.value.message
+
+
 def test_places_of_links_are_those_of_a_plane_arm(config):
     """Shoulder, elbow and wrist turn about y: the tip is where lengths and angles say."""
     robot = Description(config)
