@@ -29,9 +29,6 @@ for argument in "$@"; do
 done
 
 if [ -f $JAZZY/setup.bash ]; then MODE=jazzy; else MODE=wheels; fi
-mkdir -p "$WS/log" 2>/dev/null && : 2>/dev/null >>"$LOG" || fail "cannot write in $WS (read-only, no permission or no disk)"
-: >"$WS/log/COLCON_IGNORE"
-
 # ------------------------------------------------------------------------------------------------ what there is to do
 # Python sources are linked, not copied, so only what the build itself reads counts: manifests, interfaces, and which files there are.
 requirements_state() {
@@ -48,19 +45,26 @@ build_state() {
       LC_ALL=C sort -z | xargs -0 cat
   } | sha256sum | cut -d' ' -f1
 }
+# Ends this script where there is nothing to do.
+look() {
+  REQUIREMENTS=$(requirements_state)
+  BUILD=$(build_state)
+  VENV_READY=0
+  [ -x "$VENV/bin/python" ] && [ "$(cat "$VENV/.requirements_state" 2>/dev/null)" = "$REQUIREMENTS" ] && VENV_READY=1
+  if [ $VENV_READY = 1 ] && [ $REBUILD = 0 ] && [ -f "$WS/install/local_setup.bash" ] && [ "$(cat "$WS/install/.build_state" 2>/dev/null)" = "$BUILD" ]; then
+    say "everything is set up ($MODE); nothing to do"
+    exit 0
+  fi
+}
+look
+# Nothing has been written so far: a finished installation may be read-only.
+mkdir -p "$WS/log" 2>/dev/null && : 2>/dev/null >>"$LOG" || fail "cannot write in $WS (read-only, no permission or no disk), and something is left to set up"
+: >"$WS/log/COLCON_IGNORE"
 # Two set-ups of one tree at a time would trample on each other.
 if command -v flock >/dev/null; then
   exec 9>"$WS/log/setup.lock"
   flock -n 9 || { say "another set-up of this tree is running; waiting for it"; flock -w 3600 9 || fail "the other set-up did not end within an hour"; }
-fi
-REQUIREMENTS=$(requirements_state)
-BUILD=$(build_state)
-VENV_READY=0 BUILD_READY=0
-[ -x "$VENV/bin/python" ] && [ "$(cat "$VENV/.requirements_state" 2>/dev/null)" = "$REQUIREMENTS" ] && VENV_READY=1
-[ $VENV_READY = 1 ] && [ $REBUILD = 0 ] && [ -f "$WS/install/local_setup.bash" ] && [ "$(cat "$WS/install/.build_state" 2>/dev/null)" = "$BUILD" ] && BUILD_READY=1
-if [ $BUILD_READY = 1 ]; then
-  say "everything is set up ($MODE); nothing to do"
-  exit 0
+  look
 fi
 : >"$LOG"
 
