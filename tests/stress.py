@@ -164,7 +164,8 @@ def _mangled(message: Any, name: str, kind: str, value: Any, rng: random.Random)
         setattr(message, name, min(max(rng.choice([low, high, 0, 1, value + 1, value - 1]), low), high))
     elif isinstance(value, np.ndarray):
         changed = value.copy()
-        changed[rng.randrange(len(changed))] = rng.choice(FLOATS)
+        whole = np.issubdtype(changed.dtype, np.integer)
+        changed[rng.randrange(len(changed))] = rng.choice((0, 1, np.iinfo(changed.dtype).max) if whole else FLOATS)
         setattr(message, name, changed)
     elif hasattr(value, "__len__") and not isinstance(value, bytes):
         return _mangled_list(message, name, kind, value, rng)
@@ -271,9 +272,11 @@ def good_requests(scene: Any, ask: Callable[[Any, Any], Any]) -> dict[Any, Any]:
     match = MatchContact.Request(strategy="hooking", tool_ids=["object_1"], target_id="object_2", top_k=2)
     matched = ask(MatchContact, match)
     tool, target = scene.objects
-    plan = PlanMotion.Goal(strategy="hooking", variant="fg", tool=tool, target=target, table=scene.table, timeout=2.0)
+    plan = PlanMotion.Goal(strategy="hooking", variant="fg", tool=tool, target=target, table=scene.table, timeout=DEADLINE)
     plan.candidate = matched.candidates[0]
     planned = ask(PlanMotion, plan)
+    assert matched.code == planned.code == Code.OK, f"{matched.message}; {planned.message}"
+    plan.timeout = 2.0
     verify = VerifyMotion.Goal(strategy="hooking", tool=tool, target=target, table=scene.table, timeout=2.0)
     verify.candidate, verify.plan = matched.candidates[0], planned.plan
     run = RunStrategy.Goal(strategy="hooking", variant="fg", tool_id="object_1", target_id="object_2", timeout=10.0)
