@@ -177,7 +177,7 @@ def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, pla
 
     The motion of whatever holds the tool stays as it was planned, so that the true tool is held where it truly is.
     """
-    from magic_verifier.verification import verify
+    from magic_verifier.verification import Limits, verify
 
     true = replace(layout.tools[index], id=seen.id)
     seen_from_true = transforms.inverse(seen.world_from_object) @ true.world_from_object
@@ -188,7 +188,10 @@ def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, pla
     others = tuple(tool for k, tool in enumerate(layout.tools) if k != index)
     truth = replace(strategy, physics=layout.physics)
     plan = MotionPlan(plan.variant, motion, arm)
-    return verify(truth, true, layout.target, (*layout.fixtures, *others), TABLE, None, plan, seed=seed, repetitions=1, deadline=deadline)
+    # A real hand gives way as the verifier's drawn rollouts have it.
+    limits = Limits().yielding()
+    scene = (truth, true, layout.target, (*layout.fixtures, *others), TABLE, None, plan)
+    return verify(*scene, seed=seed, repetitions=1, deadline=deadline, limits=limits)
 
 
 def sheet(frames: list[RgbdFrame], scene: Scene, path: Any) -> None:

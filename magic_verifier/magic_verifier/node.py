@@ -69,7 +69,12 @@ class VerifierNode(Node):
                 self, "limits.tracking_slide", 0.01, "Way in m that a sliding joint may lag behind its command.", low=0.0001, high=1.0
             ),
             give=parameter(
-                self, "limits.give", 0.003, "Depth in m that a floating tool that is off may be in static things.", low=0.0, high=0.1
+                self,
+                "limits.give",
+                0.006,
+                "In drawn rollouts, m that a hand gives way by: overlap and nudge may be as large.",
+                low=0.0,
+                high=0.1,
             ),
             required_rate=parameter(
                 self, "required_rate", Limits.required_rate, "Least lower end of the success rate's interval.", low=0.0, high=0.99
