@@ -25,9 +25,14 @@ class Workers:
                 self.executor.submit(_nothing)
 
     def close(self) -> None:
-        """End the processes; what they have begun they finish, and no one waits for it."""
-        if self.executor is not None:
-            self.executor.shutdown(wait=False, cancel_futures=True)
+        """End the processes, whatever they are at: else this one would wait for it when it ends itself."""
+        if self.executor is None:
+            return
+        # Python 3.14 has terminate_workers() for this.
+        processes = list((self.executor._processes or {}).values())
+        self.executor.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
 
 
 def _ready(parent: int) -> None:
