@@ -133,7 +133,7 @@ def test_a_timeout_is_kept(graph):
     started = time.monotonic()
     result = ask(graph, goal_message(plan=slow_plan(), timeout=0.5))
     assert result.code == Code.SIMULATION_TIMEOUT
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 15
 
 
 def test_a_second_goal_is_refused_and_a_cancel_ends_the_first(graph):

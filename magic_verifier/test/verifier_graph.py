@@ -70,8 +70,8 @@ def slow_plan():
     """A motion that takes minutes to carry out, and seconds to simulate."""
     *_, plan = scenes.hooking("L")
     motion = plan.tool_motion
-    phases = tuple(replace(phase, start=100 * phase.start, end=100 * phase.end) for phase in motion.phases)
-    return replace(plan, tool_motion=replace(motion, times=100 * motion.times, phases=phases))
+    phases = tuple(replace(phase, start=30 * phase.start, end=30 * phase.end) for phase in motion.phases)
+    return replace(plan, tool_motion=replace(motion, times=30 * motion.times, phases=phases))
 
 
 def goal_message(name="hooking", kind="L", tool=None, target=None, plan=None, **fields):
