@@ -219,7 +219,7 @@ def _build(
     points, colors = points[keep], colors[keep]
     cut, hanging = cut_off(looks, labels, label, parameters), hangs(looks, labels, label, fixtures)
     # A wall, a monitor, a person: no thing on the table.
-    across = float(np.ptp(np.percentile(points, [1, 99], axis=0), axis=0).max())
+    across = float(np.ptp(np.percentile(points[:: max(1, len(points) // 500)], [1, 99], axis=0), axis=0).max())
     if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut) and not hanging:
         raise MagicError(
             Code.OBJECT_CUT_OFF,
@@ -229,7 +229,13 @@ def _build(
         )
     solid = reconstruct(sights, parameters)
     evidence = Evidence(
-        solid.shape, agreement(solid.mesh, sights), witnessed(solid.mesh, sights), solid.mesh.extents, len(sights), apart, bool(cut)
+        solid.shape,
+        solid.fit or agreement(solid.mesh, sights),
+        witnessed(solid.mesh, sights),
+        solid.mesh.extents,
+        len(sights),
+        apart,
+        bool(cut),
     )
     best = int(np.argmax(counts))
     return _Built(solid, points, colors, labels[best] == label, looks[best].frame.camera, counts[best], cut, evidence, hanging)

@@ -19,6 +19,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     if found is not None:
         fit = agreement(found.mesh, sights)
         if fit.overlap > 0.75 and fit.through < _FREE:
-            return found
+            return replace(found, fit=fit)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
     # Without the outermost half percent: one stray ray must not lay a mug down.
@@ -59,7 +60,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         if turned is not None:
             fit = agreement(turned.mesh, sights)
             if fit.overlap > 0.8 and fit.through < _FREE:
-                return turned
+                return replace(turned, fit=fit)
         if height > 0.65 * length:  # a ladle's stem rises, but it lies
             return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
     return _freest([lambda: build_lying(sights, noise, parameters)], sights, noise)
@@ -97,7 +98,7 @@ def _freest(builds: list[Callable[[], Reconstruction | None]], sights: list[Sigh
     if best is None:
         assert problem is not None
         raise problem
-    return best
+    return replace(best, fit=value)
 
 
 def as_in_paper(points: NDArray[np.float64], alpha: float = 0.1, voxel: float = 0.005) -> Reconstruction:

@@ -10,15 +10,18 @@ from shapely.geometry import Polygon
 
 from magic_core.mesh import Mesh, concatenate
 from magic_perception import polygons
+from magic_perception.sight import Agreement
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """mesh and convex pieces in the table frame; ``shape`` names how they came about."""
+    """mesh and convex pieces in the table frame; ``shape`` names how they came about; ``fit``: how the mesh agrees
+    with what was seen, where that was asked already."""
 
     mesh: Mesh
     pieces: tuple[Mesh, ...]
     shape: str
+    fit: Agreement | None = None
 
 
 def hull_of(points: NDArray[np.float64]) -> Mesh | None:
