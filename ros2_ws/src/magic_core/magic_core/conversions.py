@@ -398,6 +398,8 @@ def plane_from_msg(msg: Plane) -> NDArray[np.float64]:
     """Plane to (4,) coefficients with a unit normal that points up; all zeros mean the plane z = 0."""
     coef = np.array(msg.coef, dtype=float)
     norm = float(np.linalg.norm(coef[:3]))
+    if not (np.all(np.isfinite(coef)) and np.isfinite(norm)):
+        raise MagicError(Code.BAD_REQUEST, "coefficients of the plane", coef.tolist(), "finite numbers a, b, c, d of ax + by + cz + d = 0")
     if norm < 1e-9:
         return np.array([0.0, 0.0, 1.0, 0.0])
     coef /= norm

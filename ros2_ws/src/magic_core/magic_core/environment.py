@@ -30,6 +30,7 @@ def prepare() -> None:
             os.environ["HOME"] = tempfile.gettempdir()
     wanted, there = os.environ.get("RMW_IMPLEMENTATION"), middlewares()
     if wanted and there and wanted not in there:
+        del os.environ["RMW_IMPLEMENTATION"]  # who reports the error may load ROS's libraries for that
         raise MagicError(
             Code.BAD_REQUEST, "RMW_IMPLEMENTATION", wanted, f"{', '.join(there)}, which is installed; or unset RMW_IMPLEMENTATION"
         )

@@ -405,3 +405,14 @@ def test_plans_that_are_none():
     assert code(lambda m: setattr(m.arm_trajectory, "points", [])) == Code.BAD_MOTION
     assert code(lambda m: m.arm_trajectory.points[0].positions.pop()) == Code.BAD_MOTION
     assert code(lambda m: m.tool_trajectory.points.reverse()) == Code.BAD_MOTION
+
+
+@pytest.mark.parametrize(
+    "coefficients", [[np.nan, 0.0, 1.0, 0.0], [0.0, 0.0, np.inf, 0.0], [0.0, 0.0, 1.0, np.nan], [1e300, 1e300, 1e300, 0.0]]
+)
+def test_planes_that_are_none_are_refused(coefficients):
+    from shape_msgs.msg import Plane
+
+    with pytest.raises(MagicError) as caught:
+        cv.plane_from_msg(Plane(coef=coefficients))
+    assert caught.value.code is Code.BAD_REQUEST
