@@ -18,6 +18,10 @@ PICTURE, REGION, FIXTURE, ROBOT = "picture", "region", "fixture", "robot"
 VIEW_KINDS = ("top", "side", "section")
 
 
+#: Metres a pixel that a view may have: from a microscope's to one in which a tool is a pixel; 1 stands for not known.
+SCALES = 1e-7, 10.0
+
+
 @dataclass(frozen=True)
 class CanonicalView:
     """An orthographic picture of one object in its canonical pose (paper, III-A).
@@ -47,8 +51,9 @@ class CanonicalView:
             raise MagicError(Code.BAD_REQUEST_IMAGE, "image and mask", f"{self.image.shape} and {self.mask.shape}", "(H, W, 3) and (H, W)")
         if self.kind not in VIEW_KINDS:
             raise MagicError(Code.BAD_REQUEST_IMAGE, "kind of view", self.kind, VIEW_KINDS)
-        if not (np.isfinite(self.metres_per_pixel) and self.metres_per_pixel > 0):
-            raise MagicError(Code.BAD_REQUEST_IMAGE, "metres_per_pixel", self.metres_per_pixel, "a number above 0")
+        low, high = SCALES
+        if not low <= self.metres_per_pixel <= high:  # nor is NaN
+            raise MagicError(Code.BAD_REQUEST_IMAGE, "metres_per_pixel", self.metres_per_pixel, f"{low:g} to {high:g}")
 
     @property
     def direction(self) -> NDArray[np.float64]:

@@ -416,3 +416,11 @@ def test_planes_that_are_none_are_refused(coefficients):
     with pytest.raises(MagicError) as caught:
         cv.plane_from_msg(Plane(coef=coefficients))
     assert caught.value.code is Code.BAD_REQUEST
+
+
+@pytest.mark.parametrize("scale", [np.nan, np.inf, -1.0, 0.0, 1e-300, 1e300])
+def test_views_of_no_possible_scale_are_refused(scale):
+    with pytest.raises(MagicError) as caught:
+        CanonicalView(np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), bool), scale, np.eye(4))
+    assert caught.value.code is Code.BAD_REQUEST_IMAGE
+    assert CanonicalView(np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), bool), 1.0, np.eye(4)).kind == "top"
