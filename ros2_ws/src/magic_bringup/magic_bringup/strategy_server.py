@@ -46,6 +46,8 @@ COMPLAINT_AGE = 30.0
 OUT_OF_TIME = (Code.NO_FRAMES, Code.NO_OBJECTS, Code.STALE_DATA)
 #: The node that plays a bag, the project's as rosbag2's: what comes in while it is there has stamps of another time.
 PLAYER = "rosbag2_player"
+#: How far the objects' frame may be turned against the robot's base for them to be carried from one into the other, degrees.
+TURNED = 1.0
 #: Between two questions whether a trajectory may be published or the arm may move, where that takes waiting, s.
 ASKING_PERIOD = 0.1
 
@@ -186,6 +188,15 @@ class StrategyServer(Node):
                 raise NotYet(
                     error.code, f"objects in {frame!r} cannot be told in {base!r}, the robot's base frame: {error.message}"
                 ) from error
+        turned = float(np.rad2deg(np.arccos(np.clip((np.trace(base_from_frame[:3, :3]) - 1) / 2, -1.0, 1.0))))
+        if not turned <= TURNED:
+            # A round object's own axes are those of the frame in which it was seen, and a strategy's directions are told in them.
+            raise MagicError(
+                Code.BAD_REQUEST,
+                f"frame of the objects {frame!r}, in degrees against {base!r}, the robot's base frame",
+                round(turned, 2),
+                f"at most {TURNED:g}; set perception's parameter frame to {base}",
+            )
         return conversions.carried(scene, base, base_from_frame)
 
     def look(self) -> Look | None:

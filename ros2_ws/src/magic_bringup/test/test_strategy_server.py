@@ -364,20 +364,29 @@ def test_a_success_rate_below_the_required_one_is_not_published(folder):
         bench.close()
 
 
+def told(bench, world_from_base):
+    """Whether the server has heard of a transform."""
+    try:
+        found = bench.server._transforms.buffer.lookup("world", "panda_link0")
+    except MagicError:
+        return False
+    return np.allclose(found, world_from_base, atol=1e-9)
+
+
 def test_objects_in_another_frame_are_carried_into_the_robots_base(folder):
     from geometry_msgs.msg import TransformStamped
     from tf2_msgs.msg import TFMessage
 
     bench = Bench(folder)
     static = bench.node.create_publisher(TFMessage, "/tf_static", qos.STATIC_TF)
-    world_from_base = transforms.from_rpy(0.0, 0.0, np.deg2rad(10.0), [0.05, -0.06, 0.0])
+    turned, world_from_base = (transforms.from_rpy(0.0, 0.0, np.deg2rad(a), [0.05, -0.06, 0.0]) for a in (10.0, 0.5))
     seen = fakes.scene()
-    told = [replace(o, world_from_object=world_from_base @ o.world_from_object) for o in seen.objects]
+    there = [replace(o, world_from_object=world_from_base @ o.world_from_object) for o in seen.objects]
     # The table of the objects' own frame lies 20 mm lower there; only a turn about z, so that its normal stays.
-    in_world = replace(seen, objects=tuple(told), table=np.array([0.0, 0.0, 1.0, 0.02]), frame_id="world")
+    in_world = replace(seen, objects=tuple(there), table=np.array([0.0, 0.0, 1.0, 0.02]), frame_id="world")
 
     def match(request):
-        found = conversions.candidate_to_msg(fakes.candidate(), told[0].world_from_object)  # the matcher sees them as they come
+        found = conversions.candidate_to_msg(fakes.candidate(), there[0].world_from_object)  # the matcher sees them as they come
         return MatchContact.Response(candidates=[found], target_id="object_2", features="fake")
 
     try:
@@ -387,10 +396,15 @@ def test_objects_in_another_frame_are_carried_into_the_robots_base(folder):
         assert (result.code, result.verified) == (Code.NO_TRANSFORM, False)
         assert "'world'" in result.message
         assert "'panda_link0'" in result.message
-        for frame, code in (("", Code.BAD_REQUEST), ("world", Code.OK)):
+        for frame, told_pose, code in (
+            ("", turned, Code.BAD_REQUEST),
+            ("world", turned, Code.BAD_REQUEST),
+            ("world", world_from_base, Code.OK),
+        ):
             head = conversions.header("world")
-            pose = conversions.transform_to_msg(world_from_base)
+            pose = conversions.transform_to_msg(told_pose)
             static.publish(TFMessage(transforms=[TransformStamped(header=head, child_frame_id="panda_link0", transform=pose)]))
+            bench.until(lambda: told(bench, told_pose))
             sees(bench, replace(in_world, frame_id=frame))
             bench.fakes.goals.clear()
             result, _ = bench.run()
