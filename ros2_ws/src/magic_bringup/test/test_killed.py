@@ -117,7 +117,7 @@ class Bench:
         if self.stage == OWN.get(self.role):
             goal.top_k = goal.seed = killed_roles.HELD
         try:
-            result = self.client.call(goal, DEADLINE, Token(), presence=30.0, feedback=self.feedback)
+            result = self.client.call(goal, DEADLINE, Token(), presence=30.0, feedback=self.feedback).result
         except MagicError as error:
             return int(error.code), error.message
         return result.code, result.message
