@@ -1,18 +1,17 @@
 """The feature backends there are, by name; what one is says :class:`magic_matcher.features.Features`.
 
 ``embedded`` ships with the package; ``dinov2`` needs weights.  ``auto`` takes ``dinov2`` where weights are named and the
-embedded one everywhere else.  Another backend is added by an entry of :data:`MAKERS`.
+embedded one everywhere else.  Another backend is added by an entry of :data:`magic_matcher.features.MAKERS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from magic_core.errors import Code, MagicError
 from magic_matcher.embedded import EmbeddedFeatures
-from magic_matcher.features import Features
+from magic_matcher.features import MAKERS, Features, load
 
 
 def _embedded(weights: str, device: str, **options: Any) -> Features:
@@ -37,15 +36,7 @@ def _dinov2(weights: str, device: str, **options: Any) -> Features:
     return Dinov2Features(weights, device, **options)
 
 
-#: Makers of backends: weights (hub name or folder, may be empty), torch device, and options of their own.
-MAKERS: dict[str, Callable[..., Features]] = {"embedded": _embedded, "dinov2": _dinov2}
+MAKERS.update(embedded=_embedded, dinov2=_dinov2)
 BACKENDS = ("auto", *MAKERS)
 
-
-def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: Any) -> Features:
-    """A backend by name; raises ``UNKNOWN_FEATURES`` or ``FEATURE_WEIGHTS`` saying what was looked for."""
-    if name == "auto":
-        name = "dinov2" if weights else "embedded"
-    if name not in MAKERS:
-        raise MagicError(Code.UNKNOWN_FEATURES, "features", name, ("auto", *MAKERS))
-    return MAKERS[name](weights, device, **options)
+__all__ = ["BACKENDS", "MAKERS", "load"]

@@ -8,7 +8,9 @@ and then proposes contact points on any number of new tools.  Which there are sa
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
@@ -164,3 +166,18 @@ def from_strategy(strategy: Strategy) -> Reference:
     target = strategy.target_contact
     radius = target.radius / strategy.tool_view.metres_per_pixel if np.isfinite(target.radius) and not target.concave else None
     return make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
+
+
+#: Makers of backends by name: weights (hub name or folder, may be empty), torch device, and options of their own.
+#: :mod:`magic_matcher.backends` puts in those there are; others may be added.
+MAKERS: dict[str, Callable[..., Features]] = {}
+
+
+def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: Any) -> Features:
+    """A backend by name; raises ``UNKNOWN_FEATURES`` or ``FEATURE_WEIGHTS`` saying what was looked for."""
+    import_module("magic_matcher.backends")  # by its name: the backends are made of what this module defines
+    if name == "auto":
+        name = "dinov2" if weights else "embedded"
+    if name not in MAKERS:
+        raise MagicError(Code.UNKNOWN_FEATURES, "features", name, ("auto", *MAKERS))
+    return MAKERS[name](weights, device, **options)
