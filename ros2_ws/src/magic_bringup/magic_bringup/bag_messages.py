@@ -10,6 +10,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 
 from magic_bringup.bag_file import open_bag
+from magic_bringup.bag_types import Carrier
 from magic_core.errors import Code, MagicError
 
 
@@ -27,17 +28,15 @@ def messages(bag: Path, wanted: Callable[[str, str], bool] = lambda topic, type_
 
     ``wanted`` is asked with topic and type before a message is decoded; types that are not installed are left out.  Raises BAD_BAG.
     """
+    carrier = Carrier()
     with open_bag(bag) as reader:
         for connection, stamp, data in reader.messages():
             kind = message_class(connection.msgtype)
             if kind is not None and wanted(connection.topic, connection.msgtype):
                 try:
-                    message = deserialize_message(bytes(data), kind)
-                except RuntimeError as error:  # RMWError: the type has had other fields when the bag was recorded
+                    message = deserialize_message(carrier.carry(connection, data), kind)
+                except RuntimeError as error:  # RMWError: the bytes are not what their type says
                     raise MagicError(
-                        Code.BAD_BAG,
-                        f"message of {connection.topic} in {bag}",
-                        str(error),
-                        f"{connection.msgtype} as installed: record the bag again",
+                        Code.BAD_BAG, f"message of {connection.topic} in {bag}", str(error), f"{connection.msgtype} as installed"
                     ) from error
                 yield connection.topic, stamp, message

@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from magic_bringup import bag_qos
 from magic_bringup.bag_file import note_on, open_bag, topics_of
 from magic_bringup.bag_messages import message_class
+from magic_bringup.bag_types import Carrier
 from magic_core import arguments
 from magic_core.errors import Code, MagicError
 
@@ -64,6 +65,7 @@ class Player:
         self._options = options
         self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock_hz > 0 else None
         self._publishers: dict[tuple[str, str], Any] = {}
+        self._carrier = Carrier()
 
     def play(self) -> int:
         """Raises ``BAD_BAG`` where the bag is unreadable, empty, or none of its topics can be published."""
@@ -134,7 +136,7 @@ class Player:
         for connection, stamp, data in reader.messages(connections, start, stop):
             tick(stamp)
             self._sleep_until(due(stamp))
-            self._publishers[connection.topic, connection.msgtype].publish(bytes(data))
+            self._publishers[connection.topic, connection.msgtype].publish(self._carrier.carry(connection, data))
             count += 1
         tick(stop)
         return count
