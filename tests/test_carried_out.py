@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from magic_bringup import fakes
-from magic_bringup.testing import feeding, first_messages, started, until
+from magic_bringup.testing import ONCE, feeding, first_messages, started, until
 from magic_core.errors import Code
 from magic_core.executor import ThreadedExecutor
 
@@ -21,6 +21,7 @@ SERVER = {
     "objects_age": 20.0,
     "trajectory_action": "arm/follow_joint_trajectory",
     "gripper_action": "gripper/gripper_action",
+    **ONCE,
 }
 
 
@@ -38,7 +39,7 @@ def test_a_mug_is_hung_by_arm_and_gripper(tmp_path):
         try:
             with feeding(messages):  # as cameras would: the objects must have been seen just now where the arm begins to move
                 until(lambda: bench.watcher.objects_at is not None, what="objects are published")
-                result = bench.run(strategy="hanging", variant="arm", timeout=120.0)
+                result = bench.run(strategy="hanging", variant="arm")
         finally:
             executor.shutdown(timeout_sec=2.0)
             arm.destroy_node()

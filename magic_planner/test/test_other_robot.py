@@ -95,6 +95,7 @@ def test_the_node_takes_it_by_its_parameters(config, tmp_path):
         for name, value in vars(config).items()
         if name in ("urdf", "srdf", "move_group", "closing_axis", "opening", "home", "acceleration")
     }
+    given["robot.base_frame"] = "panda_link0"  # what the goal's objects call the root of any arm
     with node(tmp_path, **given) as client:
         result = ask(client, goal(target=scenes.standing_cylinder(at=(0.72, 0.0))[0]))
         assert result.code == Code.OK, result.message

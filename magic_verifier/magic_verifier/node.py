@@ -44,7 +44,7 @@ class VerifierNode(Node):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("verifier", **kwargs)
         self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
-        self._timeout = parameter(self, "timeout", 30.0, "Wall time in s for one goal that names none.", low=0.1, high=3600.0)
+        self._timeout = parameter(self, "timeout", 120.0, "Wall time in s for one goal that names none.", low=0.1, high=3600.0)
         fg = parameter(self, "frequency", 240.0, "Steps per simulated second, floating gripper.", low=60.0, high=2000.0)
         arm = parameter(self, "arm_frequency", 240.0, "Steps per simulated second, arm.", low=120.0, high=2000.0)
         self._settings = {"fg": replace(DEFAULTS["fg"], frequency=fg), "arm": replace(DEFAULTS["arm"], frequency=arm)}

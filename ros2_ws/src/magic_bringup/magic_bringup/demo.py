@@ -70,7 +70,7 @@ class Options:
     tool: str = ""
     target: str = ""
     seed: int = 0
-    timeout: float = 120.0
+    timeout: float = 300.0
     cameras: tuple[str, ...] = ()
     topics: tuple[tuple[str, str], ...] = ()
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
@@ -483,7 +483,7 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument("--tool", default="", help="object id of the tool (default: the matcher chooses)")
     parser.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
     parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
-    parser.add_argument("--timeout", type=float, default=120.0, help="s for the run from match to verify (default 120)")
+    parser.add_argument("--timeout", type=float, default=300.0, help="s for the run from match to verify (default 300)")
     parser.add_argument(
         "--cameras", nargs="+", default=[], metavar="NAME", help="the cameras, by the name in their topics (default left right)"
     )

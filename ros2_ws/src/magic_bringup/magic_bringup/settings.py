@@ -59,12 +59,12 @@ def read(node: Node) -> Settings:
         repetitions=parameter(
             node, "repetitions", 0, "rollouts of one motion at most; 0: the verifier's own number", low=0, high=1000, read_only=True
         ),
-        timeout=seconds("timeout", 120.0, "s for a whole run where the goal does not say"),
+        timeout=seconds("timeout", 300.0, "s for a whole run where the goal does not say"),
         presence=seconds("server_timeout", 5.0, "s to wait for a server that is not there"),
         objects=seconds("objects_timeout", 10.0, "s to wait for objects"),
         match=seconds("match_timeout", 60.0, "s for one match"),
         plan=seconds("plan_timeout", 30.0, "s for one plan"),
-        verify=seconds("verify_timeout", 60.0, "s for one verification"),
+        verify=seconds("verify_timeout", 120.0, "s for one verification"),
         grace=seconds("grace", 5.0, "s that an answer may come late before its server counts as dead"),
         execute=parameter(node, "execute", False, "carry verified plans out with arm and gripper", read_only=True),
         execute_unverified=parameter(

@@ -24,6 +24,8 @@ from magic_core import qos
 
 #: Longest wait for anything in these tests, s; a machine with two busy cores starts the graph in less than half of it.
 DEADLINE = 90.0
+#: Parameters of a strategy server with which a motion is simulated once, in the scene as given: for tests of what comes before and after.
+ONCE = {"repetitions": 1, "required_rate": 0.0}
 
 
 def until(condition: Callable[[], Any], timeout: float = DEADLINE, what: str = "") -> Any:
@@ -86,9 +88,9 @@ class Bench:
         until(seen, what="objects are published")
         self.graph.stop(["bag_player"])
 
-    def run(self, timeout: float = DEADLINE, **goal: Any) -> Any:
+    def run(self, timeout: float = 2 * DEADLINE, **goal: Any) -> Any:
         """The result of one run of a strategy."""
-        options = Options(**{"strategy": "hooking", "variant": "fg", "bag": Path(), "out": Path(), "timeout": 60.0, **goal})
+        options = Options(**{"strategy": "hooking", "variant": "fg", "bag": Path(), "out": Path(), "timeout": 150.0, **goal})
         pending = self.watcher.send(options)
 
         def answered() -> bool:
