@@ -71,7 +71,7 @@ class VerifierNode(Node):
             give=parameter(
                 self,
                 "limits.give",
-                0.006,
+                0.01,
                 "In drawn rollouts, m that a hand gives way by: overlap and nudge may be as large.",
                 low=0.0,
                 high=0.1,

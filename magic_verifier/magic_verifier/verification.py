@@ -69,8 +69,8 @@ class Limits:
 
     give (m): what stands for overlap and nudge, and for early_force with a hand's stiffness (:data:`STIFFNESS`), in drawn
     rollouts, where tool and target are off by what was drawn: a hand gives way to what it brushes, and a target that is
-    pushed so far was drawn as far away as well.  6 mm are 12 N, below the 20 N at which Franka's examples set the threshold
-    of a contact; whether the task is done in spite of it is for the goal to say.
+    pushed so far was drawn as far away as well.  10 mm are 20 N, where Franka's examples set the threshold of a
+    contact; whether the task is done in spite of it is for the goal to say.
 
     required_rate: the lower end of the 95 % interval of the success rate must be no lower.  0.7: more than two thirds of
     what may be the case must succeed, and nine rollouts that all pass suffice to say so.  Of motions that really succeed
@@ -86,7 +86,7 @@ class Limits:
     slip_angle: float = 0.35
     tracking: float = 0.1
     tracking_slide: float = 0.01
-    give: float = 0.006
+    give: float = 0.01
     required_rate: float = 0.7
 
     def yielding(self) -> Limits:
