@@ -30,9 +30,12 @@ class Workers:
             return
         # Python 3.14 has terminate_workers() for this.
         processes = list((self.executor._processes or {}).values())
+        manager = self.executor._executor_manager_thread
         self.executor.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.terminate()
+        if manager is not None:  # else it may close its pipe while the interpreter's end is writing to it
+            manager.join(5.0)
 
 
 def _ready(parent: int) -> None:
