@@ -185,7 +185,7 @@ def test_a_cage_about_the_target_is_a_collision_and_not_a_hang(arm):
     with pytest.raises(MagicError) as raised:
         arm.plan(*problem(), obstacles=[lid], budget=Budget(6.0))
     assert raised.value.code in (Code.NO_GRASP, Code.PATH_IN_COLLISION, Code.NO_PATH, Code.NO_IK, Code.JOINT_LIMIT, Code.PLANNING_TIMEOUT)
-    assert time.monotonic() - started < 8
+    assert time.monotonic() - started < 20
 
 
 def test_cancel_and_deadline_stop_inside_the_stages(arm):

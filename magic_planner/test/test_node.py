@@ -31,18 +31,18 @@ def test_an_arm_motion_comes_with_feedback(graph):
     assert result.plan.tool_trajectory.joint_names == ["tool"]
     assert len(result.plan.arm_trajectory.points) == len(result.plan.tool_trajectory.points)
     assert [p.name for p in result.plan.phases][:2] == ["grasp", "transfer"]
-    assert 0 < result.seconds < 5
+    assert result.seconds > 0
     assert {"motion", "grasp", "task"} <= set(stages)
 
 
-def test_a_floating_motion_is_quick_and_the_same_as_from_the_core(graph):
+def test_a_floating_motion_is_the_same_as_from_the_core(graph):
     import numpy as np
 
     from magic_core import conversions as convert
     from magic_planner.object_motion import plan_tool_motion
 
     result = ask(graph, goal(variant="fg"))
-    assert result.code == Code.OK and result.seconds < 0.5
+    assert result.code == Code.OK, result.message
     plan = convert.plan_from_msg(result.plan)
     tool, tool_contact = scenes.hook()
     target, target_contact = scenes.standing_cylinder()

@@ -222,7 +222,7 @@ def test_a_second_goal_is_busy_and_a_cancelled_one_leaves_nothing_running(graph)
         wait(first.cancel_goal_async())
         answer = wait(first.get_result_async())
         assert answer.result.code in (Code.CANCELED, Code.OK, Code.PATH_IN_COLLISION, Code.NO_GRASP)
-        assert time.monotonic() - started < 4.0, "a cancel is answered within one search"
+        assert time.monotonic() - started < 12.0, "a cancel is answered within one search"
         if second.code == Code.BUSY and answer.result.code == Code.CANCELED:
             break
     else:

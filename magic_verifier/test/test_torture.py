@@ -47,7 +47,7 @@ def test_a_million_triangles_are_decomposed_and_simulated():
     assert time.process_time() - started < 20
     verdict, seconds = hook(target=target)
     assert verdict.code in (Code.OK, Code.DRIFT, Code.LOST_CONTACT), verdict.message
-    assert seconds < 5
+    assert seconds < 20
 
 
 @pytest.mark.parametrize("damage", ["flipped", "holes", "doubled", "loose"])
@@ -73,7 +73,7 @@ def test_a_sheet_without_thickness_gets_some_and_is_judged():
     verdict, seconds = hook(target=replace(target, mesh=sheet, pieces=convex_pieces(sheet), world_from_object=np.eye(4)))
     assert not verdict.success
     assert verdict.message
-    assert seconds < 5
+    assert seconds < 20
 
 
 def test_pieces_without_volume_are_refused():
@@ -125,7 +125,7 @@ def test_a_free_thing_that_starts_inside_the_tool_ends_with_a_code():
     verdict, seconds = hook(target=replace(target, world_from_object=pose))
     refused(verdict, verdict.code)
     assert verdict.code in (Code.PRE_CONTACT_COLLISION, Code.SIMULATION_EXPLODED, Code.LOST_CONTACT, Code.DRIFT)
-    assert seconds < 5
+    assert seconds < 20
 
 
 def test_any_mesh_gets_a_pose_or_a_code():

@@ -175,6 +175,7 @@ def cells(tmp_path_factory):
     os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), *filter(None, [before])])
     main, name = sys.modules["__main__"], getattr(sys.modules["__main__"], "__spec__", None)
     main.__spec__ = None  # the processes need nothing of pytest's own main module
+    sys.modules["killed_roles"] = killed_roles  # forgotten when the next folder was collected; pickle looks functions up by name
     domains: list[int] = []
     for _ in ROLES:
         domains.append(free_domain(exclude=tuple(domains)))

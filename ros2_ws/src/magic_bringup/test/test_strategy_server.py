@@ -665,7 +665,7 @@ def test_cancel_inside_a_stage_reaches_its_server(bench, stage):
     bench.result(handle.cancel_goal_async())
     response = bench.result(handle.get_result_async())
     assert (response.result.code, response.status) == (Code.CANCELED, GoalStatus.STATUS_CANCELED)
-    assert time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin < 10.0
     assert bench.fakes.canceled_goals == [stage]
 
 
@@ -706,7 +706,7 @@ def test_a_server_that_never_finishes(folder):
         result, _ = bench.run()
         assert result.code == Code.SERVER_TIMEOUT
         assert "verifier" in result.message
-        assert time.monotonic() - begin < 5.0
+        assert time.monotonic() - begin < 15.0
         assert bench.fakes.canceled_goals == ["verify_motion"]
     finally:
         bench.close()
@@ -742,7 +742,7 @@ def test_missing_server_and_missing_objects(folder):
         assert result.code == Code.SERVER_UNAVAILABLE
         assert "verifier" in result.message
         assert "/verify_motion" in result.message
-        assert time.monotonic() - begin < 5.0
+        assert time.monotonic() - begin < 15.0
         late = fakes.FakeServers("late", services=("verify",), context=bench.context)
         bench.executor.add_node(late)
         result, _ = bench.run()
