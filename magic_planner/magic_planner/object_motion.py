@@ -26,7 +26,7 @@ from magic_core.contact import OPPOSED, Contact, ContactCandidate, turned_over
 from magic_core.errors import Code, MagicError
 from magic_core.motion import Phase, ToolMotion
 from magic_core.scene import SceneObject
-from magic_core.strategy import MODES, REFLECTIONS, Strategy
+from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
 from magic_planner.collision import Body, grown, outer_points, solid_pieces
 from magic_planner.giving_way import GAP, give_way
 from magic_planner.sliding import lowest, slid_contacts
@@ -45,6 +45,14 @@ DWELL = 0.5
 #: By how much an approach is drawn in, in order of trial, and the room in metres that it then keeps.
 SHARES = (1.0, 0.75, 0.55, 0.4, 0.28, 0.2, 0.12)
 MARGIN = 0.0015
+#: The gap in metres that a tool keeps to a fixed target until it is let go, in order of trial: what cameras and hand do not know of
+#: where the tool is, two standard deviations, then what room there is.  It falls so far.
+GAPS = (0.006, 0.0045, 0.003, MARGIN)
+#: What is no lack of room (m).
+ROUNDING = 0.0005
+#: How far beside the contact, along its tangent, that room is looked for, in order of trial (m): what is let go there slides into the
+#: hollow by its weight.
+ASIDE = (0.0, 0.002, -0.002, 0.004, -0.004, 0.006, -0.006)
 
 
 def plan_tool_motion(
@@ -139,24 +147,52 @@ def drawn_in(
     direction are scaled, of the approach's waypoints from that of the contact, of the retreat's from that of the goal; the
     largest of :data:`SHARES` counts at which the approach keeps :data:`MARGIN` clear of the target.  Where none does, or the
     strategy has no approach that ends in a contact, it comes back as it is.
+
+    A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
+    there is room, so that a tool that is not quite where it was seen does not press on what cannot give way.
     """
     waypoints = list(strategy.waypoints)
     meets = next((i for i, w in enumerate(waypoints) if w.phase != "approach"), 0)
     if meets == 0 or waypoints[meets].phase != "contact":
         return strategy
     held = Body(tool.id, solid_pieces(tool))
+
+    def poses_of(changed: Strategy, until: int) -> NDArray[np.float64]:
+        times, contacts, phases = waypoint_motion(changed)
+        return np.asarray(world_from_contact @ contacts[times <= phases[until].end + 1e-9] @ contact_from_tool)
+
+    def roomy(gap: float) -> Body:
+        wall = Body(target.id, grown(solid_pieces(target), gap))
+        wall.move(target.world_from_object)
+        return wall
+
+    if strategy.releases and strategy.physics.target_is_fixed:
+        for gap in GAPS:
+            wall = roomy(gap - ROUNDING)
+            for aside in ASIDE:
+                seated = _seated(strategy, gap, aside)
+                if _touches_on(held, poses_of(seated, 1)[-1:], wall):
+                    continue
+                for share in SHARES:
+                    changed = _scaled(seated, meets, share)
+                    if not _touches_on(held, poses_of(changed, 1), wall):
+                        return changed
     fixed = Body.from_object(target)
-    roomy: Body | None = None
     for share in SHARES:
         changed = _scaled(strategy, meets, share)
-        times, contacts, phases = waypoint_motion(changed)
-        poses = world_from_contact @ contacts[times <= phases[0].end + 1e-9] @ contact_from_tool
-        if share < 1 and roomy is None:
-            roomy = Body(target.id, grown(solid_pieces(target), MARGIN))
-            roomy.move(target.world_from_object)
-        if not _touches_on(held, poses, fixed if roomy is None else roomy):
+        if not _touches_on(held, poses_of(changed, 0), fixed if share == 1 else roomy(MARGIN)):
             return changed
     return strategy
+
+
+def _seated(strategy: Strategy, gap: float, aside: float) -> Strategy:
+    """The strategy ``aside`` metres along the contact's tangent, its contact and all that follows ``gap`` metres from the target or more."""
+
+    def moved(w: Waypoint) -> Waypoint:
+        x, y, z = (float(value) for value in w.offset)
+        return replace(w, offset=np.array([x if w.phase == "approach" else max(x, gap), y + aside, z]))
+
+    return replace(strategy, waypoints=tuple(moved(w) for w in strategy.waypoints))
 
 
 def _touches_on(body: Body, poses: NDArray[np.float64], other: Body) -> bool:

@@ -299,3 +299,27 @@ def test_an_approach_with_room_is_left_as_it_is_and_so_is_one_without_hope():
     candidate = scenes.candidate(tool, tool_contact, candidate.target)
     start = plan_tool_motion(strategy, tool, target, candidate).world_from_tool[0] @ tool_contact.object_from_contact
     np.testing.assert_allclose(start[:3, 3], expected[:3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize(("radius", "bump", "gap"), [(0.02, False, 0.006), (0.009, False, 0.003), (0.02, True, 0.006)])
+def test_a_tool_is_let_go_clear_of_a_fixed_target_as_far_as_there_is_room(radius, bump, gap):
+    """A rod 12 mm thick has 3 mm to each side of it in the middle of a hole of 18 mm; a bump at the contact is stepped aside from."""
+    tool, tool_contact = ring(radius)
+    if bump:
+        block = scenes.box([0.012, 0.006, 0.02], [radius - 0.006, 0.008, 0])
+        tool = scenes.item("tool", [*tool.pieces, block], tool.world_from_object, scenes.DOWN)
+    offsets = {"before": [0.012, 0, -0.2], "over": [0.012, 0, 0], "touch": [0, 0, 0], "let_go": [0, 0, 0]}
+    phases = ("approach", "approach", "contact", "release")
+    strategy = scenes.pulling([Waypoint(n, np.array(o), phase) for (n, o), phase in zip(offsets.items(), phases, strict=True)])
+    strategy = dataclasses.replace(strategy, releases=True, physics=dataclasses.replace(strategy.physics, target_is_fixed=True))
+    rod = scenes.item("target", [scenes.cylinder(0.006, 0.1)], transforms.make(translation=[0.6, 0, 0.05]), scenes.DOWN)
+    candidate = scenes.candidate(tool, tool_contact, scenes.contact(scenes.DOWN, [0.006, 0, 0], [1, 0, 0]))
+    motion = plan_tool_motion(strategy, tool, rod, candidate)
+    thick = scenes.item("target", [scenes.cylinder(0.006 + 0.5 * gap, 0.1)], rod.world_from_object)
+    body, wall = Body("tool", tool.pieces), Body.from_object(thick)
+    for pose in motion.world_from_tool:
+        body.move(pose)
+        assert not body.touches(wall)
+    met = transforms.inverse(rod.world_from_object) @ at(motion, motion.times[-1]) @ tool_contact.object_from_contact
+    assert met[0, 3] - 0.006 == pytest.approx(gap, abs=1e-6)
+    assert (abs(met[1, 3]) > 0.001) == bump

