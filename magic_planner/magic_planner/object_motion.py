@@ -173,7 +173,7 @@ def drawn_in(
                 seated = _seated(strategy, gap, aside)
                 if _touches_on(held, poses_of(seated, 1)[-1:], wall):
                     continue
-                for share in SHARES:
+                for share in (*SHARES, 0.0):
                     changed = _scaled(seated, meets, share)
                     if not _touches_on(held, poses_of(changed, 1), wall):
                         return changed

@@ -306,7 +306,7 @@ def test_a_tool_is_let_go_clear_of_a_fixed_target_as_far_as_there_is_room(radius
     """A rod 12 mm thick has 3 mm to each side of it in the middle of a hole of 18 mm; a bump at the contact is stepped aside from."""
     tool, tool_contact = ring(radius)
     if bump:
-        block = scenes.box([0.012, 0.006, 0.02], [radius - 0.006, 0.008, 0])
+        block = scenes.box([0.012, 0.006, 0.02], [radius - 0.006, 0.014, 0])
         tool = scenes.item("tool", [*tool.pieces, block], tool.world_from_object, scenes.DOWN)
     offsets = {"before": [0.012, 0, -0.2], "over": [0.012, 0, 0], "touch": [0, 0, 0], "let_go": [0, 0, 0]}
     phases = ("approach", "approach", "contact", "release")
