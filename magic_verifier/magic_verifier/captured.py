@@ -12,8 +12,6 @@ does not know: what came of the motion, not what was thought of it.
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,23 +21,19 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.camera import RgbdFrame
-from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.scene import Scene, SceneObject
 from magic_core.sensor import D435, STATION, scene_raycaster
 from magic_core.sensor import capture as photograph
 from magic_core.strategy import Physics, Strategy
-from magic_verifier.cases import TOOL_PLACE, Case, Meeting, scene_for, tool_object
+from magic_verifier import placing
+from magic_verifier.cases import Case, Meeting, scene_for, tool_object
 from magic_verifier.floating import settled
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 #: Frames of each camera that are averaged, and the workspace: the perception node's defaults.
 FRAMES = 3
 REGION = (0.15, -0.6, -0.05), (0.95, 0.6, 0.5)
-#: Where tools may lie: x and y in metres from the arm's base, within its reach and in the sight of both cameras.
-PLACES = (0.30, 0.62), (-0.42, 0.42)
-#: Clear way round a tool that lies on the table (m), and places looked at.
-CLEARANCE, TRIES = 0.03, 2000
 #: A reconstruction belongs to a thing when its middle is nearer than this share of the thing's longest side.
 NEAR = 0.35
 #: What is truly the case, as factors on the strategy's own numbers: half range of friction, and densities from 1/x to x.
@@ -57,14 +51,9 @@ class Layout:
     physics: Physics
 
 
-def _seed(case: Case, seed: int) -> list[int]:
-    """A seed of the case's own, whatever other cases there are."""
-    return [int(seed), zlib.crc32(case.name.encode())]
-
-
 def lay_out(strategy: Strategy, case: Case, seed: int) -> Layout:
     """The true scene of a case; the same seed gives the same.  Raises ``BAD_SCENE`` where there is no room for a tool."""
-    rng = np.random.default_rng(_seed(case, seed))
+    rng = np.random.default_rng(placing.seed_of(case.name, seed))
     target, fixtures, meeting = scene_for(strategy, case.target)
     physics = replace(
         strategy.physics,
@@ -75,52 +64,18 @@ def lay_out(strategy: Strategy, case: Case, seed: int) -> Layout:
     tools = []
     for index, name in enumerate(case.tools):
         tool = tool_object(name, index, strategy.view)
-        tools.append(settled(_turned(tool, float(rng.uniform(-np.pi, np.pi))), TABLE, strategy.physics))
-    taken = [_footprint(item) for item in (target, *fixtures)]
-    placed = {}
-    for tool in sorted(tools, key=lambda tool: -_footprint(tool).area):  # the small ones still find room between the large ones
-        placed[tool.id] = _placed(tool, taken, rng)
-        taken.append(_footprint(placed[tool.id]))
-    return Layout(tuple(placed[tool.id] for tool in tools), target, fixtures, meeting, physics)
+        tools.append(settled(placing.turned(tool, float(rng.uniform(-np.pi, np.pi))), TABLE, strategy.physics))
+    placed = placing.place_all(tools, (target, *fixtures), rng, _in_sight)
+    return Layout(tuple(placed), target, fixtures, meeting, physics)
 
 
-def _moved(item: SceneObject, world_from_world: NDArray[np.float64]) -> SceneObject:
-    return replace(item, world_from_object=world_from_world @ item.world_from_object, world_from_box=world_from_world @ item.world_from_box)
-
-
-def _turned(item: SceneObject, yaw: float) -> SceneObject:
-    x, y = TOOL_PLACE
-    about = transforms.make(translation=[x, y, 0]) @ transforms.from_rpy(0, 0, yaw) @ transforms.make(translation=[-x, -y, 0])
-    return _moved(item, about)
-
-
-def _footprint(item: SceneObject) -> Any:
-    """What an object covers of the table, as a polygon in metres."""
+def _in_sight(item: SceneObject, covered: Any) -> bool:
+    """Whether both cameras see all of the object, and the workspace holds it."""
     import shapely
-
-    corners = transforms.apply(item.world_from_object, item.mesh.vertices)[:, :2]
-    return shapely.MultiPoint(corners).convex_hull
-
-
-def _placed(item: SceneObject, taken: Sequence[Any], rng: np.random.Generator) -> SceneObject:
-    """The object moved to a place where nothing else is near and both cameras see all of it."""
-    import shapely
-    from shapely.affinity import translate
 
     region = shapely.box(*np.add(REGION[0][:2], 0.01), *np.subtract(REGION[1][:2], 0.01))
-    covered = _footprint(item)
-    middle = covered.envelope.centroid
-    for x, y in np.column_stack([rng.uniform(*PLACES[0], TRIES), rng.uniform(*PLACES[1], TRIES)]):
-        shift = x - middle.x, y - middle.y
-        there = translate(covered, *shift)
-        if region.contains(there) and all(there.distance(other) >= CLEARANCE for other in taken):
-            moved = _moved(item, transforms.make(translation=[*shift, 0.0]))
-            if _in_sight(moved):
-                return moved
-    raise MagicError(Code.BAD_SCENE, f"place for {item.id}", f"none of {TRIES} free", "a tool that finds room on the table")
-
-
-def _in_sight(item: SceneObject) -> bool:
+    if not region.contains(covered):
+        return False
     corners = transforms.apply(item.world_from_object, item.mesh.vertices)
     for world_from_camera in STATION.values():
         pixels = D435.project(transforms.apply(transforms.inverse(world_from_camera), corners))
@@ -137,7 +92,9 @@ def capture(layout: Layout, case: Case, seed: int) -> list[RgbdFrame]:
     caster = scene_raycaster(meshes)
     frames = []
     for number, (name, pose) in enumerate(STATION.items()):
-        shots = [photograph([], D435, pose, [*_seed(case, seed), number, k], camera=name, raycaster=caster) for k in range(FRAMES)]
+        shots = [
+            photograph([], D435, pose, [*placing.seed_of(case.name, seed), number, k], camera=name, raycaster=caster) for k in range(FRAMES)
+        ]
         frames.append(average(shots))
     return frames
 

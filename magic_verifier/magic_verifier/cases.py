@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -42,12 +43,23 @@ UNSEEN_SEEDS = 50_000
 UNSEEN_COUNT = 60
 #: What the tools of an evaluation are taken for: ``meshes`` as they are, ``images`` as two cameras see them (:mod:`magic_verifier.captured`).
 SOURCES = ("meshes", "images")
-SETS = ("own", "unseen")
+SETS = ("own", "unseen", "alphabet", "controls")
+#: Negative controls, which no method can do: plain things of the matcher's own control families (bars, discs, blades, bottles, ...), and
+#: near misses.  Of these the first :data:`CONTROL_COUNT` that geometry forbids (:mod:`magic_verifier.feasibility`) are taken.
+PLAIN = ("bar", "disc", "rod", "torch", "blade", "polygon", "bottle", "driver", "segment", "bent")
+NEAR_MISSES = {
+    "scooping": ("hammer:60001", "letter:60002,glyph=I", "mallet:60003"),
+    "hanging": ("mug:60001,handle_reach=0.0105,profile=straight", "letter:60002,glyph=I", "mug:60003,handle_reach=0.011,profile=straight"),
+    "hooking": ("letter:60001,glyph=I", "cylinder:0.04", "sphere:0.04"),
+}
+CONTROL_COUNT, CONTROL_SEEDS = 12, 60_000
+#: How thick (m) a control that has only an outline is.
+PLAIN_THICKNESS = 0.016
 #: Sets of targets that ``--targets`` takes by name instead of a folder: seeds of the family.
 TARGET_SETS = {"mug_tree": tuple(range(3))}
 #: How far (m) from the post of a mug tree things are hung on its first peg, at least.
 PEG_REACH = 0.05
-#: Where tools lie when the arm takes them (m).
+#: Where tools stand before they are laid somewhere (m).
 TOOL_PLACE = (0.45, -0.32)
 
 
@@ -78,12 +90,15 @@ class Options:
     scale: float = 1.0
     source: str = "meshes"
     set: str = "own"
+    turns: int = 1
 
 
 def tool_names(options: Options) -> list[str]:
-    """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``."""
+    """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``; parameters of a family may follow its seed."""
     if options.objects:
         return _meshes(options.objects, options.scale)
+    if options.set == "alphabet":
+        return [f"capital:{letter}" for letter in ascii_uppercase]
     if options.task == "scooping":
         return [f"{family}:{seed}" for family, seed in SPOONS]
     if options.task == "hanging":
@@ -118,9 +133,17 @@ def _meshes(folder: str, scale: float = 1.0) -> list[str]:
 
 
 def all_cases(options: Options) -> list[Case]:
-    """All cases of an evaluation, in their order."""
+    """All cases of an evaluation, in their order; each in so many turns of the tool as the options say, the first turn of all first."""
+    cases = _cases(options)
+    later = [replace(case, name=f"{case.name} turn {turn}") for turn in range(2, options.turns + 1) for case in cases]
+    return [*cases, *later]
+
+
+def _cases(options: Options) -> list[Case]:
     if options.set == "unseen" and not options.objects:
         return unseen_cases(options)
+    if options.set == "controls" and not options.objects:
+        return control_cases(options)
     tools, targets = tool_names(options), target_names(options)
     if options.task == "hooking" and options.variant == "fg":
         return [Case(short_name(target), tuple(tools), target) for target in targets]
@@ -141,6 +164,26 @@ def unseen_cases(options: Options) -> list[Case]:
         # So that a family meets all targets, however many there are of both.
         target = targets[(number + number // len(families)) % len(targets)]
         cases.append(Case(f"{tool} {short_name(target)}", (tool,), target))
+    return cases
+
+
+def control_cases(options: Options) -> list[Case]:
+    """Things that cannot do the task with the targets that they are given: near misses, and plain things drawn by the seed."""
+    from magic_core import strategy as strategies
+    from magic_verifier.feasibility import impossible
+
+    strategy = strategies.find(options.task, options.strategies or None)
+    targets = target_names(options)
+    first = CONTROL_SEEDS + 1000 * options.seed
+    plain = [f"plain_{family}:{first + number}" for number in range(10) for family in PLAIN]
+    cases: list[Case] = []
+    for number, tool in enumerate((*NEAR_MISSES[options.task], *plain)):
+        target = targets[number % len(targets)]
+        case = Case(f"{tool} {short_name(target)}", (tool,), target)
+        if impossible(strategy, case):
+            cases.append(case)
+        if len(cases) == CONTROL_COUNT:
+            break
     return cases
 
 
@@ -224,6 +267,19 @@ def _peg(shape: Any) -> Meeting:
     return Meeting(region.points[index], region.normals[index], along, float(shape.parameters["peg_radius"]))
 
 
+def _plain(family: str, seed: int) -> Any:
+    """A plate with the outline of one of the matcher's control families."""
+    import shapely
+
+    from magic_core.shapes.shape import assemble
+    from magic_core.shapes.solids import plate
+    from magic_matcher.plain import outline
+
+    points = outline(family.removeprefix("plain_"), seed)
+    part = plate(shapely.Polygon(points).buffer(0), -PLAIN_THICKNESS / 2, PLAIN_THICKNESS / 2, (120, 120, 126))
+    return assemble(family, seed, {}, [part], {}, "top", (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+
+
 @lru_cache(maxsize=256)
 def load_object(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | None]:
     """Mesh and pieces in the object frame, the Shape they came from (None: a file), and where to act on it if that is given."""
@@ -247,16 +303,25 @@ def load_object(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | N
             turn = object_from_mesh[:3, :3]
             meeting = Meeting(transforms.apply(object_from_mesh, entry.scale * point), turn @ normal, turn @ direction, 0.006)
         return mesh, convex_pieces(mesh), None, meeting
-    family, number = name.split(":")
+    family, _, rest = name.partition(":")
+    number, *given = rest.split(",")
+    parameters: dict[str, float | str] = {}
+    for item in given:
+        key, _, value = item.partition("=")
+        parameters[key] = value if value.isalpha() else float(value)
     meeting = None
-    if family == "mug":
+    if family == "mug" and not parameters:
         shape = shapes.mug_of_set(int(number))
+    elif family == "capital":
+        shape = shapes.make(family, 0, glyph=number)
+    elif family.startswith("plain_"):
+        shape = _plain(family, int(number))
     elif family in ("sphere", "cylinder"):
         size = {"radius": float(number)}
         if family == "cylinder":
             size["half_height"] = float(number)
         shape = shapes.make(family, 0, **size)
     else:
-        shape = shapes.make(family, int(number))
+        shape = shapes.make(family, int(number), **parameters)
         meeting = _peg(shape) if family == "mug_tree" else None
     return shape.mesh, shape.pieces, shape, meeting

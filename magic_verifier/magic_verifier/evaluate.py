@@ -30,7 +30,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
-from magic_verifier import captured
+from magic_verifier import captured, placing
 from magic_verifier.cases import (
     BASELINES,
     METHODS,
@@ -48,6 +48,7 @@ from magic_verifier.cases import (
     short_name,
     tool_object,
 )
+from magic_verifier.feasibility import impossible
 from magic_verifier.floating import settled
 from magic_verifier.verification import Verdict, wilson
 
@@ -141,7 +142,7 @@ class _Problem:
 
 
 def _as_given(options: Options, strategy: Strategy, case: Case) -> _Problem:
-    """The meshes themselves, each tool where all tools lie."""
+    """The meshes themselves, each tool beside the others and the target in a turn drawn by the seed."""
     tools, names, left_out = [], [], []
     for index, name in enumerate(case.tools):
         try:
@@ -157,6 +158,11 @@ def _as_given(options: Options, strategy: Strategy, case: Case) -> _Problem:
         # The arm takes the tool as it lies by itself: a spoon set on the bottom of its bowl tips on to its handle.
         tools = [settled(tool, TABLE, strategy.physics) for tool in tools]
     target, obstacles, meeting = scene_for(strategy, case.target)
+    # Where nothing else stands, turned as the seed has it: neither a file's own yaw nor a place that suits one task is given.
+    rng = np.random.default_rng(placing.seed_of(case.name, options.seed))
+    yaws = rng.uniform(-np.pi, np.pi, len(case.tools))
+    tools = placing.place_all([placing.turned(tool, yaw) for tool, yaw in zip(tools, yaws, strict=False)], (target, *obstacles), rng)
+    tools = [placing.seen_from_above(tool) for tool in tools]
     return _Problem(tools, names, target, {tool.id: obstacles for tool in tools}, TABLE, meeting, left_out=tuple(left_out))
 
 
@@ -201,6 +207,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     problem = None
     try:
         strategy = _strategy(options)
+        answer["impossible"] = impossible(strategy, case)
         problem = _as_seen(options, strategy, case, seconds, film) if options.source == "images" else _as_given(options, strategy, case)
         if problem.left_out:
             answer["left_out"] = list(problem.left_out)
@@ -348,6 +355,9 @@ def _draw(path: Path, run: _Tried, problem: _Problem) -> None:
 
 def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
     """Success rate with its interval, reasons and mean times."""
+    hopeless = [c for c in done if c.get("impossible")]
+    if options.set != "controls":  # what geometry forbids is listed apart; of controls it is all that there is
+        done = [c for c in done if not c.get("impossible")]
     good = sum(bool(c["success"]) for c in done)
     low, high = wilson(good, len(done))
     stages = ("perceive", "match", "plan", "verify", "total")
@@ -360,6 +370,8 @@ def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
         "targets": options.targets or "the project's own",
         "test": _test_sentence(options),
         "cases": len(done),
+        "impossible": {c["object"]: c["impossible"] for c in hopeless},
+        "impossible_successes": sum(bool(c["success"]) for c in hopeless),
         "successes": good,
         "success_rate": good / len(done) if done else 0.0,
         "interval_95": [low, high],
@@ -491,6 +503,11 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
         f"mean seconds: perceive {times['perceive']:.3f}, match {times['match']:.3f}, plan {times['plan']:.3f}, verify {times['verify']:.3f}, total {times['total']:.3f}; "
         f"{summary['simulations']} simulations\nreasons: {summary['reasons']}\n"
     )
+    if summary["impossible"] and options.set != "controls":
+        text += (
+            f"impossible by geometry, not counted above: {len(summary['impossible'])}, of which {summary['impossible_successes']} passed\n"
+        )
+        text += "".join(f"  {name}: {reason}\n" for name, reason in summary["impossible"].items())
     if "truth" in summary:
         truth = summary["truth"]
         verified = truth["verified_and_succeeds"] + truth["verified_but_fails"]
@@ -518,7 +535,11 @@ def main(args: list[str] | None = None) -> None:
         "--from", dest="source", default="meshes", choices=SOURCES,
         help="what tools and target are taken for: their meshes, or what perception makes of two cameras' images (then judged on the meshes)",
     )  # fmt: skip
-    parser.add_argument("--set", default="own", choices=SETS, help="the paper's set sizes, or unseen tools drawn by the seed")
+    parser.add_argument(
+        "--set", default="own", choices=SETS,
+        help="the paper's set sizes, unseen tools drawn by the seed, the capital letters, or negative controls, which nothing can do",
+    )  # fmt: skip
+    parser.add_argument("--turns", type=int, default=1, help="turns, drawn by the seed, in which each tool lies")
     parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded or dinov2")
     parser.add_argument("--weights", default="", help="hub name or folder of the backend's weights")
     parser.add_argument("--objects", default="", help="folder of tool meshes, with or without poses.yaml, instead of the project's own set")

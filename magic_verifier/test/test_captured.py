@@ -13,7 +13,7 @@ pytest.importorskip("magic_planner.object_motion")
 from magic_core import strategy as strategies
 from magic_core import transforms
 from magic_core.motion import MotionPlan
-from magic_verifier import captured
+from magic_verifier import captured, placing
 from magic_verifier import evaluate as ev
 from magic_verifier.cases import Case, Options, all_cases
 
@@ -45,8 +45,8 @@ def test_nothing_stands_where_something_else_does(strategy):
     several = captured.lay_out(
         strategy, Case("four", ("caliper:50000", "watch:50001", "hanger:50002", "scissors:50003"), "cylinder:0.035"), 0
     )
-    covered = [captured._footprint(item) for item in (*several.tools, several.target)]
-    assert all(a.distance(b) >= captured.CLEARANCE for k, a in enumerate(covered) for b in covered[:k])
+    covered = [placing.footprint(item) for item in (*several.tools, several.target)]
+    assert all(a.distance(b) >= placing.CLEARANCE for k, a in enumerate(covered) for b in covered[:k])
     lowest = [transforms.apply(t.world_from_object, t.mesh.vertices)[:, 2].min() for t in several.tools]
     assert np.abs(lowest).max() < 0.002
 

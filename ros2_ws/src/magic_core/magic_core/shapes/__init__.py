@@ -13,8 +13,9 @@ from magic_core.errors import Code, MagicError
 from magic_core.shapes.flat import FLAT
 from magic_core.shapes.round import HANDLES, PROFILES, ROUND
 from magic_core.shapes.shape import Region, Shape, section_view
+from magic_core.shapes.struck import STRUCK
 
-FAMILIES: dict[str, Callable[..., Shape]] = {**FLAT, **ROUND}
+FAMILIES: dict[str, Callable[..., Shape]] = {**FLAT, **ROUND, **STRUCK}
 
 __all__ = ["FAMILIES", "HANDLES", "PROFILES", "Region", "Shape", "make", "mug_of_set", "mug_set", "section_view"]
 
