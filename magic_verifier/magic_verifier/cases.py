@@ -91,6 +91,7 @@ class Options:
     source: str = "meshes"
     set: str = "own"
     turns: int = 1
+    demonstration: str = ""
 
 
 def tool_names(options: Options) -> list[str]:
@@ -185,6 +186,22 @@ def control_cases(options: Options) -> list[Case]:
         if len(cases) == CONTROL_COUNT:
             break
     return cases
+
+
+def shown_by(strategy: Strategy, name: str) -> Strategy:
+    """A strategy demonstrated with another tool: its contact in that tool's first labelled region, moved as the old tool's contact was.
+
+    Raises ``BAD_REQUEST`` for a tool without labelled regions.
+    """
+    _, _, shape, _ = load_object(name, strategy.view)
+    if shape is None or not shape.regions:
+        raise MagicError(Code.BAD_REQUEST, "tool of the demonstration", name, "one with a labelled region, such as mug:1000")
+    view = shape.view(strategy.view)
+    contact = shape.contact(next(iter(shape.regions)), view)
+    to_new = strategy.tool_contact.object_from_contact @ transforms.inverse(contact.object_from_contact)
+    return replace(
+        strategy, tool_view=view, tool_contact=contact, tool_mesh=shape.mesh, target_from_tool=strategy.target_from_tool @ to_new
+    )
 
 
 def short_name(name: str) -> str:
