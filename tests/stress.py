@@ -8,9 +8,14 @@ Parts, each of which may be run alone:
     requests   10,000 random requests to matcher, planner, verifier and strategy server: each is answered, none by INTERNAL
     messages   300 mangled messages to perception: it goes on, and sees the objects in good ones afterwards
     bags       200 mangled bags: each is read or refused by BAD_BAG
-    goals      300 runs of a strategy from a recorded bag: each verified, no process grows
-    starts     50 starts and stops of the graph, at random moments of its start: every process ends by itself and in order
+    goals      300 runs of a strategy from a recorded bag, every tenth with the arm: each is answered in its time, those with the
+               floating gripper are verified, the same goal has the same answer, and no process grows
+    starts     50 starts and stops of the graph, at random moments of its start: every process ends by itself and in order, and
+               leaves nothing behind
     kills      each node killed while a run is at each stage: an answer within 5 s, and the next run works
+
+A process grows where its memory, its children's with it, has a slope over the cases after the warm-up that is above what is called
+flat below: the median of the slopes between any two cases, which a single step does not move.
 
 What is done is kept in ``--out`` after every case; the same command goes on where it was interrupted.  It ends with a table, and with
 status 1 where something did not hold.  ``--quick``: a twentieth of each part.
@@ -49,8 +54,15 @@ ROOT = Path(__file__).resolve().parents[1]
 SIZES = {"requests": 10_000, "messages": 300, "bags": 200, "goals": 300, "starts": 50, "kills": 25}
 #: Longest wait for any one answer, s.
 DEADLINE = 60.0
+#: For one run, s: many times what one with the arm takes on two cores (some 5 s), and less than a test's client waits.
+RUN_LIMIT = 120.0
 #: From a kill to the answer, s.
 KILL_LIMIT = 5.0
+#: Flat is a slope below this, MB a case; and from which case on it is taken.
+FLAT = {"requests": 0.002, "messages": 0.05, "goals": 0.05}
+WARM_UP = {"requests": 1000, "messages": 50, "goals": 50}
+#: Between two measurements of memory, cases; with fewer of them than this nothing is said about growth.
+MEASURED_EVERY, ENOUGH = {"requests": 20, "messages": 1, "goals": 1, "kills": 1}, 100
 STAGES = ("perceive", "match", "plan", "verify", "execute")
 #: Of a strategy server whose arm is a stand-in.
 SERVER_PARAMETERS = {
@@ -71,7 +83,7 @@ class Part:
         self.path = out / f"{name}_{size}_{seed}.json"
         self.cases: list[str] = []
         self.kinds: Counter[str] = Counter()
-        self.memory: list[dict[str, Any]] = []  # one entry a graph: MB by process, first and last
+        self.memory: list[list[tuple[int, dict[str, float]]]] = []  # by graph: after how many cases of it, MB by process
         self.seconds = 0.0
         self.worst = 0.0
         if self.path.is_file():
@@ -111,10 +123,41 @@ class Part:
             self._said = now
             say(f"{self.name}: {len(self.cases)} of {self.size}, {sum(map(bool, self.cases))} wrong")
 
-    def remember(self, graph: Graph, first: dict[str, float]) -> None:
-        """Note what the processes of a graph hold now beside what they held first."""
-        if first and len(self.cases):
-            self.memory.append({"cases": len(self.cases), "first": first, "last": held(graph)})
+    def measure(self, graph: Graph) -> None:
+        """Note what the processes of a graph hold; to be called after each case."""
+        if len(self.cases) % MEASURED_EVERY[self.name] == 0 or len(self.cases) == self.size:
+            self.memory[-1].append((len(self.cases), held(graph)))
+
+    def growth(self) -> list[dict[str, Any]]:
+        """By graph: its cases from the warm-up on, and by process MB first and last (means of a tenth) and MB a case, none where unsaid."""
+        found = []
+        for series in self.memory:
+            steady = [(case, mb) for case, mb in series if case >= series[0][0] + WARM_UP.get(self.name, 0)] if series else []
+            if not steady:
+                continue
+            cases = np.array([case for case, _ in steady], float)
+            nodes = {}
+            for name in NODES:
+                held_mb = np.array([mb.get(name, np.nan) for _, mb in steady])
+                if np.isnan(held_mb).all():
+                    continue
+                tenth = max(1, len(held_mb) // 10)
+                one, other = np.triu_indices(len(cases), 1)
+                slopes = (held_mb[other] - held_mb[one]) / (cases[other] - cases[one])
+                slope = float(np.nanmedian(slopes)) if len(cases) >= ENOUGH and self.name in FLAT else None
+                nodes[name] = (float(np.nanmean(held_mb[:tenth])), float(np.nanmean(held_mb[-tenth:])), slope)
+            found.append({"from": int(cases[0]), "to": int(cases[-1]), "nodes": nodes})
+        return found
+
+    @property
+    def grown(self) -> list[str]:
+        """The processes that are not flat."""
+        return [
+            f"{self.name}: {name} grows by {slope:.3f} MB a case (allowed: {FLAT[self.name]})"
+            for entry in self.growth()
+            for name, (_, _, slope) in entry["nodes"].items()
+            if slope is not None and slope >= FLAT[self.name]
+        ]
 
 
 def say(line: str) -> None:
@@ -122,14 +165,51 @@ def say(line: str) -> None:
 
 
 def held(graph: Graph) -> dict[str, float]:
-    """Resident memory by node, MB."""
-    found = {}
-    for name, process in graph.processes.items():
-        with contextlib.suppress(OSError):
-            match = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{process.popen.pid}/status").read_text())
-            if name in NODES and match:
-                found[name] = round(int(match[1]) / 1024, 1)
+    """Resident memory by node, MB, with that of the processes that it has started."""
+    return {
+        name: round(sum(map(resident, family(process.popen.pid))), 1)
+        for name, process in graph.processes.items()
+        if name in NODES and process.status is None
+    }
+
+
+def family(pid: int) -> list[int]:
+    """A process and all that came of it."""
+    found = [pid]
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                found += family(int(child))
     return found
+
+
+def resident(pid: int) -> float:
+    """Resident memory of a process, MB; 0 where it is gone."""
+    with contextlib.suppress(OSError):
+        if match := re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text()):
+            return int(match[1]) / 1024
+    return 0.0
+
+
+@contextlib.contextmanager
+def marked() -> Iterator[Callable[[], list[str]]]:
+    """What is started inside carries a mark: the function gives the command lines of what of it still runs."""
+    mark = f"MAGIC_STRESS={os.getpid()}.{time.monotonic_ns()}"
+    name, _, value = mark.partition("=")
+    os.environ[name] = value
+
+    def running() -> list[str]:
+        found = []
+        for folder in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if mark.encode() in (folder / "environ").read_bytes().split(b"\0") and int(folder.name) != os.getpid():
+                    found.append((folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()[-120:])
+        return found
+
+    try:
+        yield running
+    finally:
+        os.environ.pop(name, None)
 
 
 # ------------------------------------------------------------------------------------------------ mangling
@@ -229,8 +309,8 @@ def requests(part: Part, logs: Path) -> None:
             return future.result().result
 
         good = good_requests(scene, ask)
-        first: dict[str, float] = {}
-        for index, rng in part.left:
+        part.memory.append([])
+        for _, rng in part.left:
             kind = rng.choices(list(good), (4, 3, 2, 1))[0]
             request = clone(good[kind])
             paths = [mangle(request, rng) for _ in range(rng.randint(1, 4))]
@@ -246,10 +326,8 @@ def requests(part: Part, logs: Path) -> None:
             if wrong:
                 wrong = f"{kind.__name__} {paths}: {wrong}"
             part.done(wrong, Code(code).name if code in list(Code) else str(code), time.monotonic() - began)
+            part.measure(bench.graph)
             bench.graph.check()
-            if index >= 200 and not first:
-                first = held(bench.graph)
-        part.remember(bench.graph, first)
         part.save()
         publisher.destroy_node()
 
@@ -327,8 +405,8 @@ def messages(part: Part, logs: Path) -> None:
 
         until(known, DEADLINE, "objects are seen")
         wanted = count()
-        first: dict[str, float] = {}
-        for index, rng in part.left:
+        part.memory.append([])
+        for _, rng in part.left:
             topic = rng.choice(list(good))
             broken = clone(good[topic])
             paths = [mangle(broken, rng) for _ in range(rng.randint(1, 3))]
@@ -353,9 +431,7 @@ def messages(part: Part, logs: Path) -> None:
             except (AssertionError, MagicError) as error:
                 wrong = f"{topic} {paths}: {error}"
             part.done(wrong, topic.rpartition("/")[2], time.monotonic() - began)
-            if index >= 10 and not first:
-                first = held(bench.graph)
-        part.remember(bench.graph, first)
+            part.measure(bench.graph)
         part.save()
         feed.destroy_node()
 
@@ -398,28 +474,41 @@ def bags(part: Part, logs: Path) -> None:
 
 
 def goals(part: Part, logs: Path) -> None:
-    """The strategy of a recorded bag again and again, in turn with the floating gripper and the arm."""
+    """The strategy of a recorded bag again and again, with a few seeds in turn.  The scene stays, so that an answer has to come again."""
     if len(part.cases) >= part.size:
         return
     bag = ROOT / "bags/hooking"
+    answers: dict[tuple[str, int], tuple[Code, bytes]] = {}
     with started(logs, bag) as bench:
         bench.ready()
         bench.play(bag)
-        first: dict[str, float] = {}
+        part.memory.append([])
         for index, _ in part.left:
-            variant = ("fg", "arm")[index % 2]
+            variant, seed = ("arm", index // 10 % 5) if index % 10 == 9 else ("fg", index % 10)
             began = time.monotonic()
-            result = bench.run(strategy="hooking", variant=variant, seed=index % 10, timeout=60.0)
+            result = bench.run(strategy="hooking", variant=variant, seed=seed, timeout=RUN_LIMIT)
             code = Code(result.code)
-            bench.graph.check()
-            wrong = "" if result.verified or code not in (Code.INTERNAL, Code.SERVER_TIMEOUT, Code.SERVER_UNAVAILABLE) else result.message
+            answer = code, motion(result.plan)
+            wrong = result.message if code in UNANSWERED or (variant == "fg" and not result.verified) else ""
+            if not wrong and answers.setdefault((variant, seed), answer) != answer:
+                wrong = f"{variant}, seed {seed}: {code.name}, {answers[variant, seed][0].name} before, or another motion"
             part.done(wrong, f"{variant} {code.name}", time.monotonic() - began)
-            if not first and index >= 20:
-                first = held(bench.graph)
+            part.measure(bench.graph)
+            bench.graph.check()
             if index % 50 == 49:
                 say(f"goals: {index + 1}: MB {held(bench.graph)}")
-        part.remember(bench.graph, first or held(bench.graph))
         part.save()
+
+
+#: A goal that ends so has had no answer.
+UNANSWERED = {Code.INTERNAL, Code.SERVER_TIMEOUT, Code.SERVER_UNAVAILABLE, Code.SIMULATION_TIMEOUT, Code.PLANNING_TIMEOUT, Code.STALE_DATA}
+
+
+def motion(plan: Any) -> bytes:
+    """The trajectories of a plan, without the moment at which they were made."""
+    from rclpy.serialization import serialize_message
+
+    return b"".join(serialize_message(point) for t in (plan.tool_trajectory, plan.arm_trajectory) for point in t.points)
 
 
 # ------------------------------------------------------------------------------------------------ starts and kills
@@ -428,7 +517,7 @@ def goals(part: Part, logs: Path) -> None:
 def starts(part: Part, logs: Path) -> None:
     """The five nodes started at once and told to end at a random moment: all have to end in order, whatever they were at."""
     for index, rng in part.left:
-        with Graph(logs / str(index), isolated()) as graph:
+        with marked() as running, Graph(logs / str(index), isolated()) as graph:
             began = time.monotonic()
             graph.start_nodes()
             time.sleep(rng.choice((rng.uniform(0.5, 4.0), rng.uniform(4.0, 15.0))))
@@ -441,7 +530,17 @@ def starts(part: Part, logs: Path) -> None:
                 status = process.wait(20.0)
                 if status not in (0, -number) or "Traceback" in process.tail(200):
                     wrong.append(f"{name}: status {status}: {process.tail(3)}")
+            wrong += left_behind(running)
         part.done("; ".join(wrong), signal.Signals(number).name, time.monotonic() - began)
+
+
+def left_behind(running: Callable[[], list[str]]) -> list[str]:
+    """What does not end by itself within some seconds."""
+    try:
+        until(lambda: not running(), 10.0)
+    except AssertionError:
+        return [f"left behind: {'; '.join(running())}"]
+    return []
 
 
 def kills(part: Part, logs: Path) -> None:
@@ -468,29 +567,31 @@ def kills(part: Part, logs: Path) -> None:
         bench.ready()
         player = bench.graph.start("bag_player", "magic_bringup", "bag_player", str(bag), "--loop", "--exclude-topics", "/joint_states")
         until(lambda: bench.watcher.objects_at is not None, what="objects are published")
-        first = held(bench.graph)
+        part.memory.append([])
         for index, _ in part.left:
             name, stage = list(NODES)[index % 5], STAGES[index // 5 % 5]
             arm.positions = list(home)
             moving.clear()
             over.clear()
             bench.lines.clear()
-            code, seconds = kill_at(bench, name, stage, moving, over)
+            code, seconds, children = kill_at(bench, name, stage, moving, over)
             over.set()
             arm.positions = list(home)
             following = after_restart(bench, name)
             wrong = "" if seconds <= KILL_LIMIT else f"an answer after {seconds:.1f} s"
             wrong += "" if following.verified else f"; the next run: {Code(following.code).name}: {following.message}"
+            wrong += f"; {len(left)} of its processes are left" if (left := [pid for pid in children if resident(pid)]) else ""
             part.done(wrong and f"{name} killed at {stage}: {wrong}", f"{code}", seconds)
-        part.remember(bench.graph, first)
+            part.measure(bench.graph)
         part.save()
         player.signal(signal.SIGINT)
         executor.shutdown(timeout_sec=2.0)
         arm.destroy_node()
 
 
-def kill_at(bench: Bench, name: str, stage: str, moving: threading.Event, over: threading.Event) -> tuple[str, float]:
-    """Kill a node when a run says that it is at a stage; the code of the run's answer, and seconds from the kill to it."""
+def kill_at(bench: Bench, name: str, stage: str, moving: threading.Event, over: threading.Event) -> tuple[str, float, list[int]]:
+    """Kill a node when a run says that it is at a stage: the code of the run's answer, seconds from the kill to it, and the processes
+    that the node had started."""
     from magic_core import presence
 
     node = bench.watcher.node
@@ -501,6 +602,7 @@ def kill_at(bench: Bench, name: str, stage: str, moving: threading.Event, over: 
     else:
         until(lambda: any(line.startswith(stage) for line in bench.lines) or pending.result is not None, what=f"the run is at {stage}")
     process = bench.graph.processes[name]
+    children = family(process.popen.pid)[1:]
     process.stopped = True
     process.signal(signal.SIGKILL)
     process.wait(DEADLINE)
@@ -509,7 +611,7 @@ def kill_at(bench: Bench, name: str, stage: str, moving: threading.Event, over: 
     # A client hears nothing from a strategy server that has gone: it looks, as `ros2 action send_goal` does.
     until(lambda: pending.result is not None or (name == "strategy_server" and server.gone()), DEADLINE, "the run's client knows")
     code = Code(pending.result.code).name if pending.result is not None else "its server has gone"
-    return code, time.monotonic() - began
+    return code, time.monotonic() - began, children
 
 
 def after_restart(bench: Bench, name: str) -> Any:
@@ -545,11 +647,15 @@ def table(parts: list[Part]) -> str:
         lines.append(
             f"| {part.name} | {len(part.cases)} of {part.size} | {sum(map(bool, part.cases))} | {part.worst:.1f} | {part.seconds / 60:.1f} | {kinds} |"
         )
-    lines += ["", "| MB of | " + " | ".join(NODES) + " |", "| --- |" + " --- |" * len(NODES)]
+    lines += ["", "| MB, first to last (kB a case) | " + " | ".join(NODES) + " |", "| --- |" + " --- |" * len(NODES)]
     for part in parts:
-        for entry in part.memory:
-            cells = [f"{entry['first'].get(n, 0):.0f} to {entry['last'].get(n, 0):.0f}" if n in entry["first"] else "" for n in NODES]
-            lines.append(f"| {part.name}, until case {entry['cases']} | " + " | ".join(cells) + " |")
+        for entry in part.growth():
+            cells = []
+            for name in NODES:
+                first, last, slope = entry["nodes"].get(name, (None, None, None))
+                said = "" if slope is None else f" ({slope * 1000:+.1f})"
+                cells.append("" if first is None else f"{first:.0f} to {last:.0f}{said}")
+            lines.append(f"| {part.name}, cases {entry['from']} to {entry['to']} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -580,7 +686,9 @@ def main() -> int:
     text = table(parts)
     (given.out / "table.md").write_text(text + "\n")
     print(text)
-    return int(failed or any(any(p.cases) for p in parts))
+    grown = [line for p in parts for line in p.grown]
+    print("\n".join(grown))
+    return int(failed or bool(grown) or any(any(p.cases) for p in parts))
 
 
 if __name__ == "__main__":

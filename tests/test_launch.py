@@ -1,8 +1,10 @@
 """The launch files: everything that they name exists, and the graph comes up through them."""
 
+import os
 import re
 import shutil
 import signal
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -80,28 +82,45 @@ def test_arguments_that_are_given_win_over_parameter_files(own_files):
 
 
 @pytest.mark.parametrize("given, wanted", [([], False), (["respawn:=true"], True)])
-def test_nodes_that_end_are_started_again_where_that_is_asked_for(given, wanted):
+@pytest.mark.parametrize("name, more", [("magic.launch.xml", ()), ("replay.launch.xml", ("bag:=here",))])
+def test_nodes_that_end_are_started_again_where_that_is_asked_for(name, more, given, wanted):
     from magic_ros2cli import launch_file
 
-    path = launch_file.find("magic_bringup", "magic.launch.xml")
-    processes = launch_file.parse(path, dict(a.split(":=") for a in given)).processes
-    assert len(processes) == len(NODES)
-    assert all(p.respawn is wanted and p.respawn_delay == 1.0 for p in processes)
+    path = launch_file.find("magic_bringup", name)
+    processes = launch_file.parse(path, dict(a.split(":=") for a in (*given, *more))).processes
+    nodes = [p for p in processes if p.label in NODES]
+    assert len(nodes) == len(NODES)
+    assert all(p.respawn is wanted and p.respawn_delay == 1.0 for p in nodes)
+    assert [p.label for p in processes if p not in nodes] == ["bag_player"] * len(more)
 
 
-def test_the_graph_comes_up_and_ends_through_ros2_launch(tmp_path):
+def test_a_launched_graph_comes_up_with_its_files_starts_a_killed_node_again_and_ends(tmp_path):
     program = shutil.which("ros2")
     assert program, "there is no ros2 command"
-    process = Process.start(
-        "launch", [program, "launch", "magic_bringup", "magic.launch.xml", "features:=embedded"], tmp_path / "launch.log", isolated()
-    )
-    try:
-        for name in NODES:
-            until(
-                lambda n=name: re.search(rf"\[{n}\]: .*(waiting for|ready)", process.tail(500)) or process.status is not None,
-                what=f"{name} is up",
-            )
+    files = {"matcher": {"features": "embedded", "top_k": 2}, "server": {"timeout": 77.0}}
+    for name, values in files.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
+    given = ["respawn:=true", *(f"{name}_params:={tmp_path}/{name}.yaml" for name in files)]
+    env = isolated()
+    process = Process.start("launch", [program, "launch", "magic_bringup", "magic.launch.xml", *given], tmp_path / "launch.log", env)
+
+    def up(name, times=1):
+        # A node says it once for all that it waits for, or several times: what comes after its last start counts.
+        text = process.log.read_text()
+        begun = list(re.finditer(rf"\[{name}-\d+\]: process started with pid \[(\d+)\]", text))
         assert process.status is None, process.tail(50)
+        ready = len(begun) == times and re.search(rf"\[{name}\]: .*(waiting for|ready)", text[begun[-1].end() :])
+        return int(begun[-1][1]) if ready else None
+
+    def value(node, name):
+        return subprocess.run([program, "param", "get", "--hide-type", node, name], env=env, capture_output=True, text=True).stdout.strip()
+
+    try:
+        pids = {name: until(lambda n=name: up(n), what=f"{name} is up") for name in NODES}
+        os.kill(pids["strategy_server"], signal.SIGKILL)
+        assert (value("/matcher", "features"), value("/matcher", "top_k")) == ("embedded", "2")
+        assert until(lambda: up("strategy_server", 2), what="it is there again") != pids["strategy_server"]
+        assert value("/strategy_server", "timeout") == "77.0"
         process.signal(signal.SIGINT)
         assert process.wait(DEADLINE) is not None
         assert "Traceback" not in process.tail(500), process.tail(100)
