@@ -461,9 +461,12 @@ class Perception(Node):
         streams = []
         for camera, stream in self.streams.items():
             silent = now - max(stream.last.get("pair", -math.inf), self.resumed)
-            if silent < self.patience and (stream.intrinsics is None or len(stream.pairs) < self.count):
+            few = stream.intrinsics is None or len(stream.pairs) < self.count
+            # Of a bag that has fewer frames and is played again and again the first one is always young.
+            stream.few = min(stream.few, stream.pairs[0].arrived if stream.pairs else math.inf) if few else math.inf
+            if few and silent < self.patience:
                 # The first frames of a camera that speaks, or the wait for one that has not spoken yet.
-                first = stream.pairs[0].arrived if stream.pairs else self.resumed
+                first = self.resumed if math.isinf(stream.few) else max(stream.few, self.resumed)
                 if now - first < self.patience:
                     return None
             if stream.intrinsics is None:

@@ -47,7 +47,8 @@ class Stream:
     """The state of one camera.
 
     tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept, in the order of their stamps.  unit: of
-    the newest depth image's numbers.  unplaced: since when no pair's transform is known (infinite: one is).
+    the newest depth image's numbers.  unplaced: since when no pair's transform is known (infinite: one is).  few: since when there
+    have been frames, but fewer than are averaged (infinite: there are enough, or none has come yet).
     Times called ``now`` are monotonic seconds.
     """
 
@@ -56,6 +57,7 @@ class Stream:
     keep: int = 5
     unit: str = "mm"
     unplaced: float = math.inf
+    few: float = math.inf
     intrinsics: Intrinsics | None = None
     depth_intrinsics: Intrinsics | None = None
     pairs: list[Pair] = field(default_factory=list)

@@ -439,6 +439,15 @@ def test_a_short_bag_without_transforms_is_not_waited_for_without_end(frames):
         )
 
 
+@pytest.mark.parametrize("stamps", [(10.0, 10.2), (10.0, 11.5)], ids=["shorter than a second", "longer"])
+def test_a_bag_with_fewer_frames_than_are_averaged_is_not_waited_for_without_end(frames, stamps):
+    """As a killed recorder leaves it, played in a loop: its first frame is young again and again."""
+    with Bench(cameras=["left"], camera_timeout=0.5, average=3) as bench:
+        bench.transforms()
+        clock = iter(stamps * 1000)
+        bench.until(lambda: bench.objects, "objects", tick=lambda: bench.send(later(frames[0], next(clock))))
+
+
 def test_static_transforms_of_volatile_publishers_are_heard_and_bad_rotations_named(frames):
     from rclpy.qos import QoSProfile
 
