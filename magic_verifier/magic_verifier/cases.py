@@ -11,13 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import strategy as strategies
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier.posing import PoseEntry, posed, read_poses
 
-TASKS = ("scooping", "hanging", "hooking")
+TASKS = ("scooping", "hanging", "hooking", "hammering", "pushing")
+#: Those of Table V: no strategy folders, and the floating gripper alone.
+STRIKING = ("hammering", "pushing")
+#: Table V's: hammers (T, L and X of two blocks, and real-looking ones) and things that are none, with seeds from ``STRIKING_SEEDS`` up.
+HAMMERS = ("mallet:{},form=T", "mallet:{},form=L", "mallet:{},form=X", "hammer:{}")
+NON_HAMMERS = ("caliper:{}", "scissors:{}", "j_hook:{}", "plain_bar:{}", "plain_bottle:{}", "plain_driver:{}")
+STRIKING_SEEDS, STRIKING_COUNT = 70_000, 24
 VARIANTS = ("fg", "arm", "fg_no_selection")
 #: ``magic``: all of it.  The paper's baselines: ``pca`` and ``fpfh_icp`` align the whole shape, ``dino`` takes the best places of the
 #: features, neither refined nor ranked by curvature, ``curvature`` draws contact points at random and ranks them by curvature alone.  The
@@ -43,7 +50,7 @@ UNSEEN_SEEDS = 50_000
 UNSEEN_COUNT = 60
 #: What the tools of an evaluation are taken for: ``meshes`` as they are, ``images`` as two cameras see them (:mod:`magic_verifier.captured`).
 SOURCES = ("meshes", "images")
-SETS = ("own", "unseen", "alphabet", "controls")
+SETS = ("own", "unseen", "alphabet", "controls", "hammers", "non_hammers")
 #: Negative controls, which no method can do: plain things of the matcher's own control families (bars, discs, blades, bottles, ...), and
 #: near misses.  Of these the first :data:`CONTROL_COUNT` that geometry forbids (:mod:`magic_verifier.feasibility`) are taken.
 PLAIN = ("bar", "disc", "rod", "torch", "blade", "polygon", "bottle", "driver", "segment", "bent")
@@ -98,6 +105,10 @@ def tool_names(options: Options) -> list[str]:
     """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``; parameters of a family may follow its seed."""
     if options.objects:
         return _meshes(options.objects, options.scale)
+    if options.task in STRIKING:
+        families = {"hammers": HAMMERS, "non_hammers": NON_HAMMERS}.get(options.set, (*HAMMERS, *NON_HAMMERS))
+        first = STRIKING_SEEDS + STRIKING_COUNT * options.seed
+        return [families[k % len(families)].format(first + k) for k in range(STRIKING_COUNT)]
     if options.set == "alphabet":
         return [f"capital:{letter}" for letter in ascii_uppercase]
     if options.task == "scooping":
@@ -115,7 +126,9 @@ def target_names(options: Options) -> list[str]:
         return _meshes(options.targets)
     if options.task == "scooping":
         return [f"sphere:{radius:g}" for radius in BALLS]
-    return ["demonstration"] if options.task == "hanging" else [f"cylinder:{radius:g}" for radius in CYLINDERS]
+    if options.task == "hooking":
+        return [f"cylinder:{radius:g}" for radius in CYLINDERS]
+    return ["demonstration"]
 
 
 def _meshes(folder: str, scale: float = 1.0) -> list[str]:
@@ -133,8 +146,34 @@ def _meshes(folder: str, scale: float = 1.0) -> list[str]:
     return [f"{root}//{name}@{scale!r}" for name in found]
 
 
+def check(options: Options) -> None:
+    """Raise ``BAD_REQUEST`` for a set that a task does not have, or a variant that it is not made for."""
+    striking = options.task in STRIKING
+    sets = ("own", "hammers", "non_hammers") if striking else ("own", "unseen", "controls", "alphabet")
+    if options.set not in sets:
+        raise MagicError(Code.BAD_REQUEST, f"set of {options.task}", options.set, sets)
+    if striking and (options.variant != "fg" or options.source != "meshes"):
+        raise MagicError(
+            Code.BAD_REQUEST,
+            f"{options.task} as",
+            f"{options.variant} from {options.source}",
+            "fg from meshes: an arm holds no tool loosely",
+        )
+
+
+def strategy_for(options: Options) -> Strategy:
+    """The strategy of a task, as it is demonstrated; raises ``UNKNOWN_STRATEGY``."""
+    if options.task in STRIKING:
+        from magic_verifier.striking import STRATEGIES
+
+        return STRATEGIES[options.task]()
+    strategy = strategies.find(options.task, options.strategies or None)
+    return shown_by(strategy, options.demonstration) if options.demonstration else strategy
+
+
 def all_cases(options: Options) -> list[Case]:
     """All cases of an evaluation, in their order; each in so many turns of the tool as the options say, the first turn of all first."""
+    check(options)
     cases = _cases(options)
     later = [replace(case, name=f"{case.name} turn {turn}") for turn in range(2, options.turns + 1) for case in cases]
     return [*cases, *later]
@@ -170,10 +209,9 @@ def unseen_cases(options: Options) -> list[Case]:
 
 def control_cases(options: Options) -> list[Case]:
     """Things that cannot do the task with the targets that they are given: near misses, and plain things drawn by the seed."""
-    from magic_core import strategy as strategies
     from magic_verifier.feasibility import impossible
 
-    strategy = strategies.find(options.task, options.strategies or None)
+    strategy = strategy_for(options)
     targets = target_names(options)
     first = CONTROL_SEEDS + 1000 * options.seed
     plain = [f"plain_{family}:{first + number}" for number in range(10) for family in PLAIN]

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
@@ -46,7 +45,7 @@ from magic_verifier.cases import (
     met_at,
     scene_for,
     short_name,
-    shown_by,
+    strategy_for,
     tool_object,
 )
 from magic_verifier.feasibility import impossible
@@ -66,9 +65,7 @@ ARM_ATTEMPTS = 3
 @lru_cache(maxsize=16)
 def _strategy(options: Options, tool: str = "") -> Strategy:
     """The strategy with the goal test that it is evaluated by (see :func:`tested`)."""
-    strategy = strategies.find(options.task, options.strategies or None)
-    if options.demonstration:
-        strategy = shown_by(strategy, options.demonstration)
+    strategy = strategy_for(options)
     values = {**strategy.goal.values, **tested(options, tool)}
     return replace(strategy, goal=replace(strategy.goal, values=values))
 

@@ -2,7 +2,9 @@
 
 In a floating run the tool is a kinematic body on its planned trajectory: only the
 contact between tool and target is put to the test, not the arm.  Where the plan
-has a ``release`` phase the tool becomes free at its start.
+has a ``release`` phase the tool becomes free at its start, at rest; where it has a
+``strike`` phase, with the speed that its motion has there: a loose hand guides a blow
+up to it and adds nothing to it.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
@@ -21,14 +24,25 @@ from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, Phase
 from magic_core.scene import SceneObject
 from magic_core.strategy import Physics
-from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, Probe, Settings, World, sphere_of, to_poses, usable_pieces
+from magic_verifier.simulation import (
+    DYNAMIC,
+    KINEMATIC,
+    STATIC,
+    Probe,
+    Settings,
+    World,
+    from_pose,
+    sphere_of,
+    to_poses,
+    usable_pieces,
+)
 
 TOOL = "tool"
 TARGET = "target"
 TABLE = "table"
 
 #: Phases in which the tool may touch what it acts on.
-CONTACT_PHASES = ("contact", "goal", "release", "retreat")
+CONTACT_PHASES = ("contact", "goal", "release", "strike", "retreat")
 #: A tool that overlaps what it is let go on, by no more than is allowed, is pushed out of it so fast (m/s): the fall of a tenth of a
 #: millimetre.  The solver's own speed for bodies that were driven into each other would throw it up by a centimetre.
 PUSHED_OUT = 0.05
@@ -206,6 +220,7 @@ class FloatingRun:
         if not self.duration <= 600:
             raise MagicError(Code.BAD_SCENE, "length of the motion", f"{self.duration:.0f} s", "up to 600 s")
         self.release_time = phase_start(self.phases, ("release",))
+        self.strike_time = phase_start(self.phases, ("strike",))
         self.contact_time = self._contact_time()
         self._motion = motion
         self._start = start = float(np.clip(start, 0.0, self.duration))
@@ -242,9 +257,23 @@ class FloatingRun:
                 self.world.let_go(TOOL)
                 self.world.component(TOOL).max_depenetration_velocity = PUSHED_OUT
                 self._released = True
+            elif self.strike_time is not None and self.time >= self.strike_time:
+                self._throw()
+                self._released = True
             else:
                 self.world.move_to(TOOL, self._targets[min(self.world.steps, len(self._targets) - 1)])
         self.world.step()
+
+    def _throw(self) -> None:
+        """Make the tool free with the speed that its motion has now."""
+        step = min(self.world.steps, len(self._targets) - 1)
+        before, after = (from_pose(self._targets[k]) for k in (max(step - 1, 0), max(step, 1)))
+        rate = self.setup.settings.frequency
+        turn = after @ transforms.inverse(before)
+        centre = self.world.centre_of_mass(TOOL)
+        self.world.let_go(TOOL)
+        self.world.set_velocity(TOOL, (transforms.apply(turn, centre[None])[0] - centre) * rate)
+        self.world.set_turning(TOOL, Rotation.from_matrix(turn[:3, :3]).as_rotvec() * rate)
 
     def joints(self) -> NDArray[np.float64]:
         """(0,): there is no arm."""
@@ -258,7 +287,7 @@ class FloatingRun:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
         phase begins, sampled every ``interval`` seconds up to the release; ``check`` may raise to end it early."""
         setup, motion = self.setup, self._motion
-        end = self.duration if self.release_time is None else self.release_time
+        end = min((t for t in (self.release_time, self.strike_time) if t is not None), default=self.duration)
         times = np.append(np.arange(0.0, end, interval), end)
         poses = transforms.interpolate(motion.times, motion.world_from_tool, motion.times[0] + times)
         worst: dict[tuple[str, bool], Intrusion] = {}

@@ -14,6 +14,11 @@ as the paper's authors released them, with their numbers:
            ``height`` (0.2 m) and slower than ``max_speed`` (0.5 m/s).
 ``scoop``  the target is above ``height`` (0.2 m), touches the tool, and both are
            slower than ``max_speed`` (0.1 m/s), ``settle`` (1 s) after the motion.
+``drive``  the target, which resists along its axis with ``resistance`` (8 N), was driven
+           ``depth`` (5 mm) along minus its normal, and sideways by less than ``drift`` (3 mm).
+``sweep``  the target and ``others`` (2) like it, ``spacing`` (50 mm) apart on its sides, were
+           all moved ``distance`` (0.1 m) along minus its normal, each sideways by less than
+           ``drift`` (50 mm).
 =========  =========================================================================
 
 What passes these by chance, held by something else or by friction that no real pair of
@@ -546,8 +551,95 @@ class Scoop(GoalTest):
         return None
 
 
+def _along(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The direction (3,) in which the target is to go, level, and the one to its left; raises ``BAD_STRATEGY``."""
+    along = -np.asarray(strategy.target_normal, dtype=float) * [1, 1, 0]
+    if np.linalg.norm(along) < 1e-6:
+        raise MagicError(
+            Code.BAD_STRATEGY, f"target_normal of a strategy to {strategy.goal.test}", strategy.target_normal, "a direction along the table"
+        )
+    along = transforms.unit(along)
+    return along, np.cross([0, 0, 1.0], along)
+
+
+class Drive(GoalTest):
+    """Drive the target along its axis against a resistance (Coulomb's, in newtons): the depth that a blow gains.
+
+    ``depth`` is half of what the demonstrated mallet gains (10.4 mm).
+    """
+
+    settle = 0.5
+    defaults: ClassVar[dict[str, float]] = {"depth": 0.005, "resistance": 8.0, "drift": 0.003}
+
+    def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator, nudge: float | None = None) -> None:
+        super().__init__(strategy, run, rng, nudge)
+        self.along, self.sideways = _along(strategy)
+        self.origin = _middle(run, TARGET)
+        self._slowing = self.values["resistance"] / float(run.world.component(TARGET).mass) / run.setup.settings.frequency
+
+    def disturb(self, run: Any) -> None:
+        velocity = run.world.velocity(TARGET)
+        speed = float(velocity @ self.along)
+        if speed != 0.0:
+            run.world.set_velocity(TARGET, velocity - np.sign(speed) * min(abs(speed), self._slowing) * self.along)
+
+    def judge(self, run: Any, go_on: GoOn) -> Judgement:
+        moved = _middle(run, TARGET) - self.origin
+        depth, drift = float(moved @ self.along), abs(float(moved @ self.sideways))
+        metrics = {"depth": depth, "sideways_drift": drift}
+        state = f"driven {depth * 1000:.1f} mm, {drift * 1000:.1f} mm sideways"
+        if depth < self.values["depth"]:
+            return Judgement(
+                Code.GOAL_NOT_REACHED, f"not driven deep enough: {state} (needed: {self.values['depth'] * 1000:g} mm)", metrics
+            )
+        if drift >= self.values["drift"]:
+            return Judgement(Code.DRIFT, f"knocked aside: {state} (allowed: below {self.values['drift'] * 1000:g} mm)", metrics)
+        return Judgement(Code.OK, f"the target was {state}, against {self.values['resistance']:g} N", metrics)
+
+
+class Sweep(GoalTest):
+    """Move the target and others like it, which stand beside it, along one direction."""
+
+    settle = 0.3
+    defaults: ClassVar[dict[str, float]] = {"distance": 0.1, "others": 2, "spacing": 0.05, "drift": 0.05}
+
+    def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator, nudge: float | None = None) -> None:
+        super().__init__(strategy, run, rng, nudge)
+        self.along, self.sideways = _along(strategy)
+        body, physics = run.setup.target, run.setup.physics
+        self.names = [TARGET]
+        for number in range(round(self.values["others"])):
+            # To the left, to the right, further to the left, ...
+            aside = (number // 2 + 1) * self.values["spacing"] * (1 if number % 2 == 0 else -1)
+            name = f"swept_{number + 1}"
+            pose = transforms.make(translation=aside * self.sideways) @ body.world_from_object
+            run.world.add(name, list(body.hulls), pose, DYNAMIC, physics.target_density, physics.friction, balls=body.balls)
+            self.names.append(name)
+        self.origins = [run.world.position(name) for name in self.names]
+
+    def judge(self, run: Any, go_on: GoOn) -> Judgement:
+        moved = np.stack([run.world.position(name) - origin for name, origin in zip(self.names, self.origins, strict=True)])
+        way, drift = moved @ self.along, np.abs(moved @ self.sideways)
+        metrics = {
+            "least_distance": float(way.min()),
+            "most_drift": float(drift.max()),
+            "swept": float((way >= self.values["distance"]).sum()),
+        }
+        ways = ", ".join(f"{1000 * w:.0f}" for w in way)
+        state = f"swept {ways} mm, at most {1000 * drift.max():.0f} mm sideways"
+        if way.min() < self.values["distance"]:
+            return Judgement(
+                Code.GOAL_NOT_REACHED,
+                f"not all were swept far enough: {state} (needed: {self.values['distance'] * 1000:g} mm each)",
+                metrics,
+            )
+        if drift.max() >= self.values["drift"]:
+            return Judgement(Code.DRIFT, f"slid off sideways: {state} (allowed: below {self.values['drift'] * 1000:g} mm)", metrics)
+        return Judgement(Code.OK, f"the {len(way)} objects were {state}", metrics)
+
+
 #: Goal tests by the name that a strategy gives.
-GOALS: dict[str, type[GoalTest]] = {"hook": Hook, "hang": Hang, "scoop": Scoop}
+GOALS: dict[str, type[GoalTest]] = {"hook": Hook, "hang": Hang, "scoop": Scoop, "drive": Drive, "sweep": Sweep}
 
 
 def goal_test(strategy: Strategy, run: Any, rng: np.random.Generator, nudge: float | None = None) -> GoalTest:

@@ -42,6 +42,7 @@ def test_the_full_sets_have_the_papers_sizes_and_every_figure_of_it_is_there():
         "Hooking Arm": 20, "Hanging on a rod FG": 134, "Hanging on a rod Arm": 134,
     }  # fmt: skip
     assert sum(c.paper is not None for c in every if c.table == "I") == 35
+    assert [len(tables.cases_of(c, False)) for c in every if (c.table, c.row) == ("V", "MAGIC")] == [24, 24, 24]
     tree = next(c for c in every if (c.row, c.column) == ("MAGIC", "Hanging FG"))
     cases = tables.cases_of(tree, False)
     assert len({case.tools for case in cases}) == 134
