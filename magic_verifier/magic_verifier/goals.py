@@ -574,6 +574,14 @@ class Drive(GoalTest):
     def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator, nudge: float | None = None) -> None:
         super().__init__(strategy, run, rng, nudge)
         self.along, self.sideways = _along(strategy)
+        if run.variant != "fg" or phase_start(run.phases, ("strike",)) is None:
+            # A tool on rails drives anything to any depth: that would be no finding.
+            raise MagicError(
+                Code.BAD_STRATEGY,
+                f"motion of a strategy to {strategy.goal.test}",
+                f"{run.variant} with phases {', '.join(phase.name for phase in run.phases) or 'none'}",
+                "fg with a phase 'strike', in which the tool flies by its own momentum",
+            )
         self.origin = _middle(run, TARGET)
         self._slowing = self.values["resistance"] / float(run.world.component(TARGET).mass) / run.setup.settings.frequency
 

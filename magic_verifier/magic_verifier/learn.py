@@ -296,7 +296,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--bag", type=Path, required=True, help="the recorded demonstration")
     parser.add_argument("--out", type=Path, required=True, help="the new strategy's folder; its name is the strategy's")
-    parser.add_argument("--goal", required=True, help="goal test (hook, hang, scoop), or 'none': simulation cannot judge it")
+    parser.add_argument("--goal", required=True, help="goal test (hook, hang, scoop, sweep), or 'none': simulation cannot judge it")
     parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal test")
     parser.add_argument("--tool-pose", help=f"topic with the poses of a frame fixed to the tool (default {TOOL_POSE})")
     parser.add_argument("--tool-frame", help="a frame of /tf fixed to the tool, instead")

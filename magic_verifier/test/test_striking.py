@@ -56,6 +56,15 @@ def test_the_blow_does_not_outlast_the_momentum():
     assert 0 < depth < 0.5 * mass * speed**2 / 8.0
 
 
+def test_a_tool_on_rails_is_no_blow(monkeypatch):
+    strategy = striking.hammering()
+    held = replace(strategy, waypoints=tuple(replace(w, phase=w.phase.replace("strike", "goal")) for w in strategy.waypoints))
+    monkeypatch.setitem(striking.STRATEGIES, "hammering", lambda: held)
+    verdict = shown("hammering")
+    assert verdict.code == Code.BAD_STRATEGY
+    assert "strike" in verdict.message
+
+
 def test_a_tool_too_short_for_the_row_leaves_some_behind():
     plank = make("mallet", 0, **{**striking.REFERENCE, "handle": 0.24})
     face = plank.contact("face", plank.view("top"))  # 32 mm wide: the row is 140
