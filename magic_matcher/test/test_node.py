@@ -7,7 +7,9 @@ import time
 import numpy as np
 import pytest
 
-os.environ["ROS_DOMAIN_ID"] = "71"
+from magic_bringup.domain import free_domain
+
+os.environ["ROS_DOMAIN_ID"] = str(free_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 rclpy = pytest.importorskip("rclpy")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import socket
+from collections import deque
 from pathlib import Path
 
 #: Domains whose ports lie below Linux's ephemeral ports (REP of ROS 2: 0 to 101).
@@ -12,6 +13,9 @@ SAFE = range(1, 102)
 
 #: The first port of domain 0, and how many a domain has (RTPS 2.2, 9.6.1.1).
 FIRST_PORT, PORTS = 7400, 250
+
+#: The last port of each domain that this process drew last: no participant comes so far, and other processes see that it is taken.
+_held: deque[socket.socket] = deque(maxlen=20)
 
 #: Where Fast DDS keeps its shared memory.
 SHARED_MEMORY = Path("/dev/shm")
@@ -44,7 +48,7 @@ def unclean() -> set[int]:
 
 
 def free_domain(exclude: tuple[int, ...] = ()) -> int:
-    """A domain in which nobody on this machine is at work, drawn at random so that neighbours starting now differ.
+    """A domain in which nobody on this machine is at work, and which nobody else has drawn just now.
 
     Domains that a killed process has left something of are taken only where there are no others.
     """
@@ -52,9 +56,22 @@ def free_domain(exclude: tuple[int, ...] = ()) -> int:
     random.SystemRandom().shuffle(domains)
     domains.sort(key=unclean().__contains__)
     for domain in domains:
-        if is_free(domain):
+        if is_free(domain) and _hold(domain):
             return domain
     raise RuntimeError(f"no free ROS domain among {SAFE.start} to {SAFE.stop - 1}")
+
+
+def _hold(domain: int) -> bool:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.bind(("0.0.0.0", ports(domain)[-1]))
+    except OSError:  # between the look and this, somebody else
+        sock.close()
+        return False
+    if len(_held) == _held.maxlen:
+        _held.popleft().close()
+    _held.append(sock)
+    return True
 
 
 def isolated(domain: int | None = None) -> dict[str, str]:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-DOMAIN = str(1 + (os.getpid() * 7 + 11) % 100)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 import rclpy
@@ -29,9 +28,11 @@ from tf2_msgs.msg import TFMessage
 from magic_bringup import bag_file, bag_qos
 from magic_bringup.bag_player import Player, PlayOptions
 from magic_bringup.bag_recorder import RecordOptions
+from magic_bringup.domain import free_domain
 from magic_core.errors import Code, MagicError
 from magic_core.qos import LATCHED, SENSOR
 
+DOMAIN = str(free_domain())
 FOREVER = QosTime(9223372036, 854775807)
 
 

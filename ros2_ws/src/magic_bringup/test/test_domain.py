@@ -9,12 +9,17 @@ from magic_bringup import domain
 
 @pytest.mark.parametrize("port", [domain.ports(50)[10], domain.ports(50)[71], domain.ports(50)[249]])
 def test_a_domain_is_taken_by_any_of_its_ports(port):
-    number = domain.free_domain()
-    assert domain.is_free(number)
+    number = next(n for n in domain.SAFE if domain.is_free(n))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("0.0.0.0", port + domain.PORTS * (number - 50)))
         assert not domain.is_free(number)
     assert domain.is_free(number)
+
+
+def test_what_is_drawn_is_drawn_by_nobody_else_for_a_while():
+    drawn = [domain.free_domain() for _ in range(15)]
+    assert len(set(drawn)) == 15
+    assert not any(domain.is_free(number) for number in drawn)
 
 
 def test_ports_are_those_of_the_standard():
@@ -33,6 +38,7 @@ def test_what_a_killed_process_left_is_avoided(tmp_path, monkeypatch):
     (tmp_path / "fastrtps_0a4d6975d272e425").touch()
     assert domain.unclean() >= set(domain.SAFE) - {40, 41}
     monkeypatch.setattr(domain, "is_free", lambda number: True)
+    monkeypatch.setattr(domain, "_hold", lambda number: True)
     assert {domain.free_domain() for _ in range(30)} == {40, 41}
     monkeypatch.setattr(domain, "is_free", lambda number: number not in (40, 41))
     assert domain.free_domain() in set(domain.SAFE) - {40, 41}

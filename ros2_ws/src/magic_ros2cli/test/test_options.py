@@ -17,12 +17,13 @@ from pathlib import Path
 
 import pytest
 
+from magic_bringup.domain import free_domain
 from magic_ros2cli import main
 
 HERE = Path(__file__).parent
 ENVIRONMENT = {
     **os.environ,
-    "ROS_DOMAIN_ID": str(1 + (os.getpid() * 5 + 71) % 100),
+    "ROS_DOMAIN_ID": str(free_domain()),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     "PYTHONUNBUFFERED": "1",
 }

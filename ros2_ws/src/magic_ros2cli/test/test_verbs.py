@@ -13,10 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from magic_bringup.domain import free_domain
+
 HERE = Path(__file__).parent
 ENVIRONMENT = {
     **os.environ,
-    "ROS_DOMAIN_ID": str(1 + (os.getpid() * 3 + 37) % 100),
+    "ROS_DOMAIN_ID": str(free_domain()),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     "PYTHONUNBUFFERED": "1",
 }
