@@ -1,6 +1,6 @@
 """The feature backends there are, by name; what one is says :class:`magic_matcher.features.Features`.
 
-``embedded`` ships with the package; ``dinov2`` needs weights.  ``auto`` takes ``dinov2`` where weights are named and the
+``embedded`` ships with the package; ``dinov2`` needs weights, ``dift`` and ``sd_dino`` (:mod:`magic_matcher.diffusion`) diffusers as well.  ``auto`` takes ``dinov2`` where weights are named and the
 embedded one everywhere else.  Another backend is added by an entry of :data:`magic_matcher.features.MAKERS`.
 """
 
@@ -36,7 +36,19 @@ def _dinov2(weights: str, device: str, **options: Any) -> Features:
     return Dinov2Features(weights, device, **options)
 
 
-MAKERS.update(embedded=_embedded, dinov2=_dinov2)
+def _diffusion(name: str) -> Any:
+    def made(weights: str, device: str, **options: Any) -> Features:
+        from magic_matcher import diffusion
+
+        if not weights:
+            raise MagicError(Code.FEATURE_WEIGHTS, "weights", weights, "a hub name or a folder of a Stable Diffusion pipeline")
+        found: Features = getattr(diffusion, name)(weights, device, **options)
+        return found
+
+    return made
+
+
+MAKERS.update(embedded=_embedded, dinov2=_dinov2, dift=_diffusion("dift"), sd_dino=_diffusion("sd_dino"))
 BACKENDS = ("auto", *MAKERS)
 
 __all__ = ["BACKENDS", "MAKERS", "load"]

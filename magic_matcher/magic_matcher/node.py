@@ -32,7 +32,7 @@ class MatcherNode(Node):
     Service ``match_contact`` (magic_interfaces/MatchContact), subscription ``objects``
     (magic_interfaces/SceneObjectArray, latched).
 
-    Parameters: ``features`` (auto, embedded, dinov2), ``weights`` (hub name or folder,
+    Parameters: ``features`` (auto, embedded, dinov2, dift, sd_dino), ``weights`` (hub name or folder,
     for dinov2), ``device`` (cpu, cuda), ``top_k``, ``curvature_weight`` (lambda),
     ``strategies`` (folder; empty: the installed ones), ``cache`` (folder of what is kept
     of references; empty: the user's cache folder; ``none``: memory only).

@@ -546,7 +546,7 @@ def main(args: list[str] | None = None) -> None:
         help="the paper's set sizes, unseen tools drawn by the seed, the capital letters, or negative controls, which nothing can do",
     )  # fmt: skip
     parser.add_argument("--turns", type=int, default=1, help="turns, drawn by the seed, in which each tool lies")
-    parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded or dinov2")
+    parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded, dinov2, dift or sd_dino")
     parser.add_argument("--weights", default="", help="hub name or folder of the backend's weights")
     parser.add_argument("--objects", default="", help="folder of tool meshes, with or without poses.yaml, instead of the project's own set")
     parser.add_argument("--scale", type=float, default=1.0, help="factor on the meshes of --objects")
