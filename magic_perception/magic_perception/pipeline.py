@@ -25,6 +25,7 @@ from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.seen import cut_off, witnessed
 from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
 from magic_perception.sight import agreement
+from magic_perception.smear import behind
 
 
 @dataclass
@@ -198,18 +199,13 @@ def _build(
         cut = (slice(y, y + h), slice(x, x + w))
         sigma = float(np.median(looked.sigma[cut][mask[cut]][::7]))
         hidden = (image != 0) & ~mask
+        # What colour gives to the thing and depth to the table behind it has no depth.
+        lost = behind(mask, looked.heights)
+        depth, heights = (np.where(lost, np.float32(np.nan), values) for values in (looked.frame.depth, looked.heights))
         sights.append(
-            Sight(
-                looked.frame.intrinsics,
-                table_from_world @ looked.frame.world_from_camera,
-                mask,
-                hidden,
-                looked.frame.depth,
-                looked.heights,
-                sigma,
-            )
+            Sight(looked.frame.intrinsics, table_from_world @ looked.frame.world_from_camera, mask, hidden, depth, heights, sigma)
         )
-        rows, columns = np.nonzero(mask[cut] & np.isfinite(looked.heights[cut]))
+        rows, columns = np.nonzero(mask[cut] & np.isfinite(heights[cut]))
         clouds.append(looked.points(rows + y, columns + x))
         paints.append(looked.frame.color[rows + y, columns + x])
     if not sights:

@@ -20,7 +20,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
-from magic_perception import clusters, convexity
+from magic_perception import clusters, convexity, smear
 from magic_perception.parameters import Parameters
 from magic_perception.table import Plane, fit_plane, supports
 
@@ -242,8 +242,13 @@ def _total(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values[..., 0] + values[..., 1] + values[..., 2]
 
 
-def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
-    """How far each pixel's colour is from the table's around it, in squared standard deviations, and the threshold of notice.
+#: How dark a shadow is at the darkest, in the lightness of what lies in it.
+DARKEST = 0.45
+
+
+def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+    """How far each pixel's colour is from the table's around it, in squared standard deviations, the same where darkness
+    may be a shadow's (both (H, W)), and the threshold of notice.
 
     The table's colour and its spread are local means over the pixels of ``table`` (a wooden grain has a large
     spread, so nothing stands out from it lightly); the threshold is what 99.7 % of the table stays below, at least 25.
@@ -260,14 +265,23 @@ def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np
     size = lab.shape[1::-1]
     # Floor: 3 grey levels of noise in lightness, 2 in colour.
     weight = 1 / (variance + np.array([9.0, 4.0, 4.0], np.float32))
-    distance = np.zeros(lab.shape[:2], np.float32)
+    distance, shaded = np.zeros(lab.shape[:2], np.float32), np.zeros(lab.shape[:2], np.float32)
     for channel in range(3):
-        offset = cv2.subtract(cv2.extractChannel(lab, channel), cv2.resize(mean[..., channel], size), dtype=cv2.CV_32F)
+        here, scale = cv2.resize(mean[..., channel], size), cv2.resize(weight[..., channel], size)
+        offset = cv2.subtract(cv2.extractChannel(lab, channel), here, dtype=cv2.CV_32F)
+        if channel == 0:
+            shade = np.minimum(1 + offset / np.maximum(here, 1), 1)
+            light = np.where(shade > DARKEST, np.maximum(offset, 0), offset)
+            cv2.accumulateProduct(light * light, scale, shaded)
+        else:
+            # In a shadow both colour axes shrink with the lightness.
+            less = offset + (1 - shade) * (here - 128)
+            cv2.accumulateProduct(less * less, scale, shaded)
         offset *= offset
-        cv2.accumulateProduct(offset, cv2.resize(weight[..., channel], size), distance)
+        cv2.accumulateProduct(offset, scale, distance)
     sample = np.flatnonzero(table)
     threshold = max(25.0, float(np.percentile(np.take(distance, sample[::7]), 99.7))) if len(sample) > 500 else np.inf
-    return distance, threshold
+    return distance, shaded, threshold
 
 
 def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
@@ -281,10 +295,10 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     if not parameters.use_color:
         return raised
     around = cv2.dilate(raised.view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
-    table = valid & (np.abs(zero) < limit) & inside & ~around
+    table = _outside(valid & (np.abs(zero) < limit) & inside & ~around, raised)
     if np.count_nonzero(table) < 500:
         return raised
-    distance, threshold = color_distance(looked, table)
+    distance, shaded, threshold = color_distance(looked, table)
     if not np.isfinite(threshold):
         return raised
     other = (distance > threshold) & inside
@@ -303,8 +317,25 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     touched[0] = False
     result = touched[labels]
     result = _fill_bowls(result, looked, other, parameters)
+    result = smear.cleared(
+        result, looked.frame.color, looked.frame.depth, table, shaded, inside & (distance > 9), looked.frame.intrinsics.fx
+    )
     result = _two_colors(result, looked, table)
     return open_by_two(result)
+
+
+def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:
+    """The table without what lies in the convex hull of something raised: the floor of a bowl is as low as the table, but has the bowl's colour.
+
+    What spans more than ``share`` of the picture (a tray's rim, a wall) encloses the table itself.
+    """
+    covered = np.zeros(table.shape, np.uint8)
+    outlines, _ = cv2.findContours(raised.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    for outline in outlines:
+        hull = cv2.convexHull(outline)
+        if cv2.contourArea(hull) < share * table.size:
+            cv2.fillConvexPoly(covered, hull, 1)
+    return table & (covered == 0)
 
 
 def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_], parameters: Parameters) -> NDArray[np.bool_]:
@@ -424,7 +455,9 @@ class DepthSegmenter:
         masks = each(lambda looked: foreground(looked, parameters), looks, parameters.workers)
         fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
         masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
-        solid = [mask & np.isfinite(looked.heights) for mask, looked in zip(masks, looks, strict=True)]
+        solid = [
+            mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights) for mask, looked in zip(masks, looks, strict=True)
+        ]
         spots = [np.nonzero(s) for s in solid]
         cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
         counts = [len(where[0]) for where in spots]
@@ -433,13 +466,16 @@ class DepthSegmenter:
             instance = self._split(looks, spots, cloud, instance)
         labels = []
         start = 0
-        for mask, where, count, known_pixels in zip(masks, spots, counts, fixed, strict=True):
+        for mask, where, count in zip(masks, spots, counts, strict=True):
             image = np.zeros(mask.shape, np.int32)
             image[where] = instance[start : start + count] + 1
             start += count
             labels.append(_fill(image, mask))
-            labels[-1][known_pixels] = -1
-        return _attached(_sizeable(labels, looks, parameters), looks, parameters)
+        # What is too small for a thing and hangs together with one in the mask belongs to it: depth is not to be trusted there.
+        labels = [_fill(image, mask) for image, mask in zip(_sizeable(labels, looks, parameters), masks, strict=True)]
+        for image, known_pixels in zip(labels, fixed, strict=True):
+            image[known_pixels] = -1
+        return _attached(labels, looks, parameters)
 
     @staticmethod
     def _split(
@@ -475,8 +511,8 @@ class DepthSegmenter:
         return convexity.insides(cloud, normal, instance, heights)
 
 
-def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 12.0) -> NDArray[np.int32]:
-    """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels."""
+def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0) -> NDArray[np.int32]:
+    """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels, if both are of one connected region."""
     x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
     if w == 0 or h == 0:
         return labels
@@ -490,8 +526,11 @@ def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 12.
     distance, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     table = np.zeros(int(np.count_nonzero(seen)) + 1, np.int32)
     table[index[seen]] = part[seen]
+    count, regions = cv2.connectedComponents(mask[cut].view(np.uint8), connectivity=8)
+    labelled = np.zeros(count, bool)
+    labelled[regions[seen]] = True
     result = labels.copy()
-    result[cut][missing] = np.where(distance[missing] <= reach, table[index[missing]], 0)
+    result[cut][missing] = np.where((distance[missing] <= reach) & labelled[regions[missing]], table[index[missing]], 0)
     return result
 
 

@@ -85,6 +85,11 @@ class Sight:
         found = cv2.remap(picture, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
         return found.ravel()[:count].reshape(points.shape[:-1])
 
+    def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Column and row (..., 2) at which points (..., 3) are seen, also outside of the picture; -1e4 behind the camera."""
+        u, v, _, count = self._pixels(points)
+        return np.stack([u.ravel()[:count], v.ravel()[:count]], axis=-1).reshape(*points.shape[:-1], 2)
+
     def _pixels(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], int]:
         """u and v of points (..., 3) in the shape that OpenCV's remap takes (less than 32768 rows and columns), depths (N,) and N."""
         pose, k = self._camera_from_table, self.intrinsics

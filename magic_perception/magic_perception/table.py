@@ -239,7 +239,11 @@ def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 
     plane = best.plane
     near = points[np.abs(plane.heights(points)) < 2 * band]
     if plane is not first and len(near) > 300:
-        plane = fit_plane(near, plane.normal, 5.0, band, seed=seed)
+        # The largest plane that the points near it tell of may be another, inclined to it (a box's side that meets it): then it stays as it was found.
+        try:
+            plane = fit_plane(near, plane.normal, 5.0, band, seed=seed)
+        except MagicError:
+            pass
     if notes is not None:
         if all(plane is not first for plane in level):
             notes.append(f"the largest plane ({first.inliers:.0%} of the depth) is upright in the picture: not the table")

@@ -307,7 +307,7 @@ def build_round(
         return None  # more than a body of revolution with a flat end, a bottle's neck say
     handle = None
     if len(out) > 20:
-        out = out[clusters.largest(out, 0.012, 4, 0.003)]
+        out = _standing_off(out, body)
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
         if np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010 and len(out) > 0.02 * len(points):
             handle = handle_of(sights, out, body, parameters)
@@ -395,6 +395,8 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
     splat[row[good], column[good]] = 1
     near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
     if useful:
+        # Where depth lost a thin bar, the mask beside the body's outline is the handle's.
+        near |= _connected(near | np.any([_beside(sight, body, plane) for sight in useful], axis=0), near)
         # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
         columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
         field = carve(useful, columns, max(0.02, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
@@ -416,6 +418,46 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
         for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)
     ]
     return bars, pieces
+
+
+def _standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:
+    """Of the points (N, 3) beyond the body the largest cluster, and the others in its direction, to ``apart`` radians: a handle that depth tore."""
+    labels = clusters.cluster(out, 0.012, 4, 0.003)
+    if labels.max(initial=-1) < 0:
+        return out
+    sizes = np.bincount(labels[labels >= 0])
+    middles = np.array([out[labels == i, :2].mean(axis=0) - body.axis for i in range(len(sizes))])
+    angles = np.arctan2(middles[:, 1], middles[:, 0])
+    off = np.abs((angles - angles[np.argmax(sizes)] + np.pi) % (2 * np.pi) - np.pi)
+    return out[np.isin(labels, np.flatnonzero((off < apart) & (sizes >= 8)))]
+
+
+def _beside(sight: Sight, body: Body, plane: NDArray[np.float64], margin: int = 3) -> NDArray[np.bool_]:
+    """Which cells (Z, S, 3) of a handle's plane a camera sees in the mask, and not before or behind the round body."""
+    turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    radius, z = body.profile.T
+    rings = np.stack(
+        [
+            body.axis[0] + radius[:, None] * np.cos(turns),
+            body.axis[1] + radius[:, None] * np.sin(turns),
+            np.broadcast_to(z[:, None], (len(z), 32)),
+        ],
+        axis=-1,
+    )
+    drawn = np.zeros(sight.mask.shape, np.uint8)
+    for low, high in itertools.pairwise(sight.pixels(rings)):
+        cv2.fillConvexPoly(drawn, cv2.convexHull(np.concatenate([low, high])).round().astype(np.int32), 1)
+    drawn = cv2.dilate(drawn, np.ones((2 * margin + 1,) * 2, np.uint8))
+    return sight.look_up(plane, (sight.mask & (drawn == 0)).astype(np.float32)) > 0.5
+
+
+def _connected(field: NDArray[np.bool_], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The connected regions of a field in which there is something of the seed."""
+    count, parts = cv2.connectedComponents(field.astype(np.uint8), connectivity=8)
+    touched = np.zeros(count, bool)
+    touched[parts[seed & field]] = True
+    touched[0] = False
+    return touched[parts]
 
 
 def _handle_plane(local: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

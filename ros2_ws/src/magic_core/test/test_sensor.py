@@ -8,7 +8,7 @@ import pytest
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
-from magic_core.sensor import D435, DepthModel, capture, degrade, looking_at, table_mesh
+from magic_core.sensor import D435, SMEARED, DepthModel, capture, degrade, looking_at, smeared, table_mesh
 from magic_core.shapes import make
 
 SMALL = Intrinsics(320, 240, 307.5, 307.5, 160.0, 120.0)
@@ -62,6 +62,23 @@ def test_edges_lose_depth_and_flat_parts_do_not() -> None:
     lost = np.isnan(measured).mean(axis=0)
     assert lost[158:162].mean() > 0.3
     assert lost[:120].max() == 0 and lost[170:].max() == 0
+
+
+def test_smear_reaches_past_edges_by_half_a_window_and_fills_narrow_gaps_only() -> None:
+    depth, _ = wall(1.0)
+    depth[60:180, 100:200] = 0.8
+    depth[111:115, 120:180] = 1.0  # a gap of 4 pixels of this image, less than is filled
+    depth[80:100, 120:180] = 1.0  # one of 20
+    result = smeared(depth, SMALL, 0, SMEARED)
+    most = SMEARED.window / 2 * SMALL.fx / SMEARED.focal
+    reach = np.argmax(np.abs(result[70, 200:] - 1.0) < 1e-6)
+    assert 1 <= reach <= np.ceil(most)
+    assert np.all(result[112, 130:170] < 0.85)
+    assert np.all(result[90, 130:170] > 0.99)
+    np.testing.assert_array_equal(result, smeared(depth, SMALL, 0, SMEARED))
+    np.testing.assert_array_equal(
+        degrade(depth, np.ones_like(depth), SMALL, 4), degrade(depth, np.ones_like(depth), SMALL, 4, DepthModel())
+    )
 
 
 def test_near_things_cast_a_shadow_on_their_left() -> None:

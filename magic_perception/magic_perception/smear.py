@@ -1,0 +1,214 @@
+"""Depth smeared past an edge or across a hole, taken out of a mask by colour; what depth lost, put back.
+
+The window of stereo matching carries a near surface's depth some pixels past its edge and over narrow gaps (a handle's hole); at thin bars it may
+carry the background's depth over the thing.  The colour image shows the edge.  Each connected region of a mask is judged with two
+histograms of colour, that of the table around it and that of its own inside: a pixel near the edge goes to whichever makes its neighbourhood
+likelier, and a region of the table's colour that the mask encloses is a hole.  What has the table's colour itself is left as it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+#: Pixels, at a focal length of 615, by which depth reaches past an edge or falls short of it, and to which a hole may lie inside a mask's edge.
+REACH, DEEP = 9, 26
+#: Log of the ratio of likelihoods from which a pixel near the edge is the table's, and one without support in depth is the thing's; and that
+#: of a region's mean from which it is a hole.
+TABLE, THING, HOLE = 1.0, 1.5, 2.5
+#: What is the table's differs from its colour around by less than so many squared standard deviations, shadows aside.
+LIKE = 25.0
+#: A hole is hollow in depth, by so many metres, or it has the table's colour to so many squared standard deviations.
+HOLLOW, SAME = 0.004, 4.0
+#: Least pixels of a hole, and of either kind for its histogram to tell anything.
+LEAST, SAMPLE = 12, 150
+#: Widths of the histograms' bins in lightness and in the two colour axes, of 256.
+BINS = (12, 5, 5)
+
+
+def _index(lab: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Each pixel's bin of a histogram of colour (H, W)."""
+    i, j, k = (cv2.extractChannel(lab, c).astype(np.int32) // BINS[c] for c in range(3))
+    return (i * _SHAPE[1] + j) * _SHAPE[2] + k
+
+
+_SHAPE = tuple(256 // b + 1 for b in BINS)
+#: A density so small that it says nothing.
+EVEN = np.float32(1e-5)
+
+
+def _density(index: NDArray[np.int32]) -> NDArray[np.float32]:
+    """A smoothed histogram of colour over all bins, which sums to 1."""
+    from scipy.ndimage import gaussian_filter
+
+    counts = np.bincount(index, minlength=int(np.prod(_SHAPE))).reshape(_SHAPE).astype(np.float32)
+    used = np.argwhere(counts)
+    low, high = np.maximum(used.min(axis=0) - 3, 0), used.max(axis=0) + 4
+    cut = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    counts[cut] = gaussian_filter(counts[cut], 0.9, mode="constant")
+    return (counts / counts.sum()).ravel()
+
+
+#: How dark a shadow beside a thing makes the table, and how much of the table is taken to lie in one.
+SHADES, SHADED = (0.9, 0.8, 0.7, 0.6), 0.15
+
+
+def _shaded(lab: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The density of the table's colours (N, 3), its own and those that it has in a shadow of that darkness: in proportion nearer to black."""
+    own = _density(_index(lab[:, None])[:, 0])
+    few = lab[:: max(1, len(lab) // 2000)].astype(np.float32) - np.float32([0, 128, 128])
+    dark = np.concatenate([few * shade for shade in SHADES]) + np.float32([0, 128, 128])
+    return (1 - SHADED) * own + SHADED * _density(_index(np.round(dark).astype(np.uint8)[:, None])[:, 0])
+
+
+def cleared(
+    mask: NDArray[np.bool_],
+    color: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    table: NDArray[np.bool_],
+    unlike: NDArray[np.float32],
+    possible: NDArray[np.bool_],
+    focal: float,
+) -> NDArray[np.bool_]:
+    """The mask (H, W) with smear taken out and lost rims put back.
+
+    color (H, W, 3) RGB; depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W): squared distance of the colour from
+    that of the table around, in the light or in a shadow, in standard deviations; possible (H, W): where the mask may grow; focal: focal length, pixels.
+    """
+    scale = focal / 615
+    reach, deep = max(3, round(REACH * scale)), round(DEEP * scale)
+    result = mask.copy()
+    lab = cv2.cvtColor(cv2.GaussianBlur(color, (3, 3), 0), cv2.COLOR_RGB2LAB)
+    wide = cv2.dilate(mask.view(np.uint8), np.ones((5, 5), np.uint8))
+    _, regions, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
+    for number, (x, y, w, h, _) in enumerate(stats[1:], 1):
+        margin = 3 * reach
+        cut = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+        mine = mask[cut] & (regions[cut] == number)
+        result[cut][mine] = False
+        others = mask[cut] & ~mine
+        # What lies farther around than smear reaches, be it the table or the room behind it, is not the thing's either.
+        beyond = cv2.dilate(mine.view(np.uint8), np.ones((2 * reach + 7,) * 2, np.uint8)) == 0
+        near = _Near(mine, lab[cut], depth[cut], unlike[cut], table[cut] | (beyond & ~others), possible[cut] & ~others)
+        result[cut] |= _judged(near, reach, deep)
+    return result
+
+
+@dataclass(frozen=True)
+class _Near:
+    """One region of a mask in its window, and what :func:`cleared` is told there; ``around``: what is surely not the thing."""
+
+    mine: NDArray[np.bool_]
+    lab: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    unlike: NDArray[np.float32]
+    around: NDArray[np.bool_]
+    possible: NDArray[np.bool_]
+
+
+def _judged(near: _Near, reach: int, deep: int) -> NDArray[np.bool_]:
+    """The region as colour has it."""
+    mine = near.mine
+    if np.count_nonzero(mine) < SAMPLE or np.count_nonzero(near.around) < SAMPLE:
+        return mine
+    index = _index(near.lab)
+    within = cv2.distanceTransform(np.pad(mine, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    ground = _shaded(near.lab[near.around])
+
+    def field(own: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Log of how much likelier each pixel's colour is around the thing than on it, of which ``own`` is a sample."""
+        return cv2.blur(np.log((ground + EVEN) / (_density(index[own]) + EVEN))[index], (3, 3))
+
+    inner = mine & (within > min(reach, 0.6 * float(within.max())))
+    other = inner & (near.unlike >= LIKE)
+    first = field(other if np.count_nonzero(other) > max(SAMPLE, 0.3 * np.count_nonzero(inner)) else inner)
+    # What looks like the table near the edge says nothing of the thing's own colours.
+    sure = mine & ~((first > TABLE) & (within < deep))
+    if np.count_nonzero(sure) < 0.3 * np.count_nonzero(mine):
+        return mine
+    told = field(sure)
+    kept = mine & ~_smeared(near, told, within, reach, deep)
+    # Grow step by step, so that nothing is reached across the table.
+    like = near.possible & ~mine & (told < -THING)
+    grown = kept
+    for _ in range(reach):
+        grown = grown | (cv2.dilate(grown.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & like)
+    return grown | _enclosed(like & ~grown & np.isfinite(near.depth), grown)
+
+
+def _smeared(near: _Near, told: NDArray[np.float32], within: NDArray[np.float32], reach: int, deep: int) -> NDArray[np.bool_]:
+    """Of a region's pixels those that colour gives to the table: a rim of it no wider than smear is, and holes that it encloses."""
+    empty = near.mine & (told > TABLE) & (near.unlike < LIKE)
+    outside = cv2.dilate((~near.mine).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    removed = np.zeros_like(empty)
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(empty.view(np.uint8), connectivity=4)
+    for i, (x, y, w, h, area) in enumerate(stats[1:], 1):
+        cut = (slice(max(y - 4, 0), y + h + 4), slice(max(x - 4, 0), x + w + 4))
+        part = parts[cut] == i
+        if area >= LEAST and float(within[cut][part].max()) < deep and _hole(near, part, empty[cut], told[cut][part], cut):
+            removed[cut] |= part
+    # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
+    inner = (empty & ~removed & (within > reach + 1)).view(np.uint8)
+    own = cv2.dilate(inner, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 3,) * 2)) > 0
+    return removed | _connected(empty & (within <= reach) & ~own, outside)
+
+
+def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: NDArray[np.float32], cut: tuple[slice, slice]) -> bool:
+    """Whether a patch of the table's colour in a region is a hole: depth shows it hollow or nothing there, or it cannot be told from the table."""
+    if float(told.mean()) < HOLE:
+        return False
+    ring = (cv2.dilate(part.view(np.uint8), np.ones((7, 7), np.uint8)) > 0) & near.mine[cut] & ~empty
+    inside, rim = near.depth[cut][part], near.depth[cut][ring]
+    inside, rim = inside[np.isfinite(inside)], rim[np.isfinite(rim)]
+    if len(inside) < 0.7 * len(told) or (len(rim) > 8 and float(np.median(inside)) > float(np.median(rim)) + HOLLOW):
+        return True
+    return float(np.median(near.unlike[cut][part])) < SAME
+
+
+def _connected(field: NDArray[np.bool_], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The connected regions of a field in which there is something of the seed."""
+    count, parts = cv2.connectedComponents(field.view(np.uint8), connectivity=4)
+    touched = np.zeros(count, bool)
+    touched[parts[seed & field]] = True
+    touched[0] = False
+    return touched[parts]
+
+
+def _enclosed(like: NDArray[np.bool_], mask: NDArray[np.bool_], share: float = 0.6) -> NDArray[np.bool_]:
+    """The regions of ``like`` whose border lies on the mask by at least that share: the floor of a bowl, which is as low as the table."""
+    result = np.zeros_like(mask)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(like.view(np.uint8), connectivity=4)
+    beside = np.pad(mask, 1)
+    for i in range(1, count):
+        x, y, w, h, area = stats[i]
+        if area < LEAST:
+            continue
+        part = np.pad(parts[y : y + h, x : x + w] == i, 1)
+        rim = (cv2.dilate(part.view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~part
+        if float(beside[y : y + h + 2, x : x + w + 2][rim].mean()) >= share:
+            result[y : y + h, x : x + w] |= part[1:-1, 1:-1]
+    return result
+
+
+#: Of a pixel whose depth is not the thing's: its own largest height over the table, and that which the mask has nearby at least, m; pixels.
+LOW, HIGH, NEARBY = 0.008, 0.030, 6
+
+
+def behind(mask: NDArray[np.bool_], heights: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels (H, W) of a mask at which depth shows the table behind the thing: at a thin bar the background's depth may win.
+
+    heights (H, W) metres above the table.  They are as low as the table where the thing is high all around.
+    """
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    result = np.zeros_like(mask)
+    if w == 0:
+        return result
+    cut = (slice(y, y + h), slice(x, x + w))
+    zero = np.where(mask[cut], np.nan_to_num(heights[cut]), np.float32(0))
+    around = cv2.dilate(zero, np.ones((2 * NEARBY + 1,) * 2, np.uint8))
+    with np.errstate(invalid="ignore"):
+        result[cut] = mask[cut] & (heights[cut] < LOW) & (around > HIGH)
+    return result

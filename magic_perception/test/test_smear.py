@@ -1,0 +1,78 @@
+"""Smear at edges and over holes is taken out by colour, and what has the table's colour is left alone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+
+from magic_core import sensor
+from magic_perception import smear
+from magic_perception.evaluate import overlap
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import perceive
+
+TABLE, THING = (150, 120, 90), (60, 70, 120)
+
+
+def ring(outer: int = 50, inner: int = 20) -> np.ndarray:
+    """A flat ring (200, 200) in the middle."""
+    v, u = np.mgrid[0:200, 0:200]
+    away = np.hypot(u - 100, v - 100)
+    return (away < outer) & (away >= inner)
+
+
+def picture(thing: np.ndarray, color: tuple[int, int, int] = THING, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    image = np.where(thing[..., None], color, TABLE) + rng.normal(0, 2, (*thing.shape, 3))
+    return np.clip(cv2.GaussianBlur(image, (0, 0), 0.6), 0, 255).astype(np.uint8)
+
+
+def cleared(mask: np.ndarray, color: np.ndarray, depth: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
+    return smear.cleared(mask, color, depth, table, np.where(seen, 100, 0).astype(np.float32), np.ones(mask.shape, bool), 615.0)
+
+
+@pytest.mark.parametrize("hollow", [0.0, 0.02])
+def test_a_fattened_ring_with_its_hole_filled_becomes_the_ring_again(hollow: float) -> None:
+    truth = ring(18, 8)
+    wide = ring(23, 0)
+    depth = np.where(ring(200, 8), 0.6, 0.6 + hollow).astype(np.float32)
+    found = cleared(wide, picture(truth), depth, truth)
+    # To a pixel at either edge, which the segmenter then puts where the colour is half way.
+    assert overlap(truth, found) > 0.85 > 0.5 > overlap(truth, wide)
+    assert not found[96:104, 96:104].any()
+
+
+def test_a_rim_that_depth_lost_is_put_back() -> None:
+    truth = ring(50, 0)
+    found = cleared(ring(44, 0), picture(truth), np.full(truth.shape, 0.6, np.float32), truth)
+    assert overlap(truth, found) > 0.94
+
+
+def test_what_has_the_colour_of_the_table_keeps_its_mask() -> None:
+    truth = ring(50, 0)
+    depth = np.full(truth.shape, 0.6, np.float32)
+    assert overlap(truth, cleared(truth, picture(truth, TABLE), depth, np.zeros(truth.shape, bool))) > 0.97
+    # A face of the table's colour that goes on farther in than smear reaches is no smear.
+    striped = truth & (np.mgrid[0:200, 0:200][0] > 85)
+    assert overlap(truth, cleared(truth, picture(striped), depth, striped)) > 0.9
+
+
+def test_depth_of_the_table_in_a_high_thing_is_not_its_own() -> None:
+    mask, heights = ring(), np.full((200, 200), 0.05, np.float32)
+    heights[95:105, 130:150] = 0.001
+    lost = smear.behind(mask, heights)
+    assert lost[100, 140] and lost.sum() == (mask & (heights < 0.01)).sum()
+    assert not smear.behind(mask, np.full((200, 200), 0.006, np.float32)).any()
+
+
+def test_the_hole_of_a_handle_opens_under_smeared_depth() -> None:
+    mug = scenes.shape("mug", 3, 0.55, 0.0, 3.3)
+    frames = [
+        sensor.capture([mug], scenes.INTRINSICS, pose, [1, i], camera=name, model=sensor.SMEARED)
+        for i, (name, pose) in enumerate(scenes.POSES.items())
+    ]
+    scene = perceive(frames, parameters=Parameters())
+    assert [item.view.kind for item in scene.objects] == ["side"]
