@@ -33,6 +33,7 @@ setup(
     entry_points={
         "console_scripts": [
             "strategy_server = magic_bringup.programs:strategy_server",
+            "magic = magic_bringup.programs:magic",
             "report = magic_bringup.programs:report",
             "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
             "bag_player = magic_bringup.programs:bag_player",

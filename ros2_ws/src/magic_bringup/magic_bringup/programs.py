@@ -3,6 +3,7 @@
 from magic_core.entry import program
 
 strategy_server = program("magic_bringup.strategy_server")
+magic = program("magic_bringup.client")
 report = program("magic_bringup.report")
 rgbd_to_bag = program("magic_bringup.rgbd_to_bag")
 bag_player = program("magic_bringup.bag_player")

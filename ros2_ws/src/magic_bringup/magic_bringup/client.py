@@ -1,0 +1,400 @@
+"""The graph from a terminal: ``ros2 run magic_bringup magic run|match|objects|strategies|doctor``.
+
+What ``ros2 action send_goal`` prints of a run are tens of thousands of lines, meshes and images among them; this prints
+what a person wants to know of it.  Exit status: 0 where the answer is OK (``doctor``: where nothing is missing), 1 where
+not, 2 for wrong arguments, 130 when interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.metadata
+import importlib.util
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from magic_bringup.graph import NODES
+from magic_bringup.pipeline import split_metrics
+from magic_bringup.remote import RemoteAction, RemoteService, Token
+from magic_core import conversions, qos
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_core.executor import ThreadedExecutor
+from magic_core.motion import VARIANTS
+from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
+from magic_interfaces.msg import SceneObjectArray
+from magic_interfaces.srv import MatchContact
+
+#: What is waited beyond a run's own time for its answer, s.
+GRACE = 30.0
+#: What the doctor listens for at least: every node reports once a second.
+LISTEN = 3.0
+#: Modules whose versions matter when somebody is asked for help, with the packages that bring them.
+MODULES = {
+    "numpy": "numpy",
+    "torch": "torch",
+    "open3d": "open3d",
+    "sapien": "sapien",
+    "mplib": "mplib",
+    "cv2": "opencv-python-headless",
+    "sklearn": "scikit-learn",
+}
+
+
+class Client:
+    """A node that asks the others; spins in a thread of its own."""
+
+    def __init__(self, arguments: Sequence[str] | None) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(
+            args=None if arguments is None else list(arguments), context=self.context, signal_handler_options=SignalHandlerOptions.NO
+        )
+        self.node = Node("magic", context=self.context)
+        self.token = Token()
+        self._group = ReentrantCallbackGroup()
+        self._executor = ThreadedExecutor(2, context=self.context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def action(self, kind: Any, name: str, server: str) -> RemoteAction:
+        return RemoteAction(self.node, kind, name, server, self._group)
+
+    def service(self, kind: Any, name: str, server: str) -> RemoteService:
+        return RemoteService(self.node, kind, name, server, self._group)
+
+    def objects(self, timeout: float) -> Any:
+        """The newest ``objects`` message; raises NO_FRAMES where none comes within ``timeout`` seconds."""
+        came: list[Any] = []
+        self.node.create_subscription(SceneObjectArray, "objects", lambda m: (came.append(m), self.token.poke()), qos.LATCHED)
+        topic = self.node.resolve_topic_name("objects")
+        if not self.token.wait(lambda: bool(came), time.monotonic() + timeout):
+            count = self.node.count_publishers("objects")
+            raise MagicError(Code.NO_FRAMES, f"nothing came on {topic} within {timeout:g} s; it has {count} publishers")
+        return came[-1]
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=2.0)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+        self._thread.join(2.0)
+
+
+@contextlib.contextmanager
+def connected(arguments: Sequence[str] | None) -> Iterator[Client]:
+    """A client that is closed whatever happens."""
+    client = Client(arguments)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def say(line: str = "") -> None:
+    """One line, at once."""
+    print(line, flush=True)
+
+
+# ------------------------------------------------------------ run
+
+
+def run(client: Client, given: argparse.Namespace) -> int:
+    """A run with its progress, what came of it, and why."""
+    begin, said = time.monotonic(), [""]
+
+    def progress(feedback: Any) -> None:
+        line = f"{feedback.stage}: {split_metrics(feedback.message)[0]}"
+        if line != said[0]:
+            said[0] = line
+            say(f"[{time.monotonic() - begin:6.1f} s] {line}")
+
+    goal = RunStrategy.Goal(
+        strategy=_strategy_name(given.strategy),
+        variant=given.variant,
+        tool_id=given.tool,
+        target_id=given.target,
+        seed=given.seed,
+        timeout=given.timeout,
+        want_pictures=given.out is not None,
+    )
+    server = client.action(RunStrategy, "run_strategy", "strategy server")
+    result = server.call(goal, given.timeout or 3600.0, client.token, grace=GRACE, feedback=progress).result
+    for line in run_lines(result):
+        say(line)
+    if given.out is not None:
+        for path in pictures(result, given.out):
+            say(f"  picture    {path}")
+    return 0 if result.code == Code.OK else 1
+
+
+def run_lines(result: Any) -> list[str]:
+    """What a RunStrategy result says, in lines for a terminal."""
+    verdict = "VERIFIED" if result.verified else "not verified"
+    lines = [f"{verdict}: {Code(result.code).name} ({result.code}): {split_metrics(result.message)[0]}"]
+    if result.rollouts:
+        lines.append(
+            f"  success    {100 * result.success_rate:.0f} % of {result.rollouts} rollouts, "
+            f"95 % interval {100 * result.rate_low:.0f} to {100 * result.rate_high:.0f} %"
+        )
+    lines += [f"  failing    {reason}" for reason in result.failures]
+    if result.tool_id:
+        lines.append(f"  tool       {result.tool_id} on {result.target_id}, matched by {result.features} features")
+    arm = result.plan.arm_trajectory
+    points, joints = (arm.points, f"{len(arm.joint_names)} joints") if arm.points else (result.plan.tool_trajectory.points, "the tool")
+    if points and result.verified:
+        end = points[-1].time_from_start
+        lines.append(f"  motion     {len(points)} points of {joints} in {end.sec + 1e-9 * end.nanosec:.1f} s")
+    lines.append(f"  executed   {'yes' if result.executed else 'no'}")
+    lines += [f"  note       {note}" for note in result.notes]
+    times = result.times
+    lines.append(
+        f"  seconds    perceive {times.perceive:.2f}, match {times.match:.2f}, plan {times.plan:.2f}, verify {times.verify:.2f}, "
+        f"total {times.total:.2f}; {result.simulations} simulations"
+    )
+    for number, report in enumerate(result.candidates):
+        if report.code != Code.OK:
+            c = report.candidate
+            reason = split_metrics(report.message)[0]
+            lines.append(f"  dropped    {number}: {c.tool_id} (score {c.score:.2f}), {report.stage}: {Code(report.code).name}: {reason}")
+    return lines
+
+
+def pictures(result: Any, folder: Path) -> list[Path]:
+    """The film strip and the heat map of a result as PNG files; those that there are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    if len(result.film.data):
+        written.append(folder / "simulation.png")
+        cv2.imwrite(str(written[-1]), conversions.color_from_msg(result.film)[:, :, ::-1])
+    if len(result.heatmap.data):
+        heat = np.nan_to_num(conversions.float_image_from_msg(result.heatmap))
+        written.append(folder / "heatmap.png")
+        cv2.imwrite(str(written[-1]), cv2.applyColorMap((255 * np.clip(heat, 0, 1)).astype(np.uint8), cv2.COLORMAP_VIRIDIS))
+    return written
+
+
+# ------------------------------------------------------------ match, objects, strategies
+
+
+def match(client: Client, given: argparse.Namespace) -> int:
+    """The contacts that correspond to the demonstration's, best first."""
+    request = MatchContact.Request(strategy=_strategy_name(given.strategy), tool_ids=given.tool, target_id=given.target, top_k=given.top_k)
+    response = client.service(MatchContact, "match_contact", "matcher").call(request, given.timeout, client.token)
+    say(f"{Code(response.code).name} ({response.code}): {response.message}")
+    if response.candidates:
+        say(f"  target {response.target_id}, {response.features} features, {response.seconds:.2f} s")
+        say(f"  {'tool':<12} {'score':>6} {'global':>7} {'local':>6} {'turn':>6}  {'x, y, z in mm':<22} radius")
+    for c in response.candidates:
+        place = ", ".join(f"{1000 * v:.0f}" for v in (c.point.x, c.point.y, c.point.z))
+        kind = "inside" if c.tool.concave else "outside"
+        mirrored = ", mirrored" if c.flipped else ""
+        say(
+            f"  {c.tool_id:<12} {c.score:6.3f} {c.s_dino:7.3f} {c.s_curv:6.3f} {np.degrees(c.rotation):5.0f}°  {place:<22} "
+            f"{1000 * c.tool.radius:.0f} mm, {kind}{mirrored}"
+        )
+    return 0 if response.code == Code.OK else 1
+
+
+def objects(client: Client, given: argparse.Namespace) -> int:
+    """What stands on the table."""
+    for line in object_lines(client.objects(given.timeout), client.node.get_clock().now().nanoseconds * 1e-9):
+        say(line)
+    return 0
+
+
+def object_lines(scene: Any, now: float) -> list[str]:
+    """An ``objects`` message in lines; now in s."""
+    stamp = scene.header.stamp.sec + 1e-9 * scene.header.stamp.nanosec
+    plural = "" if len(scene.objects) == 1 else "s"
+    lines = [f"{len(scene.objects)} object{plural} in {scene.header.frame_id or 'no frame'}, seen {now - stamp:.1f} s ago"]
+    lines.append(f"  {'id':<14} {'source':<8} {'size in mm':<18} {'middle in mm':<20} {'sure':>5} {'seen':>5}")
+    for o in scene.objects:
+        size = " x ".join(f"{1000 * v:.0f}" for v in sorted((o.box_size.x, o.box_size.y, o.box_size.z), reverse=True))
+        p = o.box_pose.position
+        middle = ", ".join(f"{1000 * v:.0f}" for v in (p.x, p.y, p.z))
+        known = o.source == "known"
+        sure, seen = ("", "") if known else (f"{100 * o.confidence:.0f} %", f"{100 * o.seen_share:.0f} %")
+        remarks = ["cut off by " + ", ".join(o.cut_off)] if o.cut_off else []
+        remarks += ["hangs above the table"] if o.hanging else []
+        lines.append(f"  {o.id:<14} {o.source:<8} {size:<18} {middle:<20} {sure:>5} {seen:>5}  {'; '.join(remarks)}".rstrip())
+    return lines + [f"  note: {note}" for note in scene.notes]
+
+
+def list_strategies(folder: str) -> int:
+    """The strategies that are installed, or those of a folder."""
+    root = Path(folder) if folder else strategies.installed_folder()
+    found = sorted(path.parent for path in root.glob("*/strategy.yaml"))
+    say(f"{len(found)} in {root}" if found else f"none in {root}")
+    for path in found:
+        try:
+            strategy = strategies.load(path)
+            say(f"  {path.name:<14} goal {strategy.goal.test}, {strategy.mode}: {strategy.description}")
+        except MagicError as error:
+            say(f"  {path.name:<14} cannot be used: {error}")
+    return 0 if found else 1
+
+
+# ------------------------------------------------------------ doctor
+
+
+def doctor(client: Client, given: argparse.Namespace) -> int:
+    """What is missing for the graph to work, and how to mend it."""
+    heard: dict[str, DiagnosticStatus] = {}
+
+    def listen(message: Any) -> None:
+        for status in message.status:
+            heard[status.name] = status
+
+    client.node.create_subscription(DiagnosticArray, "/diagnostics", listen, qos.RELIABLE)
+    wanted = _expected(client)
+    enough = time.monotonic() + LISTEN
+
+    def complete() -> bool:
+        return time.monotonic() > enough and all(there() == 1 for _, there, _ in wanted)
+
+    client.token.wait(complete, time.monotonic() + max(LISTEN, given.timeout), alive=lambda: None)
+    findings = list(environment_findings())
+    findings += [_server_finding(what, there(), mend) for what, there, mend in wanted]
+    findings += diagnostic_findings(heard, client.node.get_namespace())
+    for level, text, mend in findings:
+        say(f"{level:<5} {text}")
+        if mend and level != "ok":
+            say(f"      mend: {mend}")
+    bad = sum(level == "FAIL" for level, _, _ in findings)
+    say(f"{bad} to mend" if bad else "nothing is missing")
+    return 1 if bad else 0
+
+
+#: (ok, note or FAIL; what was found; how to mend it)
+Finding = tuple[str, str, str]
+
+
+def environment_findings() -> Iterator[Finding]:
+    """Of this process: middleware, domain, versions, what the features have to work with."""
+    rmw = os.environ.get("RMW_IMPLEMENTATION", "the default one")
+    where = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    yield "ok", f"ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}, discovery {where}, middleware {rmw}", ""
+    versions, missing = [], []
+    for module, package in MODULES.items():
+        if importlib.util.find_spec(module) is None:
+            missing.append(package)
+            continue
+        try:
+            versions.append(f"{package} {importlib.metadata.version(package)}")
+        except importlib.metadata.PackageNotFoundError:  # a distribution's own package has no such record
+            versions.append(f"{package} as installed by the system")
+    yield "ok", "versions: " + ", ".join(versions), ""
+    if missing:
+        yield "FAIL", "not installed here: " + ", ".join(missing), "bash ros2_ws/setup.sh, then source ros2_ws/env.sh"
+
+
+def _expected(client: Client) -> list[tuple[str, Callable[[], int], str]]:
+    """What has to be there: its name, how many there are, and how to start it."""
+    node = client.node
+    remotes = {
+        "matcher": client.service(MatchContact, "match_contact", "matcher"),
+        "planner": client.action(PlanMotion, "plan_motion", "planner"),
+        "verifier": client.action(VerifyMotion, "verify_motion", "verifier"),
+        "strategy_server": client.action(RunStrategy, "run_strategy", "strategy server"),
+    }
+    found: list[tuple[str, Callable[[], int], str]] = []
+    for name, (package, program) in NODES.items():
+        mend = f"ros2 run {package} {program}, or all at once: ros2 launch magic_bringup magic.launch.xml"
+        if name in remotes:
+            remote = remotes[name]
+            found.append((f"{name} ({remote.name})", lambda r=remote: len(r.servers()), mend))
+        else:
+            topic = node.resolve_topic_name("objects")
+            found.append((f"{name} ({topic})", lambda t=topic: node.count_publishers(t), mend))
+    return found
+
+
+def _server_finding(what: str, count: int, mend: str) -> Finding:
+    if count == 1:
+        return "ok", f"{what} is there", ""
+    if count == 0:
+        return "FAIL", f"{what} is not there", mend
+    return "FAIL", f"{what} is there {count} times", "end all but one: their answers cannot be told apart (ros2 node list)"
+
+
+def diagnostic_findings(heard: dict[str, DiagnosticStatus], namespace: str) -> list[Finding]:
+    """What the nodes of a namespace say about themselves."""
+    prefix = namespace.strip("/")
+    own = {n: s for n, s in sorted(heard.items()) if not prefix or n.startswith(f"{prefix}/")}
+    levels = {DiagnosticStatus.OK: "ok", DiagnosticStatus.WARN: "note"}
+    return [(levels.get(status.level, "FAIL"), f"{name}: {status.message}", "") for name, status in own.items()]
+
+
+# ------------------------------------------------------------ command line
+
+
+def _strategy_name(name: str) -> str:
+    """A folder's path whole: the server has another working directory."""
+    return str(Path(name).resolve()) if "/" in name else name
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    top = argparse.ArgumentParser(prog="magic", description="What the graph sees, matches, plans and verifies, from a terminal.")
+    top.add_argument("--version", action="version", version=f"magic {importlib.metadata.version('magic_bringup')}")
+    verbs = top.add_subparsers(dest="verb", required=True)
+    one = verbs.add_parser("run", help="use a tool as a demonstration showed it")
+    one.add_argument("strategy", help="hooking, hanging, scooping, or the folder of a strategy")
+    one.add_argument("--variant", default="arm", choices=VARIANTS, help="fg: a floating gripper; arm: the robot (default)")
+    one.add_argument("--tool", default="", help="object id of the tool (default: the matcher chooses)")
+    one.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
+    one.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
+    one.add_argument("--timeout", type=float, default=0.0, help="s for everything (default: the server's)")
+    one.add_argument("--out", type=Path, help="folder for pictures: the simulation, the heat map")
+    two = verbs.add_parser("match", help="find the corresponding contacts")
+    two.add_argument("strategy", help="hooking, hanging, scooping, or the folder of a strategy")
+    two.add_argument("--tool", nargs="+", default=[], help="object ids to choose the tool from (default: all)")
+    two.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
+    two.add_argument("--top-k", type=int, default=0, help="how many (default: the matcher's)")
+    two.add_argument("--timeout", type=float, default=60.0, help="s (default 60)")
+    three = verbs.add_parser("objects", help="what stands on the table")
+    three.add_argument("--timeout", type=float, default=10.0, help="s to wait for it (default 10)")
+    four = verbs.add_parser("strategies", help="what has been learned")
+    four.add_argument("--folder", default="", help="of strategies (default: the installed ones)")
+    five = verbs.add_parser("doctor", help="what is missing for the graph to work")
+    five.add_argument("--timeout", type=float, default=10.0, help="s for the nodes to be found (default 10)")
+    return top
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one verb; returns the exit status."""
+    plain = remove_ros_args(sys.argv if arguments is None else ["magic", *arguments])[1:]
+    given = parser().parse_args(plain)
+    try:
+        if given.verb == "strategies":
+            return list_strategies(given.folder)
+        with connected(arguments) as client:
+            # A run that nobody waits for any more is canceled, not left to the server.
+            before = signal.signal(signal.SIGINT, lambda *_: client.token.cancel())
+            try:
+                return {"run": run, "match": match, "objects": objects, "doctor": doctor}[given.verb](client, given)
+            finally:
+                signal.signal(signal.SIGINT, before)
+    except MagicError as error:
+        say(f"{error.code.name} ({int(error.code)}): {error.message}")
+        return 130 if error.code == Code.CANCELED else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
