@@ -205,15 +205,22 @@ class FloatingRun:
     it, the tool then stays where it is (or free, if it was released).  ``start``: the
     moment of the motion at which the run begins, after the tool has come along without
     touching anything.  ``tool_from_held``: where the tool is in the hand, seen from where
-    it is thought to be.
+    it is thought to be; ``thought``: the tool as it is thought to be.
     """
 
     variant = "fg"
 
-    def __init__(self, setup: Setup, plan: MotionPlan, start: float = 0.0, tool_from_held: NDArray[np.float64] | None = None) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        plan: MotionPlan,
+        start: float = 0.0,
+        tool_from_held: NDArray[np.float64] | None = None,
+        thought: Body | None = None,
+    ) -> None:
         motion = plan.tool_motion
         if tool_from_held is not None:
-            motion = replace(motion, world_from_tool=_clear_of_table(setup, motion.world_from_tool, tool_from_held))
+            motion = replace(motion, world_from_tool=_clear_of_table(setup, motion.world_from_tool, tool_from_held, thought or setup.tool))
         self.setup = setup
         self.phases = motion.phases
         self.duration = float(motion.times[-1] - motion.times[0])
@@ -318,16 +325,16 @@ class FloatingRun:
         return tuple(worst.values())
 
 
-def _clear_of_table(setup: Setup, poses: NDArray[np.float64], tool_from_held: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The poses (T, 4, 4) of a tool held otherwise than thought, raised together so that it goes no deeper into the table than 0, or
-    than it was planned to: a hand gives way to the table by what it is off."""
+def _clear_of_table(setup: Setup, poses: NDArray[np.float64], tool_from_held: NDArray[np.float64], thought: Body) -> NDArray[np.float64]:
+    """The poses (T, 4, 4) of a tool that is held otherwise, and shaped otherwise, than thought, raised together so that it goes no deeper
+    into the table than 0, or than it was planned to: a hand gives way to the table by what it is off."""
     held = poses @ tool_from_held
-    normal, corners = setup.table[:3], setup.tool.corners
+    normal = setup.table[:3]
 
-    def lowest(at: NDArray[np.float64]) -> float:
+    def lowest(at: NDArray[np.float64], corners: NDArray[np.float64]) -> float:
         return float(((normal @ at[:, :3, :3]) @ corners.T + (at[:, :3, 3] @ normal)[:, None]).min() + setup.table[3])
 
-    depth = min(0.0, lowest(poses)) - lowest(held)
+    depth = min(0.0, lowest(poses, thought.corners)) - lowest(held, setup.tool.corners)
     if depth > 0:
         held[:, :3, 3] += depth * normal
     return held

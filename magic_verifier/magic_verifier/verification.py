@@ -318,7 +318,7 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
         elif drawn is None:
             run = FloatingRun(setup, plan)
         else:
-            run = FloatingRun(setup, plan, _moving_from(task, setup), drawn.tool_from_held)
+            run = FloatingRun(setup, plan, _moving_from(task, setup), drawn.tool_from_held, task.setup.tool)
         setup = run.setup
         goal = goals.goal_test(strategy, run, np.random.default_rng([task.seed, index, 1]), None if drawn is None else drawn.nudge)
         recorder = _Recorder(run) if record else None

@@ -12,7 +12,7 @@ import yaml
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_verifier import uncertainty, verification
-from magic_verifier.floating import Body, make_setup
+from magic_verifier.floating import TABLE, Body, FloatingRun, make_setup
 from magic_verifier.goals import Judgement
 from magic_verifier.uncertainty import ShapeError, Spread
 from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, passes, verify, wilson
@@ -227,3 +227,18 @@ def test_the_parameter_that_separates_is_named():
     # One failure of 24 is the outermost of some parameter more often than not: nothing is named.
     (reason,) = verification.reasons(task, judged((order[0] + order[1]) / 2))
     assert reason == "1 of 24: the target slid off sideways"
+
+
+@pytest.mark.parametrize("thicker", [-0.006, 0.012])
+def test_a_hand_gives_way_to_the_table_by_what_the_tool_is_thicker(thicker):
+    strategy, tool, target, plan = scenes.hooking("L")
+    setup = make_setup(tool, target, (), scenes.TABLE, strategy.physics, DEFAULTS["fg"])
+    error = ShapeError(np.zeros(3), thicker, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
+    changed = replace(setup, tool=error.applied(setup.tool))
+
+    def deepest(run):
+        return max((i.depth for i in run.intrusions() if i.body == TABLE), default=0.0)
+
+    planned = deepest(FloatingRun(setup, plan))
+    assert deepest(FloatingRun(changed, plan, 0.0, np.eye(4), setup.tool)) <= planned + 1e-6
+    assert thicker < 0 or deepest(FloatingRun(changed, plan)) > planned + 0.003
