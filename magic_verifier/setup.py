@@ -24,6 +24,7 @@ setup(
             f"evaluate = {PACKAGE}.programs:evaluate",
             f"learn = {PACKAGE}.programs:learn",
             f"reality = {PACKAGE}.programs:reality",
+            f"benchmark = {PACKAGE}.programs:benchmark",
         ]
     },
 )

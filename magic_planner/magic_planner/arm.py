@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from magic_planner.collision import shell, solid_pieces
 from magic_planner.free_motion import FreeMotion
 from magic_planner.grasps import GraspSettings
 from magic_planner.hand_moves import HandMoves
+from magic_planner.margins import margins
 from magic_planner.object_motion import table_plane, tool_contact_frame, waypoint_times
 from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
 from magic_planner.robot import Robot
@@ -200,7 +202,9 @@ class ArmPlanner:
 
         feedback("grasp", "looking for grasps that serve the whole motion")
         failures = Failures()
-        lots = GraspChoice(robot, self.grasping, self.settings, request, tool_contact_frame(candidate, reflection)).lots()
+        tool_from_contact = tool_contact_frame(candidate, reflection)
+        choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact)
+        lots = choice.lots()
         chosen: list[Array] = []  # grasps of the attempts before, in order
         spare: list[Branch] = []  # those that close where one of these does, only from another side
         tried = 0
@@ -224,6 +228,8 @@ class ArmPlanner:
                     tried += 1
                     try:
                         plan = self._complete(request, branch, len(chosen) < attempt)
+                        if plan is not None:
+                            plan = self._with_margins(request, choice.grasping, tool_from_contact, plan)
                     except StageError as failure:
                         failures.add(failure.stage, failure.error)
                         if failure.stage == "approach" and failure.error.code == Code.PATH_IN_COLLISION:
@@ -239,6 +245,20 @@ class ArmPlanner:
                 Code.NO_GRASP, "stage grasp: attempt", attempt, f"0 to {len(chosen) - 1}: there are {len(chosen)} different grasps"
             )
         raise failures.error()
+
+    def _with_margins(self, request: Request, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
+        """The plan with its margins; raises StageError where one is negative."""
+        arm = plan.arm_motion
+        assert arm is not None
+        held = (arm.grasp_time, np.inf if arm.release_time is None else arm.release_time)
+        found = margins(
+            self.robot, grasping, request, arm.tool_from_tcp, tool_from_contact, arm.times, arm.positions, held, plan.tool_motion.phases
+        )
+        least = min(found, key=lambda margin: margin.left)
+        if least.left < 0:
+            code = Code.NO_GRASP if least.name == "grip" else Code.DYNAMIC_LIMIT
+            raise StageError("timing", MagicError(code, f"margin of {least}", f"{100 * least.left:.0f} % left", "0 % or more"))
+        return replace(plan, margins=found)
 
     def _complete(self, request: Request, branch: Branch, only_check: bool) -> MotionPlan | None:
         """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError."""

@@ -483,6 +483,34 @@ def _heights(
     return (in_hand @ points.T).min(axis=2) + np.einsum("gj,kj->kg", frames[:, :3, 3], up) + ground[:, None]
 
 
+def pad_share(
+    robot: Robot,
+    frames: NDArray[np.float64],
+    forces: NDArray[np.float64],
+    torques: NDArray[np.float64],
+    arm: NDArray[np.float64],
+    half: NDArray[np.float64],
+    grip: float,
+    friction: float,
+) -> NDArray[np.float64]:
+    """(G, K): the share of what the pads of G grasps can hold that K loads ask for: 1 is the verge of slipping.
+
+    Two patches pressed with N each (``grip``) hold by friction a force 2 mu N along the pads and a torque 2 mu N r about the closing
+    axis, r = ``arm`` (G,) the mean distance of a patch from its middle; and by the shift of the pressure within the patches
+    a torque 2 N h about the other axes, h = ``half`` (G, 2) their half extents.  forces (K, 3), torques (G, K, 3) about the grasp's
+    origin, in the tool's frame.  The shares are added up, which errs on the safe side.
+    """
+    index = "xy".index(robot.config.closing_axis)
+    closing, across, along = frames[:, :3, index], frames[:, :3, 1 - index], frames[:, :3, 2]
+    rub = friction * grip
+    tangential = np.linalg.norm(forces[None] - (forces @ closing.T).T[..., None] * closing[:, None], axis=2)
+    about = [np.abs(np.einsum("gkj,gj->gk", torques, axis)) for axis in (closing, across, along)]
+    share = tangential / (2 * rub) + about[0] / (2 * rub * arm)[:, None]
+    # A torque about the line across the fingers moves the pressure along them, and the other way round.
+    share += about[1] / (2 * grip * half[:, 1])[:, None] + about[2] / (2 * grip * half[:, 0])[:, None]
+    return np.asarray(share)
+
+
 class _Terms:
     """The terms of a grasp's cost, each about 1 where it begins to matter."""
 
@@ -523,26 +551,13 @@ class _Terms:
         )
 
     def used(self, robot: Robot, frames: NDArray[np.float64], arm: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(G,) the share of what the pads can hold that the motion asks for, at its worst: 1 is the verge of slipping.
-
-        Two patches pressed with N each hold by friction a force 2 mu N along the pads and a torque 2 mu N r about the closing
-        axis, r = ``arm`` (G,) the mean distance of a patch from its middle; and by the shift of the pressure within the patches
-        a torque 2 N h about the other axes, h = ``half`` (G, 2) their half extents.  The loads: the tool's weight at each of the
-        motion's poses, without and with the contact's push.  The three shares are added up, which errs on the safe side.
-        """
-        index = "xy".index(robot.config.closing_axis)
-        origin, closing, across, along = frames[:, :3, 3], frames[:, :3, index], frames[:, :3, 1 - index], frames[:, :3, 2]
+        """(G,) :func:`pad_share` at its worst: of the tool's weight at each of the motion's poses, without and with the contact's push."""
+        origin = frames[:, :3, 3]
         forces = np.concatenate([self.weights, self.weights + self.force])
         hang = np.cross((self.centre - origin)[:, None], self.weights[None])
         push = np.cross(self.contact - origin, self.force)[:, None]
         torques = np.concatenate([hang, hang + push], axis=1)  # (G, 2K, 3)
-        grip, rub = self.grip, self.friction * self.grip
-        tangential = np.linalg.norm(forces[None] - (forces @ closing.T).T[..., None] * closing[:, None], axis=2)
-        about = [np.abs(np.einsum("gkj,gj->gk", torques, axis)) for axis in (closing, across, along)]
-        share = tangential / (2 * rub) + about[0] / (2 * rub * arm)[:, None]
-        # A torque about the line across the fingers moves the pressure along them, and the other way round.
-        share += about[1] / (2 * grip * half[:, 1])[:, None] + about[2] / (2 * grip * half[:, 0])[:, None]
-        return np.asarray(share.max(axis=1))
+        return np.asarray(pad_share(robot, frames, forces, torques, arm, half, self.grip, self.friction).max(axis=1))
 
     def of_approach(self, frames: NDArray[np.float64], back: NDArray[np.float64]) -> NDArray[np.float64]:
         """(G,): an approach that is not from above, fingers drawn back by ``back`` metres."""

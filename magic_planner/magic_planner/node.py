@@ -105,6 +105,8 @@ class PlannerNode(Node):
             result.plan = convert.plan_to_msg(plan, goal.tool.id, self._base)
             end = (plan.arm_motion or plan.tool_motion).times[-1]
             result.code, result.message = int(Code.OK), f"a motion of {end:.1f} s in {len(plan.tool_motion.phases)} phases"
+            if plan.margins:
+                result.message += "; used at most: " + "; ".join(map(str, sorted(plan.margins, key=lambda margin: margin.left)))
         except Exception as error:  # into the answer, and into the log with the goal's name
             result.code, result.message = describe(self, error)
         name, seconds = Code(result.code).name, time.monotonic() - started

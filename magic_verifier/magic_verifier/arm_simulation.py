@@ -3,12 +3,13 @@
 The arm is an articulation with PD joint drives, gravity and Coriolis torques fed
 forward, and the effort limits of its URDF, as a position-controlled arm has.  Which
 arm and which gripper: :class:`magic_core.robot.Description`, the Panda where none is
-given.  The tool is a free body from the start and is held by nothing but the friction
-of the fingers.
+given.  The tool is a free body from the start; the fingers close on it, and what
+they have closed on is held by no more than their friction (:mod:`magic_verifier.grip`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,22 +22,40 @@ from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.robot import Description
 from magic_verifier.articulation import ARM, FINGERS, ArmOptions, Articulation, panda
-from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, Setup, fill_world, lifted_onto_table, phase_at, phase_start
-from magic_verifier.simulation import DYNAMIC, KINEMATIC
+from magic_verifier.floating import (
+    CONTACT_PHASES,
+    PUSHED_OUT,
+    TABLE,
+    TARGET,
+    TOOL,
+    Setup,
+    fill_world,
+    lifted_onto_table,
+    phase_at,
+    phase_start,
+)
+from magic_verifier.grip import SOFTNESS, Grip, Patch, patch_of
+from magic_verifier.simulation import DYNAMIC
 
 #: Tracking, torque, contacts and grasp are looked at every so many steps.
 WATCH_EVERY = 6
-#: Where a run begins with the tool in the hand the fingers begin farther apart by this (m), for a tool thicker than thought.
-WIDER = 0.008
+#: Where a run begins with the tool in the hand the fingers are farther apart by this (m), for a tool thicker than thought.
+WIDER = 0.004
+#: The fingers have come to a stop when they are no nearer than so many metres to where they were so many seconds before; a stiff
+#: contact makes them tremble meanwhile.
+STOPPED, LOOK_BACK = 0.0003, 0.05
+#: An arm that has let go and come to the end of its motion is left to stand still, unsolved, after so many seconds.
+ASLEEP = 0.15
 
 
 @dataclass(frozen=True)
 class Held:
-    """A tool in the hand: the moment of the trajectory in s, tool_from_tcp (4, 4), metres between the fingers."""
+    """A tool in the hand: the moment of the trajectory in s, tool_from_tcp (4, 4), metres between the fingers, where the pads touch it."""
 
     time: float
     tool_from_tcp: NDArray[np.float64]
     width: float
+    patch: Patch
 
 
 class ArmRun:
@@ -44,7 +63,7 @@ class ArmRun:
 
     ``time`` is the clock of the planned trajectory, which stands still while the
     gripper closes; ``world.time`` goes on.  With ``held`` the run begins at that moment
-    of the trajectory with the tool in the hand, where the fingers close on it anew.
+    of the trajectory, arm and tool as fast as they are then, the tool in the hand.
     ``lag``: seconds by which the arm follows its command late.
     """
 
@@ -78,29 +97,40 @@ class ArmRun:
         start = phase_start(self.phases, CONTACT_PHASES)
         self.contact_time = self.duration if start is None else start
         self._motion = motion
-        self.world = fill_world(setup, DYNAMIC if held is None else KINEMATIC)
+        self.world = fill_world(setup, DYNAMIC)
         self._arm = Articulation(self.world, robot, self.options)
-        self._slides = np.array([joint.sliding for joint in robot.arm])
-        self._held = held
+        self._obstacles = frozenset((TARGET, *(o.id for o in setup.obstacles)))
         self._lag = round(lag * setup.settings.frequency)
         frequency = setup.settings.frequency
         clock = times[0] + np.arange(int(np.ceil(self.duration * frequency)) + 1) / frequency
         self._q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
         self._qd = np.gradient(self._q, 1.0 / frequency, axis=0) if len(self._q) > 1 else np.zeros_like(self._q)
+        self._positions, self._velocities = self._q.tolist(), self._qd.tolist()
         self._index = self._first = 0
         self._hold = 0.0
+        self._widths: list[float] = []  # between the closing fingers, step by step
         self._quiet = 0.0
-        self._closing = self._closed = self._open_again = False
-        self._reference: NDArray[np.float64] | None = None
+        self._closed = self._open_again = self._standing = self._asleep = False
+        self._after = round(ASLEEP * frequency)
+        self._grip: Grip | None = None
+        self._patch: Patch | None = None
+        self._friction = (self.options.finger_friction + setup.physics.friction) / 2  # of a pair, as the engine has it
+        self._from_reference: Any = None  # tcp from tool, when the grip was made
         self._let_go_at: NDArray[np.float64] | None = None
+        sliding, turning = ("tracking_error_slide", limits.tracking_slide, "m"), ("tracking_error", limits.tracking, "rad")
+        self._tracking = [sliding if joint.sliding else turning for joint in robot.arm]
         self._torque = np.zeros(len(robot.names))
-        self._metrics = {"torque_ratio": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
+        self._metrics = {"torque_ratio": 0.0, "grip_load": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
         if held is None:
             self._arm.place(self._q[0])
+            self._arm.open_fingers()
         else:
             self._index = self._first = min(round(held.time * frequency), len(self._q) - 1)
             self._arm.place(self._q[self._index], held.width + WIDER)
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(held.tool_from_tcp))
+            self._closed = True
+            self._take(held.patch)
+            self._set_off()
 
     # ------------------------------------------------------------ what the goal tests ask
 
@@ -125,9 +155,9 @@ class ArmRun:
 
     def held(self) -> Held | None:
         """The tool in the hand at this moment, to begin another run from; ``None`` where it is not."""
-        if self._reference is None or self._open_again:
+        if self._patch is None or self._open_again:
             return None
-        return Held(self.time, self._tool_from_tcp(), self._arm.width())
+        return Held(self.time, self._tool_from_tcp(), self._arm.width(), self._patch)
 
     def joints(self) -> NDArray[np.float64]:
         """(J + 2,): the arm's joints in rad (m), then the fingers in m."""
@@ -141,37 +171,75 @@ class ArmRun:
 
     def advance(self) -> None:
         """One step."""
+        if self._asleep:
+            self.world.step()
+            self._index += 1
+            return
         row = min(max(self._index - self._lag, self._first), len(self._q) - 1)
         waiting = self._gripper()
         still = waiting or self._index >= len(self._q)
-        command = self._q[row]
-        (self._arm.close_fingers if self._closing else self._arm.open_fingers)()
-        self._arm.command(command, np.zeros_like(command) if still else self._qd[row])
+        if not still:
+            self._arm.command(self._positions[row], self._velocities[row])
+        else:
+            self._arm.command(self._positions[row], None if self._standing else [0.0] * self._q.shape[1])
+        self._standing = still
         self.world.step()
         if not waiting:
             self._index += 1
+        if self._let_go_at is not None and self._index == len(self._q) + self._lag + self._after:
+            self._asleep = self._arm.sleeps()
         if self.world.steps % WATCH_EVERY == 0:
-            self._watch(command)
+            self._watch(self._positions[row])
 
     def _gripper(self) -> bool:
         """Open and close on time; whether the arm has to wait for the fingers."""
         if self.release_time is not None and self.time >= self.release_time and not self._open_again:
-            self._open_again, self._closing = True, False
+            self._open_again = True
             self._let_go_at = self._arm.tcp()[:3, 3].copy()
+            if self._grip is not None:
+                self._grip.open()
+                self._arm.lets_go(self.world.component(TOOL))
+                self.world.component(TOOL).max_depenetration_velocity = PUSHED_OUT
+            self._arm.open_fingers()
         if self._closed or self._open_again or self.time < self.grasp_time:
             return False
-        self._closing = True
         dt = self.world.timestep
         self._hold += dt
-        self._quiet = self._quiet + dt if self._arm.finger_speed() < 0.002 and self._hold > 0.05 else 0.0
-        if self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
+        self._widths.append(self._arm.width())
+        before = self._widths[max(0, len(self._widths) - 1 - round(LOOK_BACK / dt))]
+        slow = self._hold > LOOK_BACK and abs(self._widths[-1] - before) < STOPPED
+        self._quiet = self._quiet + dt if slow else 0.0
+        if slow:
+            patch = self._touched()
+            if patch is not None:
+                self._take(patch)
+                self._arm.rest_fingers()
+        if self._grip is not None or self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
             self._closed = True
-            if self._held is not None:
-                self.world.let_go(TOOL)
-                self._set_off()
-            self._note_grasp()
+            if self._grip is None:
+                raise MagicError(
+                    Code.GRASP_SLIPPED,
+                    f"the gripper closed on nothing at {self.time:.2f} s",
+                    f"width {self._arm.width() * 1000:.1f} mm",
+                    f"both fingers on the tool, {self._motion.grasp_width * 1000:.1f} mm apart",
+                )
             return False
+        self._arm.close_fingers()
         return True
+
+    def _touched(self) -> Patch | None:
+        """Where both pads touch the tool; ``None`` where they do not hold it between them."""
+        touches = self.world.touches(TOOL, FINGERS, SOFTNESS)
+        return patch_of(touches, self._arm.tcp(), "xy".index(self.robot.config.closing_axis), self._friction)
+
+    def _take(self, patch: Patch) -> None:
+        """The tool is held, as it is between the pads."""
+        self._patch = patch
+        self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
+        self._from_reference = self._arm.tcp_pose.inv() * self.world.component(TOOL).entity_pose
+        self._metrics["grip_width"] = self._arm.width()
+        planned = np.asarray(self._motion.tool_from_tcp, dtype=float)
+        self._metrics["grasp_shift"] = float(np.linalg.norm((transforms.inverse(planned) @ self._tool_from_tcp())[:3, 3]))
 
     def _set_off(self) -> None:
         """Arm and tool as fast as they are at this moment of the trajectory, which the run begins in the middle of."""
@@ -184,49 +252,34 @@ class ArmRun:
         self.world.set_velocity(TOOL, (transforms.apply(step, middle) - middle) / dt)
         self.world.set_turning(TOOL, Rotation.from_matrix(step[:3, :3]).as_rotvec() / dt)
 
-    def _note_grasp(self) -> None:
-        width = self._arm.width()
-        self._metrics["grip_width"] = width
-        self._reference = self._tool_from_tcp()
-        planned = np.asarray(self._motion.tool_from_tcp, dtype=float)
-        self._metrics["grasp_shift"] = float(np.linalg.norm((transforms.inverse(planned) @ self._reference)[:3, 3]))
-        if not self.world.touching(TOOL, FINGERS, 0.001):
-            raise MagicError(
-                Code.GRASP_SLIPPED,
-                f"the gripper closed on nothing at {self.time:.2f} s",
-                f"width {width * 1000:.1f} mm",
-                f"both fingers on the tool, {self._motion.grasp_width * 1000:.1f} mm apart",
-            )
-
     def _tool_from_tcp(self) -> NDArray[np.float64]:
         return transforms.inverse(self.world.pose(TOOL)) @ self._arm.tcp()
 
-    def _watch(self, command: NDArray[np.float64]) -> None:
-        q, qd = self._arm.arm_state()
-        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(qd))):
-            raise MagicError(
-                Code.SIMULATION_EXPLODED, f"state of the arm at {self.time:.2f} s", "not a number", "finite joint positions and velocities"
-            )
-        self._watch_tracking(q - command)
+    def _watch(self, command: list[float]) -> None:
+        self._watch_tracking(self._arm.lags(command))
         self._watch_torque()
         self._watch_contacts()
         self._watch_grasp()
 
-    def _watch_tracking(self, error: NDArray[np.float64]) -> None:
-        lag, slides = np.abs(error), self._slides
-        for name, lags in (("tracking_error", lag[~slides]), ("tracking_error_slide", lag[slides])):
-            if len(lags):
-                self._metrics[name] = max(self._metrics.get(name, 0.0), float(lags.max()))
-        allowed = np.where(slides, self.limits.tracking_slide, self.limits.tracking)
-        worst = int((lag / allowed).argmax())
-        if lag[worst] > allowed[worst]:
-            unit = "m" if slides[worst] else "rad"
-            raise MagicError(
-                Code.LIMIT_EXCEEDED,
-                f"{self.robot.names[worst]} lags behind its command at {self.time:.2f} s ({self.phase})",
-                f"{lag[worst]:.3f} {unit}",
-                f"up to {allowed[worst]:g} {unit}",
-            )
+    def _watch_tracking(self, lags: list[float]) -> None:
+        metrics = self._metrics
+        for joint, (lag, (name, allowed, unit)) in enumerate(zip(lags, self._tracking, strict=True)):
+            if lag > metrics.get(name, 0.0):
+                metrics[name] = lag
+            if lag > allowed:
+                raise MagicError(
+                    Code.LIMIT_EXCEEDED,
+                    f"{self.robot.names[joint]} lags behind its command at {self.time:.2f} s ({self.phase})",
+                    f"{lag:.3f} {unit}",
+                    f"up to {allowed:g} {unit}",
+                )
+            if not lag <= allowed:
+                raise MagicError(
+                    Code.SIMULATION_EXPLODED,
+                    f"state of the arm at {self.time:.2f} s",
+                    "not a number",
+                    "finite joint positions and velocities",
+                )
 
     def _watch_torque(self) -> None:
         # Averaged over about 0.1 s: a real arm stops when the limit is exceeded for longer.
@@ -246,21 +299,21 @@ class ArmRun:
 
     def _watch_contacts(self) -> None:
         early = self.time < self.contact_time
-        for other in (TARGET, *(o.id for o in self.setup.obstacles), TABLE):
-            parts = (ARM,) if other == TABLE else (ARM, FINGERS)
-            for part in parts:
-                if self.world.touching(part, other, -self.limits.overlap):
+        for part in (ARM, FINGERS):
+            for other in self.world.touched_by(part, -self.limits.overlap):
+                if other in self._obstacles or (other == TABLE and part == ARM):
                     raise MagicError(
                         Code.PRE_CONTACT_COLLISION if early else Code.LIMIT_EXCEEDED,
                         f"the {'hand' if part == FINGERS else part} hit the {other} at {self.time:.2f} s ({self.phase})",
                     )
 
     def _watch_grasp(self) -> None:
-        if self._reference is None or self._open_again:
+        if self._grip is None or self._open_again:
             return
-        drift = transforms.inverse(self._reference) @ self._tool_from_tcp()
-        slip = float(np.linalg.norm(drift[:3, 3]))
-        turn = float(np.arccos(np.clip((np.trace(drift[:3, :3]) - 1) / 2, -1, 1)))
+        self._metrics["grip_load"] = max(self._metrics["grip_load"], self._grip.load())
+        drift = self._from_reference * self.world.component(TOOL).entity_pose.inv() * self._arm.tcp_pose
+        slip = math.hypot(*drift.p.tolist())
+        turn = 2 * math.acos(min(abs(float(drift.q[0])), 1.0))
         self._metrics["grasp_slip"] = max(self._metrics["grasp_slip"], slip)
         self._metrics["grasp_turn"] = max(self._metrics["grasp_turn"], turn)
         if slip > self.limits.slip or turn > self.limits.slip_angle:

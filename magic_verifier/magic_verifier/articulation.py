@@ -13,17 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_core.robot_pictures import shape_mesh
-from magic_verifier.simulation import World, from_pose
+from magic_verifier.grip import Grip, Patch
+from magic_verifier.simulation import World, engine, from_pose
 
 ARM = "arm"
 FINGERS = "fingers"
+#: Force (N) that moves any tool of a kilogram over the table, so that fingers centre it before they press on it.
+SOFTLY = 8.0
 #: What of the arm never moves and may well stand on the table.
 BASE = "base"
-#: PhysX's filter has so many bits for sets of links that may touch each other.
-GROUPS = 32
+#: PhysX's filter has so many bits for sets of links that may touch each other, and one more: a hand and the tool that it holds.
+GROUPS = 31
+HELD = 1 << GROUPS
 #: What a link of unknown size is taken for where its inertia is not given: edge of a cube in metres.
 UNKNOWN_SIZE = 0.1
 
@@ -34,10 +39,10 @@ class ArmOptions:
 
     stiffness Nm/rad and damping Nms/rad (N/m and Ns/m where a joint slides) of the arm's joint drives, one for
     each joint or one for all (the defaults are those of Franka's joint impedance controller, near critical
-    damping); armature kg m^2 is what the geared motors add to each joint's inertia; grip_force N of each
-    finger; finger_stiffness N/m couples the two fingers, which a belt does in the real hand; closing_speed m/s
-    of each free finger; quiet s for which the fingers must stand still before the arm goes on, closing_time s
-    after which it goes on anyway.
+    damping); armature kg m^2 is what the geared motors add to each joint's inertia; grip_force N with which each
+    finger presses on what it has closed on; finger_stiffness N/m couples the two fingers, which a belt does in
+    the real hand; closing_speed m/s of each free finger; quiet s for which the fingers must stand still before
+    they have closed on nothing, closing_time s after which they have anyway.
     """
 
     stiffness: tuple[float, ...] = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
@@ -56,6 +61,11 @@ class ArmOptions:
             if not values or not all(np.isfinite(v) and v > 0 for v in values):
                 raise MagicError(Code.BAD_REQUEST, f"arm {name}", values, "numbers above 0")
             object.__setattr__(self, name, values)
+
+    @property
+    def closing_force(self) -> float:
+        """N with which each finger closes until both touch: a hand that is to grip does so slowly and softly, and then presses."""
+        return min(self.grip_force, SOFTLY)
 
     def gains(self, robot: Description) -> list[tuple[float, float]]:
         """Stiffness and damping of each joint of the arm; raises BAD_REQUEST where there are more or fewer than joints."""
@@ -98,7 +108,7 @@ class Articulation:
         for joint in self._finger_joints:
             joint.set_drive_properties(
                 options.finger_stiffness,
-                options.grip_force / options.closing_speed,
+                options.closing_force / options.closing_speed,
                 force_limit=max(200.0, 3 * options.grip_force),
                 mode="force",
             )
@@ -109,6 +119,12 @@ class Articulation:
         # What a joint transmits about its axis, or along it where it slides: the axis is x of the engine's joint frames.
         self._component = [0 if joint.sliding else 3 for joint in robot.arm]
         self._tcp = body.find_link_by_name(robot.config.move_group)
+        self.hand = body.find_link_by_name(robot.fingers[0].parent)
+        #: Of the hand, in which the tool is.
+        self._gripper = [link for link in body.links if link.name in robot.finger_links] + [self.hand]
+        self._targets = [joint.set_drive_target for joint in self._arm_joints]
+        self._speeds = [joint.set_drive_velocity_target for joint in self._arm_joints]
+        self._finger_targets = [joint.set_drive_target for joint in self._finger_joints]
         strokes = np.abs(robot.opened - robot.closed)
         self._closed, self._opened = robot.closed.astype(np.float32), robot.opened.astype(np.float32)
         #: Of each finger: which way it opens, and its share of the way.
@@ -142,10 +158,10 @@ class Articulation:
         velocities[self._arm] = speed
         self.body.set_qvel(velocities)
 
-    def arm_state(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions and velocities of the arm's joints, (J,) each, rad or m, and per second."""
-        q, speed = np.asarray(self.body.qpos, dtype=float).ravel(), np.asarray(self.body.qvel, dtype=float).ravel()
-        return q[self._arm], speed[self._arm]
+    def lags(self, command: list[float]) -> list[float]:
+        """(J,): how far each of the arm's joints is from its command, rad or m."""
+        found = self.body.qpos.tolist()
+        return [abs(found[index] - position) for index, position in zip(self._arm, command, strict=True)]
 
     def joints(self) -> NDArray[np.float64]:
         """(J + 2,): the arm's joints in rad (m), then the fingers in m."""
@@ -159,58 +175,90 @@ class Articulation:
         """Metres between the fingers."""
         return float(self._opened_by().sum()) + self._rest
 
-    def finger_speed(self) -> float:
-        """Of the faster finger, m/s."""
-        return float(np.abs(np.asarray(self.body.qvel).ravel()[self._fingers]).max())
-
     def tcp(self) -> NDArray[np.float64]:
         """world_from_tcp (4, 4)."""
         return from_pose(self._tcp.entity_pose)
 
-    def transmitted(self) -> NDArray[np.float64]:
+    @property
+    def tcp_pose(self) -> Any:
+        """The same as the engine's pose."""
+        return self._tcp.entity_pose
+
+    def transmitted(self) -> NDArray[np.float32]:
         """(J,): the torque about (the force along) the axis that each of the arm's joints carries, Nm (N)."""
-        return np.asarray(self.body.get_link_incoming_joint_forces(), dtype=float)[self._driven, self._component]
+        return self.body.get_link_incoming_joint_forces()[self._driven, self._component]  # type: ignore[no-any-return]
 
     # ------------------------------------------------------------ drives
 
-    def command(self, q: NDArray[np.float64], speed: NDArray[np.float64]) -> None:
-        """Set the drives of the arm, and feed gravity and Coriolis torques forward."""
-        for joint, position, velocity in zip(self._arm_joints, q.tolist(), speed.tolist(), strict=True):
-            joint.set_drive_target(position)
-            joint.set_drive_velocity_target(velocity)
+    def command(self, q: list[float], speed: list[float] | None) -> None:
+        """Set the drives of the arm to positions (J,) and velocities (J,) (``None``: as before), and feed gravity and Coriolis torques
+        forward."""
+        for target, position in zip(self._targets, q, strict=True):
+            target(position)
+        if speed is not None:
+            for target, velocity in zip(self._speeds, speed, strict=True):
+                target(velocity)
         self.body.set_qf(self.body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
 
     def open_fingers(self) -> None:
         """Drive the fingers to where they are open."""
-        for joint, position in zip(self._finger_joints, self._opened.tolist(), strict=True):
-            joint.set_drive_target(position)
+        for target, position in zip(self._finger_targets, self._opened.tolist(), strict=True):
+            target(position)
 
     def close_fingers(self) -> None:
-        """Drive both fingers to their mean less the way that gives the grip force.
+        """Drive both fingers to their mean less the way that gives the closing force.
 
         What moves them together is resisted by that force alone, what moves one against the other by the stiffness.
         """
         opened = self._opened_by()
-        target = 0.5 * float(opened[0] + opened[1]) - self._options.grip_force / self._options.finger_stiffness
-        for joint, closed, outward in zip(self._finger_joints, self._closed.tolist(), self._outward.tolist(), strict=True):
-            joint.set_drive_target(closed + outward * target)
+        mean = 0.5 * float(opened[0] + opened[1]) - self._options.closing_force / self._options.finger_stiffness
+        for target, closed, outward in zip(self._finger_targets, self._closed.tolist(), self._outward.tolist(), strict=True):
+            target(closed + outward * mean)
+
+    def rest_fingers(self) -> None:
+        """Drive the fingers to where they are."""
+        for target, position in zip(self._finger_targets, self.joints()[-2:].tolist(), strict=True):
+            target(position)
+
+    def sleeps(self) -> bool:
+        """Let the engine leave the arm where it is, until something hits it; whether it does."""
+        speed = np.zeros(self._size, np.float32)
+        self.body.set_qvel(speed)
+        self.body.sleep_threshold = 1e6
+        for link in self.body.links:
+            link.put_to_sleep()
+        return bool(self.body.links[-1].sleeping)
+
+    # ------------------------------------------------------------ grip
+
+    def grips(self, tool: Any, patch: Patch, friction: float) -> Grip:
+        """Hold a tool (the engine's body) where it is between the pads, which leave it to the joint until :meth:`lets_go`."""
+        hand_from_tcp = transforms.inverse(from_pose(self.hand.entity_pose)) @ self.tcp()
+        self._ignore(tool, True)
+        hand_from_patch = hand_from_tcp @ patch.tcp_from_patch
+        return Grip(self.hand, hand_from_patch, tool, patch, self._options.grip_force, friction, self._world.timestep)
+
+    def lets_go(self, tool: Any) -> None:
+        """Hand and tool collide again."""
+        self._ignore(tool, False)
+
+    def _ignore(self, tool: Any, ignored: bool) -> None:
+        for body in (tool, *self._gripper):
+            for shape in body.collision_shapes:
+                first, second, together, group = shape.get_collision_groups()
+                together = together | HELD if ignored else together & ~HELD
+                shape.set_collision_groups([first, second, together, group])
 
 
 def _load(world: World, robot: Description) -> Any:
-    from sapien.wrapper.urdf_loader import URDFLoader
-
-    text, groups = _prepared(robot)
-    loader = URDFLoader()
-    loader.set_scene(world.scene)
-    loader.fix_root_link = True
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "arm.urdf"
-        path.write_text(text)
-        try:
-            body = loader.load(str(path))
-        except Exception as error:  # the loader raises whatever a file brings up
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", reason, "a URDF that SAPIEN loads") from error
+    builder, groups = _prepared(robot)
+    builder.set_scene(world.scene)
+    try:
+        body = builder.build()
+    except Exception as error:  # the engine raises whatever a file brings up
+        raise _unloadable(robot, error) from error
+    finally:
+        builder.set_scene(None)  # a world that has ended is not kept
     body.set_solver_position_iterations(world.settings.position_iterations)
     body.set_solver_velocity_iterations(world.settings.velocity_iterations)
     for link in body.links:
@@ -228,13 +276,33 @@ def _load(world: World, robot: Description) -> Any:
     return body
 
 
+def _unloadable(robot: Description, error: Exception) -> MagicError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", reason, "a URDF that SAPIEN loads")
+
+
 @lru_cache(maxsize=4)
-def _prepared(robot: Description) -> tuple[str, dict[str, int]]:
-    """The URDF as the engine takes it, and the bits of its filter for each link."""
+def _prepared(robot: Description) -> tuple[Any, dict[str, int]]:
+    """The engine's builder of the arm, read once, and the bits of its filter for each link."""
+    from sapien.wrapper.urdf_loader import URDFLoader
+
     tree = robot.tree()
     for link in tree.iterfind("link"):
         _complete_inertia(robot, link)
-    return ET.tostring(tree, encoding="unicode"), collision_groups(robot)
+    sapien = engine()
+    loader = URDFLoader()
+    loader.set_scene(sapien.Scene([sapien.physx.PhysxCpuSystem()]))
+    loader.fix_root_link = True
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.urdf"
+        path.write_text(ET.tostring(tree, encoding="unicode"))
+        try:
+            builders, others, _ = loader.parse(str(path))
+        except Exception as error:  # the loader raises whatever a file brings up
+            raise _unloadable(robot, error) from error
+    if len(builders) != 1 or others:
+        raise MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", f"{len(builders) + len(others)} separate bodies", "one")
+    return builders[0], collision_groups(robot)
 
 
 def _complete_inertia(robot: Description, link: ET.Element) -> None:

@@ -99,6 +99,7 @@ class Options:
     set: str = "own"
     turns: int = 1
     demonstration: str = ""
+    required_rate: float = 0.7
 
 
 def tool_names(options: Options) -> list[str]:

@@ -29,7 +29,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
-from magic_verifier import captured, placing
+from magic_verifier import captured, placing, reliability
 from magic_verifier.cases import (
     BASELINES,
     METHODS,
@@ -50,7 +50,7 @@ from magic_verifier.cases import (
 )
 from magic_verifier.feasibility import impossible
 from magic_verifier.floating import settled
-from magic_verifier.verification import Verdict, wilson
+from magic_verifier.verification import Limits, Verdict, wilson
 
 #: Sideways velocity noise of hooking in target radii, the released code's own test.
 HOOK_NOISE = 1.0
@@ -279,17 +279,18 @@ def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: 
 
 
 def _judge(options: Options, case: Case, problem: _Problem | None, runs: list[_Tried], answer: dict[str, Any]) -> None:
-    """What would truly have come of the motions: of the verified one; else of each that was refused, until one succeeds."""
+    """What would truly have come of the motions, of each that was tried; ``true_success``: of the verified one, else of any that was
+    refused."""
     answer["true"], answer["true_success"] = [], False
     if problem is None or problem.layout is None:
         return
-    for run in runs[-1:] if answer["success"] else runs:
+    for run in runs:
         strategy, deadline = _strategy(options, run.name), time.monotonic() + 120.0
         verdict = captured.judge(strategy, problem.layout, case.tools.index(run.name), run.tool, run.plan, options.seed, deadline)
-        answer["true"].append({"code": verdict.code.name, "message": verdict.message})
-        if verdict.success:
-            answer["true_success"] = True
-            return
+        said = {"rate": run.verdict.success_rate, "rate_low": run.verdict.rate_low, "rollouts": len(run.verdict.runs)}
+        answer["true"].append({"code": verdict.code.name, "message": verdict.message, "verified": run.verdict.success, **said})
+    succeeded = [entry["code"] == Code.OK.name for entry in answer["true"]]
+    answer["true_success"] = bool(succeeded) and (succeeded[-1] if answer["success"] else any(succeeded))
 
 
 def _reference(strategy: Strategy) -> Any:
@@ -329,7 +330,9 @@ def _try(
         return {"code": error.code.name, "message": error.message, "stage": "plan"}, None
     finally:
         seconds["plan"] += time.perf_counter() - started
-    verdict = verify(strategy, tool, target, obstacles, table, candidate, plan, seed=options.seed, deadline=time.monotonic() + 180.0)
+    limits = Limits(required_rate=options.required_rate)
+    deadline = time.monotonic() + 180.0
+    verdict = verify(strategy, tool, target, obstacles, table, candidate, plan, seed=options.seed, deadline=deadline, limits=limits)
     seconds["verify"] += verdict.seconds
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}
@@ -381,7 +384,14 @@ def summarise(options: Options, done: list[dict[str, Any]]) -> dict[str, Any]:
     }
     if options.source == "images":
         summary["truth"] = truths(done)
+        summary["reliability"] = reliability.rows(judged(done))
     return summary
+
+
+def judged(done: list[dict[str, Any]]) -> list[reliability.Judged]:
+    """Every motion that was simulated, verified or not, with what truly came of it."""
+    entries = [entry for case in done for entry in case.get("true", ())]
+    return [reliability.Judged(e["rate"], e["rate_low"], e["rollouts"], e["code"] == Code.OK.name) for e in entries]
 
 
 def truths(done: list[dict[str, Any]]) -> dict[str, Any]:
@@ -482,6 +492,8 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
             options.features,
             "dinov2, which has a PCA and patches to leave out",
         )
+    if not 0 <= options.required_rate < 1:
+        raise MagicError(Code.BAD_REQUEST, "required rate", options.required_rate, "0 or more, below 1")
     todo = all_cases(options)[: limit or None]
     (out / "cases").mkdir(parents=True, exist_ok=True)
     # What is stored belongs to these options only.
@@ -523,6 +535,11 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
             f"on the true objects: {truth['verified_and_succeeds']} of {verified} verified motions succeed{share}; of those refused "
             f"{truth['refused_but_would_succeed']} would have succeeded, {truth['refused_and_fails']} not\n"
         )
+        motions = judged(done)
+        text += f"every simulated motion on the true objects:\n{reliability.table(motions)}\n"
+        title = f"{options.task}, {options.variant}: {len(motions)} motions (number at each point)"
+        said, true = "success rate in simulation", "share that truly succeeds"
+        reliability.draw(reliability.points(motions), out / "reliability.png", title, said, true)
     (out / "summary.txt").write_text(text)
     if films:
         contact_sheet(out / "films", done, True, out / "successes.png")
@@ -556,6 +573,12 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--limit", type=int, default=0, help="only the first so many cases")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
+    parser.add_argument(
+        "--required-rate",
+        type=float,
+        default=Options.required_rate,
+        help="lower end of the success rate's interval that a motion must have",
+    )
     parser.add_argument("--top-k", type=int, default=3, help="candidates tried for a case")
     parser.add_argument(
         "--noise", type=float, default=None, help=f"hooking: sideways velocity noise in target radii; {HOOK_NOISE:g} by default"

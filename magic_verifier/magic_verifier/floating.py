@@ -340,15 +340,22 @@ def _clear_of_table(setup: Setup, poses: NDArray[np.float64], tool_from_held: ND
     return held
 
 
-def nears(setup: Setup, poses: NDArray[np.float64], times: NDArray[np.float64], within: float) -> float | None:
-    """The first of the times (T,) at which the tool's box comes within so many metres of that of target or obstacle."""
-    others = {
-        body.id: ([transforms.apply(body.world_from_object, body.corners) + s * within for s in (-1.0, 1.0)], np.eye(4))
-        for body in (setup.target, *setup.obstacles)
-    }
+def nears(
+    setup: Setup, poses: NDArray[np.float64], times: NDArray[np.float64], within: float, others: tuple[Body, ...] | None = None
+) -> float | None:
+    """The first of the times (T,) at which the box of one of the tool's pieces comes within so many metres of that of one of another
+    body's (default: target and obstacles)."""
+    others = (setup.target, *setup.obstacles) if others is None else others
+    boxes = [transforms.apply(body.world_from_object, hull) for body in others for hull in body.hulls]
+    low, high = np.array([b.min(axis=0) for b in boxes]) - within, np.array([b.max(axis=0) for b in boxes]) + within
     corners = setup.tool.corners
-    near = np.flatnonzero(_near(corners[ConvexHull(corners).vertices], poses, others))
-    return float(times[near[0]]) if len(near) else None
+    whole = {"": ([np.array([low.min(axis=0), high.max(axis=0)])], np.eye(4))}
+    for index in np.flatnonzero(_near(corners[ConvexHull(corners).vertices], poses, whole)):
+        moved = [hull @ poses[index, :3, :3].T + poses[index, :3, 3] for hull in setup.tool.hulls]
+        mine_low, mine_high = np.array([m.min(axis=0) for m in moved]), np.array([m.max(axis=0) for m in moved])
+        if np.any(np.all((mine_low[:, None] <= high) & (mine_high[:, None] >= low), axis=2)):
+            return float(times[index])
+    return None
 
 
 def _near(

@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_verifier import reliability
 from magic_verifier.simulation import DYNAMIC, Settings, World
 
 #: Tosses whose number this divides were used to choose the parameters; figures are given for the others.
@@ -231,24 +232,9 @@ def table(rows: Sequence[tuple[str, Scores]]) -> str:
 
 def diagram(scores: Scores, path: Path) -> None:
     """The reliability diagram: how many rollouts agreed against how often they were right."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(5, 5))
-    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-    agreed, right, counts = np.array(scores.bins).T
-    # One standard error of a share.
-    error = np.sqrt(np.maximum(right * (1 - right), 1e-9) / counts)
-    axes.errorbar(agreed, right, yerr=error, fmt="o", color="tab:blue", capsize=3)
-    for x, y, n in zip(agreed, right, counts, strict=True):
-        axes.annotate(f"{int(n)}", (x, y), textcoords="offset points", xytext=(7, -11), fontsize=8)
-    axes.set(xlim=(0.3, 1.03), ylim=(0, 1.05), xlabel=f"share of {scores.rollouts} rollouts that agree", ylabel="share of right answers")
-    axes.set_title(f"{scores.tosses} recorded tosses (number of tosses at each point)", fontsize=9)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    title = f"{scores.tosses} recorded tosses (number of tosses at each point)"
+    said = f"share of {scores.rollouts} rollouts that agree"
+    reliability.draw(scores.bins, path, title, said, "share of right answers", lowest=0.33)
 
 
 def compare(tosses: list[Toss], setting: Setting, rollouts: int, seed: int, jobs: int, log: Any = print) -> dict[str, Any]:

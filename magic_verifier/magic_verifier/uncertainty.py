@@ -152,31 +152,33 @@ class ShapeError:
         middle, extent = (low + high) / 2, high - low
         scale = np.clip(1 + self.size / np.maximum(extent, 1e-6), 0.5, 1.5)
         largest = max(float(extent.max()), 1e-6)
-        hulls: list[Array] = []
-        balls: list[tuple[Array, float] | None] = []
-        for hull, ball in zip(body.hulls, body.balls, strict=True):
+        hulls: list[Array] = list(body.hulls)
+        balls: list[tuple[Array, float] | None] = list(body.balls)
+        for index, ball in enumerate(body.balls):
             if ball is not None:
                 grown = max(1 + (float(self.size.mean()) + self.thickness) / (2 * ball[1]), THINNEST)
-                hulls.append(ball[0] + grown * (hull - ball[0]))
-                balls.append((ball[0], grown * ball[1]))
-                continue
-            points = middle + scale * (_thicker(hull, self.thickness) - middle)
+                hulls[index] = ball[0] + grown * (hulls[index] - ball[0])
+                balls[index] = (ball[0], grown * ball[1])
+        # All pieces of so many corners at once: a mug has hundreds.
+        for count in {len(hull) for hull, ball in zip(hulls, balls, strict=True) if ball is None}:
+            some = [i for i, (hull, ball) in enumerate(zip(hulls, balls, strict=True)) if ball is None and len(hull) == count]
+            points = middle + scale * (_thicker(np.stack([hulls[i] for i in some]), self.thickness) - middle)
             angles = 2 * np.pi * (points - middle) @ self.vectors.T / largest + self.phases
-            hulls.append(points + np.sin(angles) @ self.amplitudes)
-            balls.append(None)
+            for i, moved in zip(some, points + np.sin(angles) @ self.amplitudes, strict=True):
+                hulls[i] = moved
         return replace(body, hulls=tuple(hulls), mesh=None, known_balls=tuple(balls))
 
 
-def _thicker(hull: Array, by: float) -> Array:
-    """A convex piece that is ``by`` metres thicker along each of its principal axes."""
-    middle = hull.mean(axis=0)
-    local = hull - middle
-    axes = np.linalg.eigh(local.T @ local)[1]
+def _thicker(hulls: Array, by: float) -> Array:
+    """Convex pieces (K, N, 3) that are ``by`` metres thicker along each of their principal axes."""
+    middle = hulls.mean(axis=1, keepdims=True)
+    local = hulls - middle
+    axes = np.linalg.eigh(local.transpose(0, 2, 1) @ local)[1]
     along = local @ axes
-    low, high = along.min(axis=0), along.max(axis=0)
+    low, high = along.min(axis=1, keepdims=True), along.max(axis=1, keepdims=True)
     factor = np.maximum(1 + by / np.maximum(high - low, 1e-6), THINNEST)
     centre = (low + high) / 2
-    return middle + (centre + factor * (along - centre)) @ axes.T
+    return np.asarray(middle + (centre + factor * (along - centre)) @ axes.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,13 @@ rate lies on one side of the rate that is required.
 from __future__ import annotations
 
 import math
+import pickle
 import time as clock
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ from magic_core import transforms
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
-from magic_core.robot import Description
+from magic_core.robot import Description, RobotConfig
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals, motion_check, uncertainty
@@ -39,12 +41,13 @@ from magic_verifier.uncertainty import Draw, Eyes, Uncertainty
 #: Deadline and cancel request are looked at, and the state checked, every so many steps.
 CHECK_EVERY = 12
 #: Solver settings of the variants: a grip needs more iterations than a floating tool.
-DEFAULTS = {"fg": Settings(), "arm": Settings(position_iterations=25, velocity_iterations=2, contact_offset=0.002)}
+DEFAULTS = {"fg": Settings(), "arm": Settings(position_iterations=8, velocity_iterations=1, contact_offset=0.002)}
 #: Poses are recorded at this rate (Hz).
 RECORD_RATE = 30.0
 #: Rollouts at most, where the caller names no number: up to two of so many may fail (see ``Limits.required_rate``).
 ROLLOUTS = 24
-#: A drawn rollout begins so many seconds before the tool's box comes within so many metres of anything but the table.
+#: A drawn rollout begins so many seconds before the box of one of the tool's pieces comes within so many metres of one of anything but
+#: the table, with a floating gripper of the target: more than what is drawn may displace them.
 LEAD, NEAR = 0.1, 0.03
 #: How an arm's hand yields (N/m): a usual stiffness of Cartesian impedance control.
 STIFFNESS = 2000.0
@@ -394,7 +397,8 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None) -> Any:
 
 
 def _start(setup: Setup, plan: MotionPlan) -> float:
-    """Where drawn rollouts begin: shortly before the tool comes near target or obstacles, not before its approach nor after its contact."""
+    """Where drawn rollouts begin: shortly before the tool comes near anything that it may meet, not before its approach; at the end of a
+    motion that comes near nothing."""
     phases = plan.tool_motion.phases
     contact = phase_start(phases, CONTACT_PHASES)
     if contact is None:
@@ -403,38 +407,139 @@ def _start(setup: Setup, plan: MotionPlan) -> float:
     first = (0.0 if plan.arm_motion is None else contact) if approach is None else approach
     times, poses = plan.tool_motion.times, plan.tool_motion.world_from_tool
     fine = np.append(np.arange(first, contact, 0.02), contact)
-    near = nears(setup, transforms.interpolate(times, poses, fine), fine, NEAR)
+    # Nothing that is fixed meets a tool that is led along its path; an arm may press on it.
+    others = (setup.target, *(setup.obstacles if plan.arm_motion is not None else ()))
+    near = nears(setup, transforms.interpolate(times, poses, fine), fine, NEAR, others)
     return float(np.clip((contact if near is None else near) - LEAD, first, contact))
 
 
-def _in_order(
-    task: Task, numbers: range, pool: Executor | None, workers: int, stop: _Stop, progress: Callable[[str, float], None] | None
-) -> Iterator[Outcome]:
-    """The outcomes of rollouts in the order of their numbers; with a pool some are computed ahead by others, to the same outcomes."""
-    if pool is None:
-        for index in numbers:
-            yield rollout(task, index, stop, progress, record=False)
-        return
+@dataclass(frozen=True)
+class _Packed:
+    """A task as it is sent to other processes, once packed and, there, once unpacked."""
+
+    content: bytes
+
+    @classmethod
+    def of(cls, task: Task) -> _Packed:
+        """The arm goes by what it was read from, so that a process reads it once for all tasks."""
+        return cls(pickle.dumps((replace(task, robot=None), None if task.robot is None else task.robot.config), pickle.HIGHEST_PROTOCOL))
+
+
+@lru_cache(maxsize=4)
+def _read(config: RobotConfig) -> Description:
+    return Description(config)
+
+
+@lru_cache(maxsize=2)
+def _unpacked(packed: _Packed) -> Task:
+    task, config = pickle.loads(packed.content)
+    return replace(task, robot=None if config is None else _read(config))
+
+
+def _elsewhere(packed: _Packed, index: int) -> Outcome:
+    return rollout(_unpacked(packed), index, record=False)
+
+
+def from_held(task: Task, first: Outcome) -> Task:
+    """The task of the drawn rollouts: where the arm has the tool in its hand, as it had it in the first one."""
+    return task if first.held is None else replace(task, held=first.held, start=first.held.time)
+
+
+def _least_more(passed: int, count: int, most: int, required: float) -> int:
+    """How many further rollouts it takes at least until it is decided."""
+    for more in range(1, most - count + 1):
+        if decided(passed + more, count + more, most, required) or decided(passed, count + more, most, required):
+            return more
+    return most - count
+
+
+def rollouts(
+    task: Task,
+    first: Outcome,
+    most: int,
+    required: float | None,
+    pool: Executor | None = None,
+    workers: int = 0,
+    stop: Any = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> list[Outcome]:
+    """The outcomes of the rollouts in the order of their numbers, the ``first`` among them, until it is decided whether the required
+    rate is reached (``None``: all of them).
+
+    With a pool others compute some of them meanwhile, to the same outcomes, none beyond those that are needed at least: which
+    ones are computed where depends on who is ready first, what comes of them does not.
+    """
+    stop = stop or _Never()
+    task = from_held(task, first)
+    outcomes, passed = [first], int(first.judgement.code == Code.OK)
+    found: dict[int, Outcome] = {}
     waiting: dict[int, Future[Outcome]] = {}
+    packed = None if pool is None else _Packed.of(task)
+    following = 1
     try:
-        for index in numbers:
-            found = None
-            if index in waiting:
+        while len(outcomes) < most:
+            end = most
+            if required is not None:
+                if len(outcomes) > 1 and decided(passed, len(outcomes), most, required):
+                    break
+                end = len(outcomes) + _least_more(passed, len(outcomes), most, required)
+            for index in [i for i, future in waiting.items() if future.done()]:
                 future = waiting.pop(index)
-                while not future.done():
-                    stop.check(0.0)
-                    wait([future], timeout=0.01)
-                found = None if isinstance(future.exception(), BrokenExecutor) else future.result()
+                if isinstance(future.exception(), BrokenExecutor):
+                    pool = None
+                    found[index] = rollout(task, index, stop, progress, record=False)
+                else:
+                    found[index] = future.result()
+            # One more than there are processes, so that none waits for this one to look round.
+            while pool is not None and following < end and len(waiting) <= workers:
+                try:
+                    waiting[following] = pool.submit(_elsewhere, packed, following)
+                except RuntimeError:  # a process was killed, or the pool is closed: this one does it all
+                    pool = None
+                    break
+                following += 1
+            if (index := len(outcomes)) in found:
+                outcomes.append(found.pop(index))
+                passed += outcomes[-1].judgement.code == Code.OK
+            elif following < end:
+                following += 1
+                found[following - 1] = rollout(task, following - 1, stop, progress, record=False)
             else:
-                for ahead in range(index + 1, min(index + 1 + workers, numbers.stop)):
-                    try:
-                        waiting[ahead] = pool.submit(rollout, task, ahead, record=False)
-                    except RuntimeError:  # a process was killed, or the pool is closed: this one does it all
-                        break
-            yield rollout(task, index, stop, progress, record=False) if found is None else found
+                stop.check(0.0)
+                wait([waiting[index]], timeout=0.01)
     finally:
         for future in waiting.values():
             future.cancel()
+    return outcomes
+
+
+def make_task(
+    strategy: Strategy,
+    tool: SceneObject,
+    target: SceneObject,
+    obstacles: tuple[SceneObject, ...],
+    table: NDArray[np.float64],
+    plan: MotionPlan,
+    seed: int = 0,
+    settings: Settings | None = None,
+    spreads: Uncertainty | None = None,
+    limits: Limits | None = None,
+    arm_options: Any = None,
+    robot: Description | None = None,
+) -> Task:
+    """What the rollouts of a verdict are a function of; arguments and errors as :func:`verify` has them."""
+    if not strategy.simulatable:
+        raise MagicError(Code.NOT_VERIFIABLE, f"strategy {strategy.name}", "says that simulation cannot judge it", "simulatable: true")
+    goals.require(strategy)
+    if plan.variant == "arm" and robot is None:
+        from magic_verifier.articulation import panda
+
+        robot = panda()
+    motion_check.check(plan, robot)
+    setup = make_setup(tool, target, obstacles, table, strategy.physics, settings or DEFAULTS[plan.variant])
+    spreads = spreads or uncertainty.read()
+    eyes = spreads.eyes(tool), spreads.eyes(target)
+    return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, _start(setup, plan))
 
 
 def verify(
@@ -473,7 +578,6 @@ def verify(
     seed gives the same verdict, with or without them.
     """
     started = clock.monotonic()
-    settings = settings or DEFAULTS[plan.variant]
     limits = limits or Limits()
     most = int(repetitions) if repetitions > 0 else ROLLOUTS
     stop = _Stop(deadline, cancel)
@@ -486,33 +590,15 @@ def verify(
         return float(sum(outcome.simulated for outcome in outcomes))
 
     try:
-        if not strategy.simulatable:
-            raise MagicError(Code.NOT_VERIFIABLE, f"strategy {strategy.name}", "says that simulation cannot judge it", "simulatable: true")
-        goals.require(strategy)
         stop.check(0.0)
-        if plan.variant == "arm" and robot is None:
-            from magic_verifier.articulation import panda
-
-            robot = panda()
-        motion_check.check(plan, robot)
-        setup = make_setup(tool, target, tuple(obstacles), table, strategy.physics, settings)
-        spreads = spreads or uncertainty.read()
-        eyes = spreads.eyes(tool), spreads.eyes(target)
-        task = Task(strategy, setup, plan, limits, int(seed), spreads, eyes, arm_options, robot, _start(setup, plan))
+        task = make_task(strategy, tool, target, tuple(obstacles), table, plan, seed, settings, spreads, limits, arm_options, robot)
         outcomes.append(rollout(task, 0, stop, progress))
         if outcomes[0].judgement.code == Code.OK and most > 1:
-            task = replace(task, held=outcomes[0].held)
-            if outcomes[0].held is not None:
-                task = replace(task, start=outcomes[0].held.time)
-            passed = 1
-            for outcome in _in_order(task, range(1, most), pool, workers, stop, progress):
-                outcomes.append(outcome)
-                passed += outcome.judgement.code == Code.OK
-                if decided(passed, len(outcomes), most, limits.required_rate):
-                    break
+            outcomes = rollouts(task, outcomes[0], most, limits.required_rate, pool, workers, stop, progress)
+            passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
             shown = _shown(outcomes, passed, most, limits.required_rate)
             if shown > 0:  # recording costs, and of the drawn rollouts one is looked at: the same again, recorded
-                outcomes[shown] = rollout(task, shown, stop)
+                outcomes[shown] = rollout(from_held(task, outcomes[0]), shown, stop)
     except MagicError as error:
         runs = tuple(outcome.judgement for outcome in outcomes)
         return Verdict(False, error.code, error.message, 0.0, {}, simulated(), elapsed(), None, runs)
@@ -550,10 +636,9 @@ def _verdict(task: Task, outcomes: list[Outcome], most: int, simulated: float, s
         message += f"; {'; '.join(failures)}"
     metrics = dict(judgements[shown].metrics)
     if count > 1:  # what the drawn rollouts found of it, in shares
-        for name in ("holds", "holds_in_stronger_noise"):
-            found = [j.metrics[name] for j in judgements if name in j.metrics]
-            if found:
-                metrics[f"{name}_rate"] = float(np.mean(found))
+        found = [j.metrics["holds"] for j in judgements if "holds" in j.metrics]
+        if found:
+            metrics["holds_rate"] = float(np.mean(found))
     return Verdict(
         success, code, message, good / count, metrics, simulated, seconds, outcomes[shown].recording, tuple(judgements), low, high, failures
     )

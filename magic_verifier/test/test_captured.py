@@ -1,5 +1,6 @@
 """Cases seen by cameras: the layout is fair, reconstructions belong to the right things, and the truth is judged apart from what was seen."""
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from magic_core.motion import MotionPlan
 from magic_verifier import captured, placing
 from magic_verifier import evaluate as ev
 from magic_verifier.cases import Case, Options, all_cases
+from magic_verifier.reliability import Judged, points, rows, table
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
 CASE = Case("caliper", ("caliper:50000",), "cylinder:0.025")
@@ -96,6 +98,23 @@ def test_an_evaluation_from_images_counts_what_was_verified_against_what_is_true
     assert sum(truth[k] for k in ("verified_and_succeeds", "verified_but_fails", "refused_but_would_succeed", "refused_and_fails")) == 1
     assert "true objects" in (tmp_path / "summary.txt").read_text()
     assert list((tmp_path / "films").glob("*.scene.png"))
+    assert sum(row["motions"] for row in summary["reliability"]) == len(ev.judged(ev_cases(tmp_path)))
+    assert (tmp_path / "reliability.png").is_file()
+
+
+def ev_cases(folder):
+    return json.loads((folder / "results.json").read_text())["cases"]
+
+
+def test_what_was_said_is_counted_against_what_was_the_case():
+    sure = [Judged(1.0, 0.81, 16, k > 0) for k in range(20)]
+    doubtful = [Judged(0.5, 0.25, 8, k % 2 == 0) for k in range(6)]
+    failing = [Judged(0.0, 0.0, 1, False)]
+    found = {row["from"]: (row["motions"], row["succeeded"]) for row in rows([*sure, *doubtful, *failing])}
+    assert found == {0.0: (1, 0), 0.2: (6, 3), 0.5: (0, 0), 0.7: (0, 0), 0.8: (20, 19)}
+    assert points([*sure, *doubtful, *failing]) == [(0.0, 0.0, 1), (0.5, 0.5, 6), (1.0, 0.95, 20)]
+    assert "95.0 % (76 to 99 %)" in table(sure)
+    assert len(table([]).splitlines()) == 6
 
 
 def test_the_four_counts():

@@ -72,12 +72,29 @@ class ArmMotion:
 
 
 @dataclass(frozen=True)
+class Margin:
+    """How much of a limit a motion leaves over where it leaves least: ``left`` 1 nothing is used, 0 all of it, below 0 more than there
+    is; ``time`` s of the motion and ``phase`` in which that is; ``what`` completes "70 % ...", the share that is used."""
+
+    name: str
+    left: float
+    time: float
+    phase: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {100 * (1 - self.left):.0f} % {self.what} at {self.time:.2f} s ({self.phase})"
+
+
+@dataclass(frozen=True)
 class MotionPlan:
-    """What the planner hands to the verifier: where the tool goes, and how the arm takes it there."""
+    """What the planner hands to the verifier: where the tool goes, and how the arm takes it there; ``margins``: what analysis says of
+    an arm's motion (not sent with it)."""
 
     variant: str
     tool_motion: ToolMotion
     arm_motion: ArmMotion | None = None
+    margins: tuple[Margin, ...] = ()
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:

@@ -1,0 +1,121 @@
+"""How long the rollouts of a verdict take, on procedural objects with their labelled contacts: ``ros2 run magic_verifier benchmark``.
+
+Each case is planned as :mod:`magic_planner.benchmark` does, with the first grasp.  Then all
+rollouts are computed, decided or not, by this process and ``--workers`` others that are warm, as the node has them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from magic_core.errors import Code, MagicError
+from magic_core.motion import MotionPlan
+from magic_core.strategy import find
+from magic_core.threads import one_thread
+from magic_verifier import verification
+from magic_verifier.workers import Workers
+
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One case: seconds by the clock of the rollout of the scene as given and of all of them; how many passed."""
+
+    name: str
+    first: float
+    everything: float
+    passed: int
+    count: int
+
+
+def measured(task: verification.Task, name: str, count: int, pool: Workers) -> Timing | None:
+    """The rollouts of one task, timed; ``None`` where the scene as given fails, after which there are none."""
+    started = time.perf_counter()
+    first = verification.rollout(task, 0)
+    so_far = time.perf_counter() - started
+    if first.judgement.code != Code.OK:
+        return None
+    outcomes = verification.rollouts(task, first, count, None, pool.executor, pool.count)
+    passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
+    return Timing(name, so_far, time.perf_counter() - started, passed, count)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of ``ros2 run magic_verifier benchmark``."""
+    from magic_planner.benchmark import TASKS, make_case
+    from magic_planner.giving_way import GAP, GAP_IN_HAND
+    from magic_planner.object_motion import plan_tool_motion
+
+    parser = argparse.ArgumentParser(prog="benchmark", description="Measure the rollouts of a verdict on procedural objects.")
+    parser.add_argument("--strategies", type=Path, default=None, help="folder of strategies; the installed ones by default")
+    parser.add_argument("--task", nargs="*", default=list(TASKS), choices=list(TASKS))
+    parser.add_argument("--variant", nargs="*", default=["fg", "arm"], choices=["fg", "arm"])
+    parser.add_argument("--count", type=int, default=4, help="objects for each task, the families in turn")
+    parser.add_argument("--rollouts", type=int, default=20)
+    parser.add_argument("--workers", type=int, default=1, help="processes beside this one")
+    parser.add_argument("--seed", type=int, default=0, help="of the first object and of the draws")
+    options = parser.parse_args(arguments)
+    one_thread()
+    planner = None
+    if "arm" in options.variant:
+        from magic_planner.arm import ArmPlanner
+        from magic_planner.budget import Budget
+        from magic_planner.robot import Robot
+
+        planner = ArmPlanner(Robot())
+    pool = Workers(options.workers)
+    try:
+        print(f"load of the machine before: {os.getloadavg()[0]:.1f} of {os.cpu_count()} cores")
+        for task in options.task:
+            strategy, families = find(task, options.strategies), TASKS[task][0]
+            rows: dict[str, list[Timing]] = {variant: [] for variant in options.variant}
+            for number in range(options.count):
+                family, region = families[number % len(families)]
+                case = make_case(strategy, family, region, options.seed + number)
+                scene = (strategy, case.tool, case.target)
+                for variant in options.variant:
+                    label = f"{task:9} {variant:3} {case.name:28}"
+                    try:
+                        gap = GAP if variant == "fg" else GAP_IN_HAND
+                        motion = plan_tool_motion(*scene, case.candidate, "keep", TABLE, case.obstacles, gap)
+                        plan = MotionPlan("fg", motion)
+                        if variant == "arm":
+                            assert planner is not None
+                            plan = planner.plan(*scene, case.candidate, "keep", motion, TABLE, case.obstacles, budget=Budget(10.0))
+                        found = measured(
+                            verification.make_task(*scene, case.obstacles, TABLE, plan, options.seed), case.name, options.rollouts, pool
+                        )
+                    except MagicError as error:
+                        print(f"{label} {error}")
+                        continue
+                    if found is None:
+                        print(f"{label} fails in the scene as given")
+                        continue
+                    rows[variant].append(found)
+                    print(
+                        f"{label} {found.everything:.2f} s for {found.count} rollouts, of it {found.first:.2f} s for the first; "
+                        f"{found.passed} passed",
+                        flush=True,
+                    )
+            for variant, timings in rows.items():
+                if timings:
+                    seconds = np.array([row.everything for row in timings])
+                    print(
+                        f"{task:9} {variant:3} {len(timings)} cases: {options.rollouts} rollouts take {seconds.mean():.2f} s in the mean, "
+                        f"median {np.median(seconds):.2f} s, longest {seconds.max():.2f} s; the first of them "
+                        f"{np.mean([row.first for row in timings]):.2f} s"
+                    )
+    finally:
+        pool.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

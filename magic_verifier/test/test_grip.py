@@ -1,0 +1,89 @@
+"""Two soft pads hold what friction holds: forces along them and torques, up to a limit that analysis gives, and no more."""
+
+import numpy as np
+import pytest
+import scenes
+
+from magic_core import transforms
+from magic_verifier.grip import LEAST, Grip, Patch, patch_of
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, usable_pieces
+
+FORCE, FRICTION = 40.0, 0.8
+PATCH = Patch(np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]]), 0.006, (0.008, 0.006))
+
+
+def hand_and_tool(mass, offset, settings=None):
+    """A fixed hand and a cube of a mass (kg) whose middle is ``offset`` (3,) m from where it is held."""
+    world = World(settings or Settings())
+    half = 0.05
+    hulls = usable_pieces("tool", (scenes.block(*[(c - half, c + half) for c in offset]),))
+    world.add("hand", usable_pieces("hand", (scenes.block((-0.02, 0.02), (-0.02, 0.02), (0.2, 0.24)),)), np.eye(4), KINEMATIC, 1000.0, 0.5)
+    world.add("tool", hulls, np.eye(4), DYNAMIC, mass / (2 * half) ** 3, 0.5)
+    return world, Grip(world.component("hand"), PATCH.tcp_from_patch, world.component("tool"), PATCH, FORCE, FRICTION, world.timestep)
+
+
+def after(world, grip, seconds):
+    loads = []
+    for step in range(round(seconds * world.settings.frequency)):
+        world.step()
+        if step % 6 == 0:
+            loads.append(grip.load())
+    pose = world.pose("tool")
+    return loads[-1], float(np.linalg.norm(pose[:3, 3])), transforms.rotation_angle(pose, np.eye(4))
+
+
+@pytest.mark.parametrize("frequency", [240.0, 480.0])
+@pytest.mark.parametrize("share", [0.05, 0.9, 1.15])
+def test_weight_along_the_pads_slips_exactly_where_it_exceeds_friction(share, frequency):
+    mass = share * 2 * FRICTION * FORCE / 9.81
+    load, slip, _ = after(*hand_and_tool(mass, (0, 0, 0), Settings(frequency=frequency)), 0.5)
+    if share < 1:
+        assert load == pytest.approx(share, abs=0.06)
+        assert slip < 0.001
+    else:  # g (1 - 1 / share) t^2 / 2
+        assert slip == pytest.approx(9.81 * (1 - 1 / share) * 0.5**2 / 2, rel=0.1)
+
+
+@pytest.mark.parametrize("share", [0.8, 1.3])
+def test_a_lever_about_the_closing_axis_turns_exactly_where_it_exceeds_the_patches(share):
+    # The closing axis is y of the world; the weight pulls at a lever along x.
+    mass = 1.0
+    lever = share * 2 * FRICTION * FORCE * PATCH.radius / (mass * 9.81)
+    load, _, angle = after(*hand_and_tool(mass, (lever, 0, 0)), 0.5)
+    assert (angle < 0.1) if share < 1 else (angle > 0.5)
+    assert share > 1 or load == pytest.approx(share, abs=0.1)
+
+
+def test_a_light_tool_is_held_as_a_heavy_one_and_falls_when_let_go():
+    world, grip = hand_and_tool(0.002, (0, 0, 0))
+    assert after(world, grip, 0.5)[1] < 1e-4
+    grip.open()
+    for _ in range(48):
+        world.step()
+    assert world.position("tool")[2] == pytest.approx(-9.81 * 0.2**2 / 2, rel=0.05)
+
+
+def touch(x, y, z, side):
+    return Touch(np.array([x, y, z]), np.array([0, -side, 0.0]), 0.0, np.zeros(3))
+
+
+def test_a_patch_is_what_both_pads_touch():
+    both = [touch(x, side * 0.01, z, side) for side in (1, -1) for x in (-0.008, 0.008) for z in (-0.004, 0.006)]
+    patch = patch_of(both, np.eye(4), 1, FRICTION)
+    assert patch.tcp_from_patch[:3, 3] == pytest.approx([0, 0, 0.001])
+    assert patch.half == pytest.approx((0.008, 0.005))
+    assert 0.004 < patch.radius < 0.008
+    line = patch_of([t for t in both if t.position[0] > 0], np.eye(4), 1, FRICTION)
+    assert line.half == pytest.approx((LEAST, 0.005))
+    holds = patch.holds(FORCE, FRICTION)
+    assert holds[1] == holds[2] == 2 * FORCE * FRICTION and holds[4] == pytest.approx(2 * FORCE * 0.005)
+
+
+def test_no_patch_where_one_pad_touches_nothing_or_only_pushes():
+    one = [touch(0, 0.01, 0, 1), touch(0.01, 0.01, 0, 1)]
+    assert patch_of(one, np.eye(4), 1, FRICTION) is None
+    assert patch_of([], np.eye(4), 1, FRICTION) is None
+    steep = Touch(np.array([0, -0.01, 0.0]), np.array([0.95, 0.31, 0.0]), 0.0, np.zeros(3))
+    assert patch_of([*one, steep], np.eye(4), 1, FRICTION) is None
+    aside = [touch(0, -0.01, 0.04, -1)]
+    assert patch_of([*one, *aside], np.eye(4), 1, FRICTION) is None
