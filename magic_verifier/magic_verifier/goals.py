@@ -127,6 +127,11 @@ class GoalTest:
             raise MagicError(Code.BAD_STRATEGY, f"goal values of {strategy.goal.test}", ", ".join(unknown), list(self.defaults))
         self.values = {**self.defaults, **strategy.goal.values}
 
+    @classmethod
+    def around(cls, strategy: Strategy) -> float:
+        """How far (m) from the target bodies of the test's own may stand."""
+        return 0.0
+
     def until(self, run: Any) -> float:
         """The moment of the motion at which the run may end."""
         moment = run.duration + self.settle
@@ -627,6 +632,11 @@ class Sweep(GoalTest):
             run.world.add(name, list(body.hulls), pose, DYNAMIC, physics.target_density, physics.friction, balls=body.balls)
             self.names.append(name)
         self.origins = [run.world.position(name) for name in self.names]
+
+    @classmethod
+    def around(cls, strategy: Strategy) -> float:
+        values = {**cls.defaults, **strategy.goal.values}
+        return float(np.ceil(values["others"] / 2) * values["spacing"])
 
     def judge(self, run: Any, go_on: GoOn) -> Judgement:
         moved = np.stack([run.world.position(name) - origin for name, origin in zip(self.names, self.origins, strict=True)])

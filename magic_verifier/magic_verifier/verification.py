@@ -396,7 +396,7 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None) -> Any:
     return ArmRun(setup, task.plan, options, task.limits, task.robot, held, drawn.lag)
 
 
-def _start(setup: Setup, plan: MotionPlan) -> float:
+def _start(strategy: Strategy, setup: Setup, plan: MotionPlan) -> float:
     """Where drawn rollouts begin: shortly before the tool comes near anything that it may meet, not before its approach; at the end of a
     motion that comes near nothing."""
     phases = plan.tool_motion.phases
@@ -409,7 +409,7 @@ def _start(setup: Setup, plan: MotionPlan) -> float:
     fine = np.append(np.arange(first, contact, 0.02), contact)
     # Nothing that is fixed meets a tool that is led along its path; an arm may press on it.
     others = (setup.target, *(setup.obstacles if plan.arm_motion is not None else ()))
-    near = nears(setup, transforms.interpolate(times, poses, fine), fine, NEAR, others)
+    near = nears(setup, transforms.interpolate(times, poses, fine), fine, NEAR + goals.GOALS[strategy.goal.test].around(strategy), others)
     return float(np.clip((contact if near is None else near) - LEAD, first, contact))
 
 
@@ -539,7 +539,7 @@ def make_task(
     setup = make_setup(tool, target, obstacles, table, strategy.physics, settings or DEFAULTS[plan.variant])
     spreads = spreads or uncertainty.read()
     eyes = spreads.eyes(tool), spreads.eyes(target)
-    return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, _start(setup, plan))
+    return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, _start(strategy, setup, plan))
 
 
 def verify(
