@@ -229,7 +229,7 @@ class ArmPlanner:
                     try:
                         plan = self._complete(request, branch, len(chosen) < attempt)
                         if plan is not None:
-                            plan = self._with_margins(request, choice.grasping, tool_from_contact, plan)
+                            plan = self._with_margins(request.tool, choice.grasping, tool_from_contact, plan)
                     except StageError as failure:
                         failures.add(failure.stage, failure.error)
                         if failure.stage == "approach" and failure.error.code == Code.PATH_IN_COLLISION:
@@ -246,13 +246,13 @@ class ArmPlanner:
             )
         raise failures.error()
 
-    def _with_margins(self, request: Request, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
+    def _with_margins(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
         """The plan with its margins; raises StageError where one is negative."""
         arm = plan.arm_motion
         assert arm is not None
         held = (arm.grasp_time, np.inf if arm.release_time is None else arm.release_time)
         found = margins(
-            self.robot, grasping, request, arm.tool_from_tcp, tool_from_contact, arm.times, arm.positions, held, plan.tool_motion.phases
+            self.robot, grasping, tool, arm.tool_from_tcp, tool_from_contact, arm.times, arm.positions, held, plan.tool_motion.phases
         )
         least = min(found, key=lambda margin: margin.left)
         if least.left < 0:

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.motion import Margin, Phase
+from magic_core.scene import SceneObject
 from magic_planner.collision import mass_centre, solid_pieces
 from magic_planner.grasps import GraspSettings, Patches, pad_share
 from magic_planner.kinematics import GRAVITY, Chain
-from magic_planner.request import Request
 from magic_planner.robot import Robot
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ LEVER = 0.3
 def margins(
     robot: Robot,
     grasping: GraspSettings,
-    request: Request,
+    tool: SceneObject,
     tool_from_tcp: Array,
     tool_from_contact: Array,
     times: Array,
@@ -54,7 +54,7 @@ def margins(
     for phase in phases:
         if phase.name in ("contact", "goal"):
             pushed |= (times >= phase.start) & (times < phase.end)
-    pieces = solid_pieces(request.tool)
+    pieces = solid_pieces(tool)
     volume, centre = mass_centre(pieces)
     mass = volume * grasping.density
     tcp_from_tool = transforms.inverse(tool_from_tcp)

@@ -15,7 +15,8 @@ from magic_core.strategy import Waypoint
 from magic_planner import timing
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, grown
-from magic_planner.object_motion import plan_tool_motion
+from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
+from magic_planner.request import StageError
 
 
 def problem(at=(0.6, 0.0), **changes):
@@ -241,3 +242,24 @@ def test_a_carried_tool_keeps_room_about_it():
     box = scenes.box([0.1, 0.1, 0.1])
     (large,) = grown([box], 0.01)
     np.testing.assert_allclose(np.ptp(large.vertices, axis=0), 0.12)
+
+
+def test_a_plan_carries_its_margins_and_a_heavy_tool_is_refused_with_its_number(arm, solved):
+    (_, tool, _, candidate, reflection, _), plan = solved
+    found = {margin.name: margin for margin in plan.margins}
+    assert set(found) == {"grip", "torque", "joint limit", "singularity"}
+    assert all(0 < margin.left < 1 and 0 <= margin.time <= plan.arm_motion.times[-1] for margin in found.values())
+    # The motion is slow: most of the torque is that of gravity.
+    still = np.abs(arm.robot.chain.gravity_torques(plan.arm_motion.positions)) / arm.robot.chain.effort
+    assert 1 - found["torque"].left == pytest.approx(still.max(), abs=0.1)
+    slack = np.minimum(plan.arm_motion.positions - arm.robot.chain.lower, arm.robot.chain.upper - plan.arm_motion.positions)
+    assert found["joint limit"].left == pytest.approx((slack / (arm.robot.chain.upper - arm.robot.chain.lower) * 2).min())
+    contact = tool_contact_frame(candidate, reflection)
+    shares = []
+    for density in (600.0, 1200.0):
+        heavier = arm._with_margins(tool, dataclasses.replace(arm.grasping, density=density, force=0.0), contact, plan)
+        shares.append(1 - next(m.left for m in heavier.margins if m.name == "grip"))
+    assert shares[1] == pytest.approx(2 * shares[0], rel=1e-6)
+    with pytest.raises(StageError) as caught:
+        arm._with_margins(tool, dataclasses.replace(arm.grasping, density=1.2 * 600.0 / shares[0], force=0.0), contact, plan)
+    assert caught.value.error.code in (Code.NO_GRASP, Code.DYNAMIC_LIMIT) and "margin of grip: 120 %" in caught.value.error.message

@@ -27,25 +27,27 @@ TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class Timing:
-    """One case: seconds by the clock of the rollout of the scene as given and of all of them; how many passed."""
+    """One case: seconds by the clock of the rollout of the scene as given and of all of them, seconds of this process's processor; how
+    many passed."""
 
     name: str
     first: float
     everything: float
+    busy: float
     passed: int
     count: int
 
 
 def measured(task: verification.Task, name: str, count: int, pool: Workers) -> Timing | None:
     """The rollouts of one task, timed; ``None`` where the scene as given fails, after which there are none."""
-    started = time.perf_counter()
+    started, busy = time.perf_counter(), time.process_time()
     first = verification.rollout(task, 0)
     so_far = time.perf_counter() - started
     if first.judgement.code != Code.OK:
         return None
     outcomes = verification.rollouts(task, first, count, None, pool.executor, pool.count)
     passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
-    return Timing(name, so_far, time.perf_counter() - started, passed, count)
+    return Timing(name, so_far, time.perf_counter() - started, time.process_time() - busy, passed, count)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -101,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
                         continue
                     rows[variant].append(found)
                     print(
-                        f"{label} {found.everything:.2f} s for {found.count} rollouts, of it {found.first:.2f} s for the first; "
+                        f"{label} {found.everything:.2f} s for {found.count} rollouts, of it {found.first:.2f} s for the first ({found.busy:.2f} s of this process); "
                         f"{found.passed} passed",
                         flush=True,
                     )
@@ -111,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
                     print(
                         f"{task:9} {variant:3} {len(timings)} cases: {options.rollouts} rollouts take {seconds.mean():.2f} s in the mean, "
                         f"median {np.median(seconds):.2f} s, longest {seconds.max():.2f} s; the first of them "
-                        f"{np.mean([row.first for row in timings]):.2f} s"
+                        f"{np.mean([row.first for row in timings]):.2f} s; this process is busy for {np.mean([row.busy for row in timings]):.2f} s"
                     )
     finally:
         pool.close()
