@@ -129,7 +129,7 @@ def _middle(item: SceneObject) -> NDArray[np.float64]:
     return transforms.apply(item.world_from_object, item.mesh.bounds.mean(axis=0))
 
 
-def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, plan: MotionPlan, seed: int, deadline: float) -> Any:
+def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, plan: MotionPlan, seed: int) -> Any:
     """The verdict of one run with the true tool ``index``, target and fixtures, where ``seen`` is what the plan took the tool for.
 
     The motion of whatever holds the tool stays as it was planned, so that the true tool is held where it truly is.
@@ -148,7 +148,7 @@ def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, pla
     # A real hand gives way as the verifier's drawn rollouts have it.
     limits = Limits().yielding()
     scene = (truth, true, layout.target, (*layout.fixtures, *others), TABLE, None, plan)
-    return verify(*scene, seed=seed, repetitions=1, deadline=deadline, limits=limits)
+    return verify(*scene, seed=seed, repetitions=1, limits=limits)
 
 
 def sheet(frames: list[RgbdFrame], scene: Scene, path: Any) -> None:

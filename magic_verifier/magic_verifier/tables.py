@@ -83,9 +83,12 @@ COLUMNS_5 = (
 )
 PAPER_5 = {"KETO": (66.4, 46.3, 71.7), "MAGIC": (75.6, 53.7, 76.3)}
 TASKS_FG = (("Scooping", "scooping"), ("Hanging", "hanging"), ("Hooking", "hooking"))
-#: Cases of a cell in the short run, by variant; negative controls; cases from images.
-QUICK = {"fg": 4, "fg_no_selection": 4, "arm": 1}
+#: Cases of a cell in the short run, by variant (an arm's takes half a minute: the other methods' are left to the full run); negative
+#: controls; cases from images.
+QUICK = {"fg": 3, "fg_no_selection": 3, "arm": 1}
 QUICK_CONTROLS, QUICK_IMAGES = 2, {"fg": 2, "arm": 1}
+#: The reports are written anew every so many seconds while cases run.
+REPORT_EVERY = 300.0
 NO_WEIGHTS = "no weights at hand"
 
 
@@ -147,7 +150,8 @@ def cells(seed: int = 0, strategies: str = "", weights: dict[str, str] | None = 
             hanging = task == "hanging"
             result.append(Cell("I", row, column, options(task, variant, method=method), QUICK[variant], PAPER_1[row][k], one_each=hanging))
         for column, variant in (("Hanging on a rod FG", "fg"), ("Hanging on a rod Arm", "arm")):
-            result.append(Cell("I", row, column, replace(base, variant=variant, method=method), QUICK[variant]))
+            count = 0 if variant == "arm" and method != "magic" else QUICK[variant]
+            result.append(Cell("I", row, column, replace(base, variant=variant, method=method), count))
         for column, task in TASKS_FG:
             variant = "fg_no_selection" if task == "hooking" else "fg"
             controls = replace(base, task=task, variant=variant, method=method, set="controls")
@@ -276,24 +280,34 @@ def run(
     left = [cell for cell, _ in waiting]
     started = time.monotonic()
     tasks = (delayed(_run)(c, case, film_of(out, c, case.name) if films and c.options.method == "magic" else None) for c, case in waiting)
-    for number, (cell, case, result) in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(tasks), 1):
-        store.add(cell.key, case.name, result)
-        estimate.note(cell, result)
-        left.remove(cell)
-        remains = estimate.seconds(left) / 60
-        log(
-            f"[{total - len(left)}/{total}] {cell.table} {cell.row}, {cell.column}: {case.name}: {result['reason']} ({result['wall']:.1f} s); "
-            f"{len(left)} left, about {remains:.0f} min"
-        )
-        if number == len(waiting):
-            minutes = (time.monotonic() - started) / 60
-            log(f"{number} problems in {minutes:.1f} min: {number / minutes:.1f} a minute with {jobs} job(s)")
-    results = {key: [store.done[key, case.name] for case in cases] for key, cases in wanted.items()}
-    figures = [tables_report.figure(cell, results.get(cell.key, [])) for cell in chosen]
-    pictures = {
-        (key, result["object"]): film_of(out, by_key[key], result["object"]) for key, several in results.items() for result in several
-    }
-    tables_report.write(figures, TABLES, pictures, out)
+    reported = time.monotonic()
+
+    def report() -> dict[str, list[dict[str, Any]]]:
+        """Write what there is, and answer it."""
+        results = {key: [store.done[key, c.name] for c in cases if (key, c.name) in store.done] for key, cases in wanted.items()}
+        figures = [tables_report.figure(cell, results.get(cell.key, []), len(wanted.get(cell.key, []))) for cell in chosen]
+        pictures = {(key, r["object"]): film_of(out, by_key[key], r["object"]) for key, several in results.items() for r in several}
+        tables_report.write(figures, TABLES, pictures, out)
+        return results
+
+    try:
+        for number, (cell, case, result) in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(tasks), 1):
+            store.add(cell.key, case.name, result)
+            estimate.note(cell, result)
+            left.remove(cell)
+            remains = estimate.seconds(left) / 60
+            log(
+                f"[{total - len(left)}/{total}] {cell.table} {cell.row}, {cell.column}: {case.name}: {result['reason']} "
+                f"({result['wall']:.1f} s); {len(left)} left, about {remains:.0f} min"
+            )
+            if number == len(waiting):
+                minutes = (time.monotonic() - started) / 60
+                log(f"{number} problems in {minutes:.1f} min: {number / minutes:.1f} a minute with {jobs} job(s)")
+            elif time.monotonic() - reported > REPORT_EVERY:
+                report()
+                reported = time.monotonic()
+    finally:  # what was done before an interruption can be looked at
+        results = report()
     return results
 
 
@@ -327,7 +341,7 @@ def main(args: list[str] | None = None) -> None:
         print(f"tables: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("tables: interrupted; run the same command again to go on", file=sys.stderr)
+        print(f"tables: interrupted; {given.out} holds what was done, the same command goes on", file=sys.stderr)
         sys.exit(130)
     print((out / "tables.txt").read_text())
 

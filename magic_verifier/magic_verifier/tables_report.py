@@ -26,7 +26,7 @@ PICTURES, PICTURE_WIDTH = 12, 420
 class Figure:
     """What came of a cell: counts without the cases that geometry forbids, which stand apart, and mean seconds a problem.
 
-    ``missing``: why nothing was run; ``truth``: the four counts of :func:`magic_verifier.evaluate.truths`, for cases from images.
+    ``wanted`` and ``done``: cases asked for and finished; ``missing``: why nothing was run; ``truth``: the four counts of :func:`magic_verifier.evaluate.truths`, for cases from images.
     """
 
     table: str
@@ -37,6 +37,8 @@ class Figure:
     paper_seconds: float | None
     missing: str
     control: bool
+    wanted: int
+    done: int
     cases: int
     successes: int
     interval: tuple[float, float]
@@ -53,8 +55,8 @@ class Figure:
         return 100.0 * self.successes / self.cases if self.cases else math.nan
 
 
-def figure(cell: Any, results: Sequence[Mapping[str, Any]]) -> Figure:
-    """The figure of a cell (:class:`magic_verifier.tables.Cell`) from its results."""
+def figure(cell: Any, results: Sequence[Mapping[str, Any]], wanted: int) -> Figure:
+    """The figure of a cell (:class:`magic_verifier.tables.Cell`) from its results, of which there are to be ``wanted``."""
     hopeless = {r["object"]: r["impossible"] for r in results if r.get("impossible")}
     counted = [r for r in results if cell.control or r["object"] not in hopeless]
     failed = [r for r in counted if not r["success"]]
@@ -68,6 +70,8 @@ def figure(cell: Any, results: Sequence[Mapping[str, Any]]) -> Figure:
         cell.paper_seconds,
         cell.missing,
         cell.control,
+        wanted,
+        len(results),
         len(counted),
         good,
         wilson(good, len(counted)),
@@ -84,10 +88,15 @@ def words(found: Figure) -> str:
     """A figure in a line: ours with its 95 % interval and count, the time, what geometry forbids, the truth."""
     if found.missing:
         return found.missing
+    if not found.wanted:
+        return "not in this run"
+    if not found.done:
+        return "not run yet"
     if not found.cases:
-        return f"no case ({len(found.impossible)} impossible)" if found.impossible else "no case"
+        return f"no case but {len(found.impossible)} impossible"
+    left = f"; {found.wanted - found.done} cases still to run" if found.done < found.wanted else ""
     if found.control:
-        return f"{found.successes} of {found.cases} passed (should be 0)"
+        return f"{found.successes} of {found.cases} passed (should be 0){left}"
     low, high = (100 * x for x in found.interval)
     text = f"{found.rate:.1f} % ({low:.0f} to {high:.0f}; {found.successes} of {found.cases}), {found.seconds:.1f} s"
     if found.impossible:
@@ -98,7 +107,7 @@ def words(found: Figure) -> str:
             f"; on the true objects: {truth['verified_and_succeeds']} verified and succeed, {truth['verified_but_fails']} verified but fail, "
             f"{truth['refused_but_would_succeed']} refused though they would succeed, {truth['refused_and_fails']} refused rightly"
         )
-    return text
+    return text + left
 
 
 def paper_words(found: Figure) -> str:

@@ -80,17 +80,32 @@ def test_it_goes_on_where_it_stopped_even_in_the_middle_of_a_line(tmp_path, monk
     assert "it slid off" in page
 
 
+def test_an_interrupted_run_shows_what_was_done(tmp_path, monkeypatch):
+    asked = []
+
+    def interrupted(options, case, film):
+        asked.append(case.name)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return answer(options, case, film)
+
+    monkeypatch.setattr(tables, "attempt", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tables.run([cell()], tmp_path, False, log=lambda text: None)
+    assert "of 1), 0.5 s; 19 cases still to run" in (tmp_path / "tables.txt").read_text()
+
+
 def test_what_geometry_forbids_is_counted_apart_and_controls_are_not():
     def result(name, success, impossible):
         return {**answer(None, type("Case", (), {"name": name}), None), "success": success, "impossible": impossible}
 
     results = [result("a", True, ""), result("b", False, ""), result("c", False, "too narrow"), result("d", True, "too wide")]
-    found = tables_report.figure(cell(), results)
+    found = tables_report.figure(cell(), results, 4)
     assert (found.successes, found.cases, dict(found.impossible)) == (1, 2, {"c": "too narrow", "d": "too wide"})
     assert "2 impossible, 1 of them passed" in tables_report.words(found)
-    controls = tables_report.figure(cell(control=True), results)
+    controls = tables_report.figure(cell(control=True), results, 4)
     assert tables_report.words(controls) == "2 of 4 passed (should be 0)"
-    assert tables_report.words(tables_report.figure(cell(missing=tables.NO_WEIGHTS), [])) == "no weights at hand"
+    assert tables_report.words(tables_report.figure(cell(missing=tables.NO_WEIGHTS), [], 0)) == "no weights at hand"
 
 
 def test_results_do_not_depend_on_the_number_of_jobs(tmp_path):
