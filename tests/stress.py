@@ -8,8 +8,8 @@ Parts, each of which may be run alone:
     requests   10,000 random requests to matcher, planner, verifier and strategy server: each is answered, none by INTERNAL
     messages   300 mangled messages to perception: it goes on, and sees the objects in good ones afterwards
     bags       200 mangled bags: each is read or refused by BAD_BAG
-    goals      300 runs of a strategy from a recorded bag, every tenth with the arm: each is answered in its time, those with the
-               floating gripper are verified, the same goal has the same answer, and no process grows
+    goals      300 runs of a strategy from a recorded bag, every tenth with the arm and its pictures: each is answered in its time,
+               those with the floating gripper are verified, the same goal has the same answer, and no process grows
     starts     50 starts and stops of the graph, at random moments of its start: every process ends by itself and in order, and
                leaves nothing behind
     kills      each node killed while a run is at each stage: an answer within 5 s, and the next run works
@@ -486,7 +486,7 @@ def goals(part: Part, logs: Path) -> None:
         for index, _ in part.left:
             variant, seed = ("arm", index // 10 % 5) if index % 10 == 9 else ("fg", index % 10)
             began = time.monotonic()
-            result = bench.run(strategy="hooking", variant=variant, seed=seed, timeout=RUN_LIMIT)
+            result = bench.run(strategy="hooking", variant=variant, seed=seed, timeout=RUN_LIMIT, pictures=variant == "arm")
             code = Code(result.code)
             answer = code, motion(result.plan)
             wrong = result.message if code in UNANSWERED or (variant == "fg" and not result.verified) else ""

@@ -56,7 +56,7 @@ ROBOT_NODES = ("perception", "planner", "verifier", "strategy_server")
 
 @dataclass(frozen=True)
 class Options:
-    """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself.
+    """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself.  pictures: for the report.
 
     cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it is played.
     files: parameters files by node.
@@ -71,6 +71,7 @@ class Options:
     target: str = ""
     seed: int = 0
     timeout: float = 300.0
+    pictures: bool = True
     cameras: tuple[str, ...] = ()
     topics: tuple[tuple[str, str], ...] = ()
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
@@ -296,7 +297,7 @@ class Watcher:
             target_id=options.target,
             seed=options.seed,
             timeout=options.timeout,
-            want_pictures=True,
+            want_pictures=options.pictures,
         )
         return Pending(self, self.client.send_goal_async(goal, feedback_callback=self._on_feedback))
 
