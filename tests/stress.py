@@ -671,6 +671,9 @@ def main() -> int:
     if unknown:
         parser.error(f"unknown part {unknown[0]!r}; there are: {', '.join(SIZES)}")
     given.out.mkdir(parents=True, exist_ok=True)
+    # A shell that starts this in the background has it ignore SIGINT, and what is started here would inherit that.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     parts = [Part(n, max(1, s // 20) if given.quick else s, given.seed, given.out) for n, s in SIZES.items() if n in (given.parts or SIZES)]
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     failed = False
