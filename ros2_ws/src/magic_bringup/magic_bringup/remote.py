@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +36,7 @@ class Token:
         self._condition = threading.Condition()
         self._canceled = self._ended = False
         self._closing = False
+        self._minded: Callable[[], None] = lambda: None
 
     def cancel(self, closing: bool = False) -> None:
         """Make all present and later waits end with CANCELED; ``closing``: without waiting for what other nodes say to that."""
@@ -71,6 +73,15 @@ class Token:
         if self._canceled:
             raise MagicError(Code.CANCELED, "canceled")
 
+    @contextmanager
+    def minding(self, check: Callable[[], None]) -> Iterator[None]:
+        """While inside, each wait that looks whether somebody is ``alive`` calls ``check`` as well, unless it is about an end."""
+        before, self._minded = self._minded, check
+        try:
+            yield
+        finally:
+            self._minded = before
+
     def poke(self, *_: Any) -> None:
         """Make waiters look at their condition again; fits as a future's done callback."""
         with self._condition:
@@ -90,6 +101,8 @@ class Token:
                     return False
                 if alive is not None:
                     alive()
+                    if heed_cancel:
+                        self._minded()
                 self._condition.wait(min(left, PRESENCE_PERIOD) if alive is not None else left)
             return True
 
@@ -158,6 +171,16 @@ class _Remote:
             seen = seen or self.ready()
 
         return still_there
+
+    def mind(self) -> Callable[[], None]:
+        """What raises SERVER_UNAVAILABLE once those who serve now have gone and nobody has come in their place."""
+        servers = presence.Watch(self.servers)
+
+        def to_be_asked() -> None:
+            if servers.gone() and not self.ready():
+                raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server}, still to be asked, has gone: nothing serves {self.name}")
+
+        return to_be_asked
 
     def _asked_again(self, ask: Callable[[float], Any], timeout: float) -> Any:
         """What ``ask(seconds left)`` returns, asked again where those asked have gone and others have come in their place meanwhile."""

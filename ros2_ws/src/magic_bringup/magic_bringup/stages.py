@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 import numpy as np
@@ -79,7 +80,7 @@ class Stages:
         server, self.strategy = self._server, request.strategy
         # First the servers: a run that cannot be verified is not begun.
         deadline = time.monotonic() + min(timeout, server.settings.presence)
-        needed = (server.matcher, server.planner, *([server.verifier] if self._needs_verifier else []))
+        needed = (server.matcher, server.planner, *self._verifier())
         for remote in needed:
             remote.require(max(0.0, deadline - time.monotonic()), self._token)
         if not self._token.wait(lambda: all(len(s) <= 1 for s in server.servers().values()), deadline, alive=lambda: None):
@@ -109,6 +110,20 @@ class Stages:
         if unknown:
             raise MagicError(Code.UNKNOWN_OBJECT, unknown[0], unknown[1], [o.id for o in scene.objects])
         self._take(scene, time.monotonic() + wait)
+
+    def _verifier(self) -> tuple[RemoteAction, ...]:
+        """The verifier, where this run needs it."""
+        return (self._server.verifier,) if self._needs_verifier else ()
+
+    def _minding(self, *remotes: RemoteAction) -> AbstractContextManager[None]:
+        """End waits while inside where one of these, to be asked later, has gone."""
+        checks = [remote.mind() for remote in remotes]
+
+        def still_there() -> None:
+            for check in checks:
+                check()
+
+        return self._token.minding(still_there)
 
     def _take(self, scene: SceneObjectArray, deadline: float) -> None:
         """Make a scene this run's own, told in the robot's base frame; waits a little for the transform.  Raises NO_TRANSFORM."""
@@ -169,7 +184,9 @@ class Stages:
         deadline = time.monotonic() + min(timeout, server.settings.match)
         patience = min(time.monotonic() + OBJECTS_LAG, deadline)
         while True:
-            answer = server.matcher.call(message, max(0.0, deadline - time.monotonic()), self._token, server.settings.presence)
+            # A match may take a minute: it is not waited for where nobody will be there to go on with it.
+            with self._minding(server.planner, *self._verifier()):
+                answer = server.matcher.call(message, max(0.0, deadline - time.monotonic()), self._token, server.settings.presence)
             # The ids were found in the objects that came here; the matcher may just be about to read the same message.
             if answer.code not in (Code.UNKNOWN_OBJECT, Code.NO_OBJECTS) and self._same_objects(answer):
                 break
@@ -239,7 +256,8 @@ class Stages:
         joints = server.joints.all()
         goal.start = JointState(name=list(joints), position=[j.position for j in joints.values()])
         self.state_known = bool(joints)
-        result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace).result
+        with self._minding(*self._verifier()):
+            result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace).result
         if result.code == Code.OK:
             self._check_plan(result.plan, request.variant)
         elif result.code == Code.JOINT_LIMIT:

@@ -766,6 +766,34 @@ def test_missing_server_and_missing_objects(folder):
         bench.close()
 
 
+@pytest.mark.parametrize("goes, at", [("plan", "match"), ("verify", "match"), ("verify", "plan")])
+def test_a_long_stage_is_not_waited_for_where_who_comes_after_it_has_gone(folder, goes, at):
+    bench = Bench(folder, services=tuple({"match", "plan", "verify"} - {goes}), server_timeout=10.0)
+    other = fakes.FakeServers("other", services=(goes,), context=bench.context)
+    bench.executor.add_node(other)
+    try:
+        bench.fakes.publish(fakes.scene())
+        begun, over = threading.Event(), threading.Event()
+
+        def wait():
+            begun.set()
+            over.wait(DEADLINE)
+
+        bench.fakes.on_match = lambda request: (wait() if at == "match" else None, fakes.FakeServers.match(request))[1]
+        bench.fakes.on_plan = lambda goal, canceled: (wait() if at == "plan" else None, fakes.FakeServers.plan(goal, canceled))[1]
+        answer = bench.send().get_result_async()
+        assert begun.wait(DEADLINE)
+        bench.executor.remove_node(other)
+        other.destroy_node()
+        bench.until(answer.done)
+        result = answer.result().result
+        assert result.code == Code.SERVER_UNAVAILABLE, result.message
+        assert {"plan": "planner", "verify": "verifier"}[goes] in result.message and "has gone" in result.message
+    finally:
+        over.set()
+        bench.close()
+
+
 def test_another_namespaces_diagnostics_are_not_read(folder):
     bench = Bench(folder)
     try:
