@@ -249,6 +249,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         tried.append({"code": error.code.name, "message": error.message})
     if options.source == "images":
         _judge(options, case, problem, runs, answer)
+        answer["seen"] = _seen(case, problem)
     if film is not None and runs and problem is not None:
         _draw(film, runs[-1], problem)
     seconds["total"] = sum(seconds.values())
@@ -292,6 +293,21 @@ def _judge(options: Options, case: Case, problem: _Problem | None, runs: list[_T
         answer["true"].append({"code": verdict.code.name, "message": verdict.message, "verified": run.verdict.success, **said})
     succeeded = [entry["code"] == Code.OK.name for entry in answer["true"]]
     answer["true_success"] = bool(succeeded) and (succeeded[-1] if answer["success"] else any(succeeded))
+
+
+def _seen(case: Case, problem: _Problem | None) -> list[dict[str, float]]:
+    """How sure perception was of each tool, how much of it was seen, and how far it is off (m)."""
+    if problem is None or problem.layout is None:
+        return []
+    true = dict(zip(case.tools, problem.layout.tools, strict=True))
+    return [
+        {
+            "confidence": round(float(tool.confidence), 3),
+            "seen_share": round(float(tool.seen_share), 3),
+            "surface_error": round(captured.surface_error(true[name], tool), 5),
+        }
+        for tool, name in zip(problem.tools, problem.names, strict=True)
+    ]
 
 
 def _reference(strategy: Strategy) -> Any:
@@ -554,6 +570,14 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
         title = f"{options.task}, {options.variant}: {len(motions)} motions (number at each point)"
         said, true = "success rate in simulation", "share that truly succeeds"
         reliability.draw(reliability.points(motions), out / "reliability.png", title, said, true)
+        for words, sure in (("above 0.5", True), ("up to 0.5", False)):
+            errors = [s["surface_error"] for c in done for s in c.get("seen", ()) if (s["confidence"] > 0.5) == sure]
+            if errors:
+                low, middle, high = 1000 * np.percentile(errors, [16, 50, 84])
+                text += (
+                    f"reconstructions of confidence {words}: surface error {middle:.1f} mm (the middle two thirds {low:.1f} to {high:.1f}) "
+                    f"of {len(errors)}\n"
+                )
     (out / "summary.txt").write_text(text)
     if films:
         contact_sheet(out / "films", done, True, out / "successes.png")
