@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.robot import Description
+from magic_core.robot import Description, RobotConfig
 from magic_core.robot_pictures import shape_mesh
 from magic_verifier.grip import Grip, Patch
 from magic_verifier.simulation import World, engine, from_pose
@@ -78,10 +78,20 @@ class ArmOptions:
         return list(zip(*found, strict=True))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)
+def described(config: RobotConfig) -> Description:
+    """The arm of a configuration, read once by each process."""
+    return Description(config)
+
+
 def panda() -> Description:
     """The arm that is simulated where no other one is given."""
-    return Description()
+    return described(RobotConfig())
+
+
+def prepare(robot: Description) -> None:
+    """Read what the first run with an arm would otherwise wait for."""
+    _prepared(robot)
 
 
 class Articulation:

@@ -214,7 +214,8 @@ class World:
             sleep_threshold=0.0,
         )
         self.scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
-        self.scene.physx_system.timestep = 1.0 / self.settings.frequency
+        self._system = self.scene.physx_system
+        self._system.timestep = 1.0 / self.settings.frequency
         self.time = 0.0
         self.steps = 0
         self._materials: dict[float, Any] = {}
@@ -401,7 +402,7 @@ class World:
 
     def step(self) -> None:
         """Advance by one step."""
-        self.scene.step()
+        self._system.step()
         self.steps += 1
         self.time = self.steps / self.settings.frequency
 
@@ -466,7 +467,7 @@ class World:
             self._sorted_at = self.steps
             self._sorted = {}
             names = self._names
-            for contact in self.scene.get_contacts():
+            for contact in self._system.get_contacts():
                 a, b = contact.bodies
                 pair = (names.get(a._physx_pointer, ""), names.get(b._physx_pointer, ""))
                 self._sorted.setdefault(pair, []).append(contact)

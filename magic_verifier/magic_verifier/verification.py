@@ -29,7 +29,7 @@ from magic_core import transforms
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
-from magic_core.robot import Description, RobotConfig
+from magic_core.robot import Description
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals, motion_check, uncertainty
@@ -425,15 +425,12 @@ class _Packed:
         return cls(pickle.dumps((replace(task, robot=None), None if task.robot is None else task.robot.config), pickle.HIGHEST_PROTOCOL))
 
 
-@lru_cache(maxsize=4)
-def _read(config: RobotConfig) -> Description:
-    return Description(config)
-
-
 @lru_cache(maxsize=2)
 def _unpacked(packed: _Packed) -> Task:
+    from magic_verifier.articulation import described
+
     task, config = pickle.loads(packed.content)
-    return replace(task, robot=None if config is None else _read(config))
+    return replace(task, robot=None if config is None else described(config))
 
 
 def _elsewhere(packed: _Packed, index: int) -> Outcome:

@@ -42,15 +42,16 @@ def _ready(parent: int) -> None:
     """Load what the first rollout would otherwise wait for; leave signals to the process that asked for this one."""
     import signal
 
+    import magic_verifier.verification  # noqa: F401
     from magic_core.threads import one_thread
-    from magic_verifier.articulation import panda
+    from magic_verifier.articulation import panda, prepare
     from magic_verifier.simulation import engine
 
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     one_thread()
     engine()
-    panda()
+    prepare(panda())
 
 
 def _end_with(parent: int) -> None:
