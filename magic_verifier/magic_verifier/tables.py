@@ -83,8 +83,7 @@ COLUMNS_5 = (
 )
 PAPER_5 = {"KETO": (66.4, 46.3, 71.7), "MAGIC": (75.6, 53.7, 76.3)}
 TASKS_FG = (("Scooping", "scooping"), ("Hanging", "hanging"), ("Hooking", "hooking"))
-#: Cases of a cell in the short run, by variant (an arm's takes half a minute: the other methods' are left to the full run); negative
-#: controls; cases from images.
+#: Cases of a cell in the short run, by variant (see :func:`short`); negative controls; cases from images.
 QUICK = {"fg": 3, "fg_no_selection": 3, "arm": 1}
 QUICK_CONTROLS, QUICK_IMAGES = 2, {"fg": 2, "arm": 1}
 #: The reports are written anew every so many seconds while cases run.
@@ -114,6 +113,13 @@ class Cell:
     def key(self) -> str:
         """A name for the options, the same in all tables."""
         return hashlib.sha256(json.dumps(vars(self.options), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def short(method: str, variant: str) -> int:
+    """Cases of the short run: an arm's and those of the curvature baseline, which looks at all of an outline, take longest."""
+    if variant == "arm":
+        return QUICK["arm"] if method == "magic" else 0
+    return 1 if method == "curvature" else QUICK[variant]
 
 
 def cases_of(cell: Cell, quick: bool) -> list[Case]:
@@ -147,19 +153,18 @@ def cells(seed: int = 0, strategies: str = "", weights: dict[str, str] | None = 
     result: list[Cell] = []
     for row, method in METHODS.items():
         for k, (column, task, variant) in enumerate(COLUMNS_1):
-            hanging = task == "hanging"
-            result.append(Cell("I", row, column, options(task, variant, method=method), QUICK[variant], PAPER_1[row][k], one_each=hanging))
+            given = options(task, variant, method=method)
+            result.append(Cell("I", row, column, given, short(method, variant), PAPER_1[row][k], one_each=task == "hanging"))
         for column, variant in (("Hanging on a rod FG", "fg"), ("Hanging on a rod Arm", "arm")):
-            count = 0 if variant == "arm" and method != "magic" else QUICK[variant]
-            result.append(Cell("I", row, column, replace(base, variant=variant, method=method), count))
+            result.append(Cell("I", row, column, replace(base, variant=variant, method=method), short(method, variant)))
         for column, task in TASKS_FG:
             variant = "fg_no_selection" if task == "hooking" else "fg"
             controls = replace(base, task=task, variant=variant, method=method, set="controls")
-            result.append(Cell("I", row, f"{column} controls", controls, QUICK_CONTROLS, control=True))
+            result.append(Cell("I", row, f"{column} controls", controls, min(QUICK_CONTROLS, short(method, "fg")), control=True))
         intra = options("hanging", method=method, demonstration=HELD_OUT_MUG)
-        result.append(Cell("II", row, "Hanging (intra-cat.)", intra, QUICK["fg"], PAPER_2[row][0], one_each=True))
+        result.append(Cell("II", row, "Hanging (intra-cat.)", intra, short(method, "fg"), PAPER_2[row][0], one_each=True))
         result.append(
-            Cell("II", row, "Hanging (inter-cat.)", options("hanging", method=method), QUICK["fg"], PAPER_2[row][1], one_each=True)
+            Cell("II", row, "Hanging (inter-cat.)", options("hanging", method=method), short(method, "fg"), PAPER_2[row][1], one_each=True)
         )
     for row, method in ROWS_3.items():
         features, missing = of_dino(method)
@@ -268,11 +273,13 @@ def run(
         if key in by_key:
             estimate.note(by_key[key], result)
     most = max((len(cases) for cases in wanted.values()), default=0)
-    # The first case of each cell, then the second of each, ...: what is there when it is stopped says something of everything.
+    # The first case of each cell, then the second of each, ..., our own method before the others: what is there when it is stopped
+    # says something of everything.
+    in_turn = sorted(by_key.items(), key=lambda item: item[1].options.method != "magic")
     waiting = [
         (cell, wanted[key][k])
         for k in range(most)
-        for key, cell in by_key.items()
+        for key, cell in in_turn
         if k < len(wanted[key]) and (key, wanted[key][k].name) not in store.done
     ]
     total = sum(len(cases) for cases in wanted.values())

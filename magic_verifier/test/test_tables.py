@@ -57,6 +57,16 @@ def test_the_short_run_is_the_beginning_of_the_long_one():
     assert long[:2] == short
 
 
+def test_the_short_run_leaves_out_what_takes_longest():
+    counts = {
+        (c.row, c.column): len(tables.cases_of(c, True)) for c in tables.cells(strategies=STRATEGIES) if c.table == "I" and not c.control
+    }
+    assert {n for (row, column), n in counts.items() if "Arm" in column and row != "MAGIC"} == {0}
+    assert {n for (row, column), n in counts.items() if "Arm" in column and row == "MAGIC"} == {1}
+    assert {n for (row, column), n in counts.items() if "Arm" not in column and row == "Curvature-Only"} == {1}
+    assert {n for (row, column), n in counts.items() if "Arm" not in column and row == "MAGIC"} == {3}
+
+
 def test_it_goes_on_where_it_stopped_even_in_the_middle_of_a_line(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "attempt", answer)
     tables.run([cell()], tmp_path, True, log=lambda text: None)
