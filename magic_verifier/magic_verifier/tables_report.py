@@ -57,6 +57,8 @@ class Figure:
 
 def figure(cell: Any, results: Sequence[Mapping[str, Any]], wanted: int) -> Figure:
     """The figure of a cell (:class:`magic_verifier.tables.Cell`) from its results, of which there are to be ``wanted``."""
+    if cell.missing:  # what is not run has no results, whoever else was run with the same options
+        results = ()
     hopeless = {r["object"]: r["impossible"] for r in results if r.get("impossible")}
     counted = [r for r in results if cell.control or r["object"] not in hopeless]
     failed = [r for r in counted if not r["success"]]

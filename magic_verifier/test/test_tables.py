@@ -116,6 +116,8 @@ def test_what_geometry_forbids_is_counted_apart_and_controls_are_not():
     controls = tables_report.figure(cell(control=True), results, 4)
     assert tables_report.words(controls) == "2 of 4 passed (should be 0)"
     assert tables_report.words(tables_report.figure(cell(missing=tables.NO_WEIGHTS), [], 0)) == "no weights at hand"
+    keto = tables_report.figure(cell(missing="the paper's figure alone"), results, 4)  # it shares its options with MAGIC
+    assert (keto.cases, keto.successes, dict(keto.reasons), list(keto.failures)) == (0, 0, {}, [])
 
 
 def test_results_do_not_depend_on_the_number_of_jobs(tmp_path):
