@@ -51,10 +51,12 @@ class Evidence:
     other.  floor: a part that begins below this height stands on the table.  neck: an upper part on the lower one's axis,
     both round, and narrower than this share of it is its neck.
     foot: least width of the lowest 25 mm of what stands on another part; a post grows out of its base.
-    doubts: so many criteria must speak against two things before they are joined.
+    doubts: so many criteria must speak against two things before they are joined.  colors: so many fewer do where the two have
+    each a colour of its own: their mean chromaticities differ by ``UNLIKE``, and four fifths of either's voxels are nearer to the own mean.
     """
 
     doubts: int = 2
+    colors: int = 2
 
     seam: int = 24
     sharp: float = 25.0
@@ -74,16 +76,17 @@ def parts(
     points: NDArray[np.floating],
     normal: NDArray[np.floating],
     heights: NDArray[np.floating],
+    color: NDArray[np.floating],
     voxel: float = 0.008,
     angle: float = 12.0,
     least: float = 0.12,
     evidence: Evidence = Evidence(),
 ) -> NDArray[np.int64]:
-    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table.
+    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table, chromaticity (N, 3).
 
     Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, and
     where at least half of the voxels next to both agree.  Parts with less than ``least`` of all points go to the
-    neighbour they touch most: a handle is no thing of its own.  What is left apart is joined again unless there is :class:`Evidence`.
+    neighbour they touch most, a handle is no thing of its own, unless their colour is another part's alone: a jaw that something else hides in part.  What is left apart is joined again unless there is :class:`Evidence`.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -119,10 +122,11 @@ def parts(
     keep = convex & (agree >= 0.5 * common)
     graph = coo_matrix((np.ones(keep.sum()), (a[keep], b[keep])), shape=(n, n))
     _, part = connected_components(graph, directed=False)
-    part = _join_small(part, a, b, count.astype(float), least)
+    shade = np.stack([np.bincount(index, color[sound][:, axis]) for axis in range(3)], axis=1) / count[:, None]
+    part = _join_small(part, a, b, count.astype(float), least, shade)
     if part.max() > 0:
         height = np.bincount(index, heights[sound]) / count
-        part = _join_unproven(part, centre, mean, height, a, b, (opening < 0) & (bend > evidence.sharp), bend, clear, evidence)
+        part = _join_unproven(part, centre, mean, height, shade, a, b, (opening < 0) & (bend > evidence.sharp), bend, clear, evidence)
     labels = np.zeros(len(points), np.int64)
     labels[sound] = part[index]
     if part.max() > 0 and (~sound).any():
@@ -130,10 +134,22 @@ def parts(
     return labels
 
 
+#: Largest difference in chromaticity (R, G, B over their sum) of two parts of one thing's colour, and least of two that differ.
+ALIKE, UNLIKE = 0.03, 0.10
+
+
 def _join_small(
-    part: NDArray[np.int64], a: NDArray[np.int64], b: NDArray[np.int64], weight: NDArray[np.float64], least: float
+    part: NDArray[np.int64],
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+    weight: NDArray[np.float64],
+    least: float,
+    shade: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Parts of too few points, smallest first, into the neighbour with the longest common border; without one into the largest part."""
+    """Parts of too few points, smallest first, into the neighbour with the longest common border; without one into the largest part.
+
+    A part whose neighbour has another colour goes to the largest part of its own colour, if there is one.  shade (V, 3): chromaticity of the voxels.
+    """
     part = np.unique(part, return_inverse=True)[1]
     total = int(part.max()) + 1
     sizes = np.bincount(part, weight)
@@ -142,12 +158,18 @@ def _join_small(
     border = border + border.T
     np.fill_diagonal(border, 0)
     owner = np.arange(total)
+    tint = np.stack([np.bincount(part, weight * shade[:, axis]) for axis in range(3)], axis=1) / sizes[:, None]
+    large = sizes >= least * weight.sum()
     while True:
         small = np.nonzero((sizes > 0) & (sizes < least * weight.sum()))[0]
         if len(small) == 0:
             break
         i = int(small[np.argmin(sizes[small])])
         target = int(np.argmax(border[i])) if border[i].max() > 0 else int(np.argmax(np.where(np.arange(total) == i, -1, sizes)))
+        apart = np.linalg.norm(tint - tint[i], axis=1)
+        own = large & (apart < ALIKE)
+        if large[target] and apart[target] > UNLIKE and own.any():
+            target = int(np.argmax(np.where(own, sizes, -1)))
         owner[owner == i] = target
         sizes[target] += sizes[i]
         sizes[i] = 0
@@ -159,7 +181,7 @@ def _join_small(
 
 
 def _join_unproven(
-    part: NDArray[np.int64], centre: NDArray[np.float64], normal: NDArray[np.float64], height: NDArray[np.float64],
+    part: NDArray[np.int64], centre: NDArray[np.float64], normal: NDArray[np.float64], height: NDArray[np.float64], shade: NDArray[np.float64],
     a: NDArray[np.int64], b: NDArray[np.int64], concave: NDArray[np.bool_], bend: NDArray[np.float64], clear: NDArray[np.bool_], evidence: Evidence,
 ) -> NDArray[np.int64]:  # fmt: skip
     """Parts of voxels joined again until there is evidence between all that touch: first a bar with what it ends at (a mallet's handle
@@ -178,7 +200,8 @@ def _join_unproven(
                 angle = float(np.median(bend[told])) if told.any() else 0.0
                 if int(told.sum()) < evidence.seam:
                     share = 0.0
-                if _doubts(centre, normal, height, part == i, part == j, share, angle, evidence) < evidence.doubts:
+                doubts = _doubts(centre, normal, height, part == i, part == j, share, angle, evidence)
+                if doubts < evidence.doubts + evidence.colors * _two_colors(shade[part == i], shade[part == j]):
                     continue
                 seam = np.concatenate([a[across], b[across]])
                 rank = (not (_ends_at(centre, part == i, seam, evidence) or _ends_at(centre, part == j, seam, evidence)), share)
@@ -198,6 +221,17 @@ def _join_unproven(
         part = np.where(part == worst[1], worst[2], part)
         part = np.unique(part, return_inverse=True)[1]
     return part
+
+
+def _two_colors(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+    """Whether the voxels of two parts (N, 3) have each a chromaticity of their own."""
+    means = first.mean(axis=0), second.mean(axis=0)
+    if float(np.linalg.norm(means[0] - means[1])) < UNLIKE:
+        return False
+    near = [
+        np.linalg.norm(shade - means[i], axis=1) < np.linalg.norm(shade - means[1 - i], axis=1) for i, shade in enumerate((first, second))
+    ]
+    return all(float(n.mean()) > 0.8 for n in near)
 
 
 def _ends_at(centre: NDArray[np.float64], members: NDArray[np.bool_], seam: NDArray[np.int64], evidence: Evidence) -> bool:

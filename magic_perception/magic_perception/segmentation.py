@@ -483,6 +483,8 @@ class DepthSegmenter:
     ) -> NDArray[np.int64]:
         """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
         heights = np.concatenate([looked.heights[where] for looked, where in zip(looks, spots, strict=True)])
+        color = np.concatenate([looked.frame.color[where] for looked, where in zip(looks, spots, strict=True)]).astype(np.float32)
+        color /= np.maximum(color.sum(axis=1, keepdims=True), 1)
         following = int(instance.max(initial=-1)) + 1
         members = [np.nonzero(instance == label)[0] for label in range(following)]
         tall = [mine for mine in members if len(mine) >= 1500 and np.percentile(heights[mine], 97) >= 0.05]
@@ -504,7 +506,7 @@ class DepthSegmenter:
                 normal[start + near] = field[rows[near] - r0, columns[near] - c0]
             start += len(rows)
         for mine in tall:
-            part = convexity.parts(cloud[mine], normal[mine], heights[mine])
+            part = convexity.parts(cloud[mine], normal[mine], heights[mine], color[mine])
             for number in range(1, int(part.max()) + 1):
                 instance[mine[part == number]] = following
                 following += 1

@@ -195,12 +195,14 @@ def _enclosed(like: NDArray[np.bool_], mask: NDArray[np.bool_], share: float = 0
 
 #: Of a pixel whose depth is not the thing's: its own largest height over the table, and that which the mask has nearby at least, m; pixels.
 LOW, HIGH, NEARBY = 0.008, 0.030, 6
+#: A bar up to so many pixels wide has the depth of what is behind it mixed into its own; there a fall of so many metres nearby is none of the bar's.
+BAR, FALL = 11, 0.015
 
 
 def behind(mask: NDArray[np.bool_], heights: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Pixels (H, W) of a mask at which depth shows the table behind the thing: at a thin bar the background's depth may win.
 
-    heights (H, W) metres above the table.  They are as low as the table where the thing is high all around.
+    heights (H, W) metres above the table.  They are as low as the table where the thing is high all around, or fall off in a thin bar.
     """
     x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
     result = np.zeros_like(mask)
@@ -209,6 +211,10 @@ def behind(mask: NDArray[np.bool_], heights: NDArray[np.float32]) -> NDArray[np.
     cut = (slice(y, y + h), slice(x, x + w))
     zero = np.where(mask[cut], np.nan_to_num(heights[cut]), np.float32(0))
     around = cv2.dilate(zero, np.ones((2 * NEARBY + 1,) * 2, np.uint8))
+    bar = mask[cut] & (
+        cv2.morphologyEx(mask[cut].view(np.uint8), cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (BAR, BAR))) == 0
+    )
     with np.errstate(invalid="ignore"):
-        result[cut] = mask[cut] & (heights[cut] < LOW) & (around > HIGH)
+        low = (heights[cut] < LOW) & (around > HIGH)
+        result[cut] = mask[cut] & (low | (bar & (heights[cut] < around - FALL)))
     return result

@@ -23,7 +23,11 @@ OBJECTS = (("l_hook", 1, 0.50, -0.10, 0.4), ("cylinder", 1, 0.62, 0.12, 0.0), ("
 EYES = ((0.25, 0.45, 0.62), (0.25, -0.45, 0.62))
 
 #: What is measured in all: from the masks on, and from the images on, to meshes with convex pieces.
-SUMS = {"masks to meshes": ("meshes",), "images to meshes": ("table", "masks", "meshes"), "all": ("table", "masks", "meshes", "views")}
+SUMS = {
+    "masks to meshes": ("meshes",),
+    "images to meshes": ("table", "masks", "cameras", "meshes"),
+    "all": ("table", "masks", "cameras", "meshes", "views"),
+}
 
 
 def frame_pairs(count: int, seed: int = 0) -> list[list[RgbdFrame]]:

@@ -379,7 +379,8 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
     cell = 0.001
     start = float(body.profile[:, 0].min()) - 0.004
     top = float(max(body.profile[-1, 1], np.percentile(out[:, 2], 99))) + 0.004
-    s = np.arange(start, float(np.percentile(local @ along, 99.5)) + 0.006, cell)
+    # Farther out than its points: depth may have lost its bow.
+    s = np.arange(start, float(np.percentile(local @ along, 99.5)) + 0.025, cell)
     z = np.arange(0.0, top, cell)
     grid_s, grid_z = np.meshgrid(s, z)
     base = np.array([*body.axis, 0.0])
@@ -396,10 +397,14 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
     near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
     if useful:
         # Where depth lost a thin bar, the mask beside the body's outline is the handle's.
-        near |= _connected(near | np.any([_beside(sight, body, plane) for sight in useful], axis=0), near)
+        beside = [_beside(sight, body) for sight in useful]
+        thickness = min([thickness, *(_widest(sight, mask, plane) for sight, mask in zip(useful, beside, strict=True))])
+        seen = [sight.look_up(plane, mask.astype(np.float32)) > 0.5 for sight, mask in zip(useful, beside, strict=True)]
+        near |= _connected(near | np.any(seen, axis=0), near)
         # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
         columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
-        field = carve(useful, columns, max(0.02, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
+        # Of a bar no wider than the smear of depth a measurement a little behind it says nothing: only one far behind shows a hole.
+        field = carve(useful, columns, max(0.04, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
     else:
         field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
     solid = _bars(field > 0.5, near, grid_s, grid_z, body)
@@ -432,8 +437,8 @@ def _standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> 
     return out[np.isin(labels, np.flatnonzero((off < apart) & (sizes >= 8)))]
 
 
-def _beside(sight: Sight, body: Body, plane: NDArray[np.float64], margin: int = 3) -> NDArray[np.bool_]:
-    """Which cells (Z, S, 3) of a handle's plane a camera sees in the mask, and not before or behind the round body."""
+def _beside(sight: Sight, body: Body, margin: int = 3) -> NDArray[np.bool_]:
+    """The part of a camera's mask (H, W) that is not before or behind the round body."""
     turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     radius, z = body.profile.T
     rings = np.stack(
@@ -448,7 +453,16 @@ def _beside(sight: Sight, body: Body, plane: NDArray[np.float64], margin: int = 
     for low, high in itertools.pairwise(sight.pixels(rings)):
         cv2.fillConvexPoly(drawn, cv2.convexHull(np.concatenate([low, high])).round().astype(np.int32), 1)
     drawn = cv2.dilate(drawn, np.ones((2 * margin + 1,) * 2, np.uint8))
-    return sight.look_up(plane, (sight.mask & (drawn == 0)).astype(np.float32)) > 0.5
+    return sight.mask & (drawn == 0)
+
+
+def _widest(sight: Sight, mask: NDArray[np.bool_], plane: NDArray[np.float64]) -> float:
+    """How wide a handle's bar is at its widest in a mask, metres at the handle's plane (Z, S, 3), and no less than 5 mm; a bar is about as thick."""
+    if not mask.any():
+        return float("inf")
+    distance = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, 5)
+    away = float(np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye))
+    return max(2 * float(distance.max()) * away / sight.intrinsics.fx, 0.005)
 
 
 def _connected(field: NDArray[np.bool_], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
