@@ -475,7 +475,7 @@ class DepthSegmenter:
         labels = [_fill(image, mask) for image, mask in zip(_sizeable(labels, looks, parameters), masks, strict=True)]
         for image, known_pixels in zip(labels, fixed, strict=True):
             image[known_pixels] = -1
-        return _attached(labels, looks, parameters)
+        return _behind_one(_attached(labels, looks, parameters), looks, parameters)
 
     @staticmethod
     def _split(
@@ -611,6 +611,74 @@ def _attached(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: 
             owner[label] = owner[owner[label]]
     owner[-1] = -1
     return _sizeable([owner[image] for image in labels], looks, parameters)
+
+
+#: Two parts on both sides of what hides the middle of one thing: how much nearer that is, and how far the tops may differ in height, m; least
+#: common share of their histograms of colour; and so many pixels are between what is compared across an edge, of which there are so many at least.
+NEARER, LEVEL, COMMON, ACROSS, EDGES = 0.012, 0.015, 0.5, 8, 8
+
+
+def _behind_one(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
+    """Labels with the parts of one thing that another hides in its middle joined: of one colour, equally high, and nothing but that other between."""
+    from scipy.spatial import cKDTree
+
+    top = max((int(image.max()) for image in labels), default=0)
+    owner = np.arange(top + 2)
+    for look, image in zip(looks, labels, strict=True):
+        hides = _hides(image, look.frame.depth)
+        for front in {f for _, f in hides}:
+            parts = sorted({back for back, f in hides if f == front})
+            for i, a in enumerate(parts):
+                for b in parts[i + 1 :]:
+                    if owner[a] == owner[b]:
+                        continue
+                    one, two = (_part(look, image == label) for label in (a, b))
+                    if min(len(one[0]), len(two[0])) < 40 or abs(one[1] - two[1]) > LEVEL or np.minimum(one[2], two[2]).sum() < COMMON:
+                        continue
+                    distance, nearest = cKDTree(two[0]).query(one[0])
+                    order = np.argsort(distance)[:20]
+                    ways = np.linspace(one[0][order], two[0][nearest[order]], 12)[1:-1]
+                    k = look.frame.intrinsics
+                    local = transforms.apply(transforms.inverse(look.frame.world_from_camera), ways.reshape(-1, 3).astype(float))
+                    u = np.clip(np.rint(k.fx * local[:, 0] / local[:, 2] + k.cx), 0, k.width - 1).astype(int)
+                    v = np.clip(np.rint(k.fy * local[:, 1] / local[:, 2] + k.cy), 0, k.height - 1).astype(int)
+                    met = image[v, u]
+                    if float(np.isin(met, (front, a, b)).mean()) > 0.8 and bool((met == front).any()):
+                        owner[owner == max(owner[a], owner[b])] = min(owner[a], owner[b])
+    if np.array_equal(owner, np.arange(top + 2)):
+        return labels
+    owner[-1] = -1
+    return _sizeable([owner[image] for image in labels], looks, parameters)
+
+
+def _hides(image: NDArray[np.int32], depth: NDArray[np.float32]) -> list[tuple[int, int]]:
+    """Pairs of labels (behind, before) that meet in a picture along an edge where the second is nearer."""
+    found: dict[tuple[int, int], int] = {}
+    for axis in range(2):
+        first, second = (np.moveaxis(image, axis, 0)[part] for part in (slice(None, -ACROSS), slice(ACROSS, None)))
+        rows, columns = np.nonzero((first != second) & (first > 0) & (second > 0))
+        if len(rows) == 0:
+            continue
+        z = np.moveaxis(depth, axis, 0)
+        step = z[rows + ACROSS, columns] - z[rows, columns]
+        for sign, pair in ((1, (second, first)), (-1, (first, second))):
+            far = sign * step > NEARER
+            keys, counts = np.unique(np.stack([p[rows[far], columns[far]] for p in pair]), axis=1, return_counts=True)
+            for (back, front), count in zip(keys.T, counts, strict=True):
+                found[int(back), int(front)] = found.get((int(back), int(front)), 0) + int(count)
+    return [pair for pair, count in found.items() if count >= EDGES * ACROSS]
+
+
+def _part(look: Looked, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float, NDArray[np.float64]]:
+    """Points (N, 3) of a mask, the height of its top and its histogram of the two colour axes, which sums to 1."""
+    rows, columns = np.nonzero(mask & np.isfinite(look.heights))
+    if len(rows) == 0:
+        return np.zeros((0, 3), np.float32), 0.0, np.zeros(256)
+    step = max(1, len(rows) // 1500)
+    rows, columns = rows[::step], columns[::step]
+    lab = cv2.cvtColor(np.ascontiguousarray(look.frame.color[rows, columns][None]), cv2.COLOR_RGB2LAB)[0].astype(int)
+    histogram = np.bincount((np.clip(lab[:, 1] - 64, 0, 127) // 8) * 16 + np.clip(lab[:, 2] - 64, 0, 127) // 8, minlength=256) / len(lab)
+    return look.points(rows, columns), float(np.percentile(look.heights[rows, columns], 95)), histogram
 
 
 def _sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
