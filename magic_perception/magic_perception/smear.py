@@ -146,13 +146,14 @@ def _smeared(near: _Near, told: NDArray[np.float32], within: NDArray[np.float32]
     removed = np.zeros_like(empty)
     _, parts, stats, _ = cv2.connectedComponentsWithStats(empty.view(np.uint8), connectivity=4)
     for i, (x, y, w, h, area) in enumerate(stats[1:], 1):
+        if area < LEAST:
+            continue
         cut = (slice(max(y - 4, 0), y + h + 4), slice(max(x - 4, 0), x + w + 4))
         part = parts[cut] == i
-        if area >= LEAST and float(within[cut][part].max()) < deep and _hole(near, part, empty[cut], told[cut][part], cut):
+        if float(within[cut][part].max()) < deep and _hole(near, part, empty[cut], told[cut][part], cut):
             removed[cut] |= part
     # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
-    inner = (empty & ~removed & (within > reach + 1)).view(np.uint8)
-    own = cv2.dilate(inner, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 3,) * 2)) > 0
+    own = _around(empty & ~removed & (within > reach + 1), reach + 1)
     return removed | _connected(empty & (within <= reach) & ~own, outside)
 
 
@@ -166,6 +167,11 @@ def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: 
     if len(inside) < 0.7 * len(told) or (len(rim) > 8 and float(np.median(inside)) > float(np.median(rim)) + HOLLOW):
         return True
     return float(np.median(near.unlike[cut][part])) < SAME
+
+
+def _around(mask: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:
+    """What lies within ``reach`` pixels of a mask."""
+    return mask if not mask.any() else cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3) <= reach
 
 
 def _connected(field: NDArray[np.bool_], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -211,9 +217,8 @@ def behind(mask: NDArray[np.bool_], heights: NDArray[np.float32]) -> NDArray[np.
     cut = (slice(y, y + h), slice(x, x + w))
     zero = np.where(mask[cut], np.nan_to_num(heights[cut]), np.float32(0))
     around = cv2.dilate(zero, np.ones((2 * NEARBY + 1,) * 2, np.uint8))
-    bar = mask[cut] & (
-        cv2.morphologyEx(mask[cut].view(np.uint8), cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (BAR, BAR))) == 0
-    )
+    within = cv2.distanceTransform(np.pad(mask[cut], 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    bar = mask[cut] & ~_around(within > BAR / 2, BAR / 2)
     with np.errstate(invalid="ignore"):
         low = (heights[cut] < LOW) & (around > HIGH)
         result[cut] = mask[cut] & (low | (bar & (heights[cut] < around - FALL)))

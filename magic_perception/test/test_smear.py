@@ -76,3 +76,20 @@ def test_the_hole_of_a_handle_opens_under_smeared_depth() -> None:
     ]
     scene = perceive(frames, parameters=Parameters())
     assert [item.view.kind for item in scene.objects] == ["side"]
+
+
+def test_a_bar_whose_middle_a_thing_of_another_colour_hides_is_one() -> None:
+    import trimesh
+
+    from magic_core.mesh import Mesh
+
+    def solid(shape: trimesh.Trimesh, x: float, y: float, color: tuple[int, int, int]) -> Mesh:
+        return scenes.placed(Mesh(shape.vertices, shape.faces).painted(color), x, y)
+
+    bar = solid(trimesh.creation.box((0.03, 0.26, 0.02)), 0.58, 0.0, (96, 98, 112))
+    tin = solid(trimesh.creation.cylinder(0.03, 0.06), 0.58 - 0.015 - 0.003 - 0.03, 0.0, (180, 40, 40))
+    pose = scenes.pose([0.1, 0.0, 0.35], [0.56, 0.0, 0.0])
+    scene = perceive([sensor.capture([bar, tin], scenes.INTRINSICS, pose, 2)], parameters=Parameters())
+    sizes = sorted(float(item.box_extents.max()) for item in scene.objects)
+    assert len(sizes) == 2
+    assert sizes == pytest.approx([0.06, 0.26], abs=0.01)
