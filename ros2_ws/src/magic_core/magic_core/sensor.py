@@ -84,7 +84,7 @@ class DepthModel:
 
 
 #: A D435 with the smear at edges and the filled holes that recorded depth images of small things show: at mugs with their handle to the side depth
-#: reaches 3 to 8 pixels of the colour image past the colour's edge, and holes of 8 to 12 pixels are closed.
+#: reaches some 3 to 8 pixels of the colour image past the colour's edge, and holes of 8 to 12 pixels are closed, as read off pictures.
 SMEARED = DepthModel(window=9, filled=6)
 
 
