@@ -178,7 +178,7 @@ class _Remote:
 
         def to_be_asked() -> None:
             if servers.gone() and not self.ready():
-                raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server}, still to be asked, has gone: nothing serves {self.name}")
+                raise MagicError(Code.SERVER_UNAVAILABLE, f"the {self.server} has gone: nothing serves {self.name} any more")
 
         return to_be_asked
 

@@ -66,6 +66,7 @@ class Stages:
         self._run = run
         self._heatmap = heatmap
         self._token = token
+        self._minds: dict[str, Callable[[], None]] = {}  # by a server's name, since the run began
         self._needs_verifier = needs_verifier
         self.strategy = ""
         self._seen: SceneObjectArray | None = None  # the same objects as they came
@@ -96,6 +97,7 @@ class Stages:
                 len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
             )
 
+        self._minds = {remote.name: remote.mind() for remote in (server.planner, *self._verifier())}
         watches = [server.objects_watch(), *(remote.watch() for remote in needed)]
 
         def still_there() -> None:
@@ -116,8 +118,8 @@ class Stages:
         return (self._server.verifier,) if self._needs_verifier else ()
 
     def _minding(self, *remotes: RemoteAction) -> AbstractContextManager[None]:
-        """End waits while inside where one of these, to be asked later, has gone."""
-        checks = [remote.mind() for remote in remotes]
+        """End waits while inside where one of these, to be asked now or later, has gone since the run began."""
+        checks = [self._minds[remote.name] for remote in remotes if remote.name in self._minds]
 
         def still_there() -> None:
             for check in checks:
@@ -256,7 +258,7 @@ class Stages:
         joints = server.joints.all()
         goal.start = JointState(name=list(joints), position=[j.position for j in joints.values()])
         self.state_known = bool(joints)
-        with self._minding(*self._verifier()):
+        with self._minding(server.planner, *self._verifier()):
             result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace).result
         if result.code == Code.OK:
             self._check_plan(result.plan, request.variant)
@@ -297,7 +299,8 @@ class Stages:
             seed=request.seed,
             timeout=timeout,
         )
-        answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+        with self._minding(server.verifier):
+            answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
         result = answer.result
         self._last_goal, self._last_code = goal, result.code
         code = code_of(result.code)
