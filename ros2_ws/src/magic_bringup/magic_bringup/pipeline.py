@@ -82,13 +82,17 @@ class Settings:
 
 @dataclass(frozen=True)
 class Matches:
-    """What the matcher answered, best candidate first; a candidate has ``flipped``, ``score`` and ``tool_id``."""
+    """What the matcher answered, best candidate first; a candidate has ``flipped``, ``score`` and ``tool_id``.
+
+    doubts: why the objects themselves may be at fault where nothing succeeds, a sentence each.
+    """
 
     candidates: Sequence[Any]
     target_id: str
     features: str = ""
     heatmap: Any = None
     message: str = ""
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -302,7 +306,7 @@ class Run:
             if outcome is not None:
                 return outcome
             agenda.failed(promise, trial, code)
-        return self._outcome(Code.NO_CANDIDATE_SUCCEEDED, self._summary())
+        return self._outcome(Code.NO_CANDIDATE_SUCCEEDED, "; ".join([self._summary(), *matches.doubts]))
 
     def _try(self, matches: Matches, trial: Trial) -> tuple[Outcome | None, Code]:
         request = self._request

@@ -29,6 +29,20 @@ OBJECTS_LAG = 5.0
 SAME_POINT = 1e-6
 
 
+#: A reconstruction below this confidence is hardly ever right (``magic_perception/README.md``).
+DOUBTFUL = 0.2
+
+
+def doubt(item: SceneObject) -> str:
+    """Why an object as it was reconstructed may not be what stands there; empty where it probably is."""
+    if item.source == SceneObject.KNOWN or item.confidence >= DOUBTFUL:
+        return ""
+    return (
+        f"{item.id} is a doubtful reconstruction (confidence {item.confidence:.2f}, {100 * item.seen_share:.0f} % of its surface seen): "
+        "a hole or a hollow that no view shows is not in it; turn it, or look from another side"
+    )
+
+
 class Server(Protocol):
     """What the stages need of the strategy server, a node."""
 
@@ -201,7 +215,9 @@ class Stages:
         target_id = answer.target_id or request.target_id
         scores = ", ".join(f"{c.tool_id} {c.score:.3f}" for c in answer.candidates)
         sentence = f"{len(answer.candidates)} candidates for {target_id} ({scores}), {answer.features} features, {answer.seconds:.2f} s"
-        self.matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, sentence)
+        involved = {target_id, *(c.tool_id for c in answer.candidates)}
+        doubts = tuple(text for o in self.scene.objects if o.id in involved and (text := doubt(o)))
+        self.matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, sentence, doubts)
         return self.matches
 
     def _same_objects(self, answer: MatchContact.Response) -> bool:

@@ -176,6 +176,18 @@ def test_a_verified_arm_trajectory_is_published(bench):
     assert not bench.messages["tool"]
 
 
+def test_what_fails_with_a_doubtful_reconstruction_says_so(bench):
+    scene = fakes.scene()
+    doubtful = replace(scene.objects[0], confidence=0.03, seen_share=0.41)
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+    assert "doubtful" not in bench.run()[0].message
+    bench.fakes.publish(replace(scene, objects=(doubtful, *scene.objects[1:])))
+    bench.wait(lambda: bench.server.scene is not None and bench.server.scene.objects[0].confidence < 0.1)
+    message = bench.run()[0].message
+    assert "; object_1 is a doubtful reconstruction (confidence 0.03, 41 % of its surface seen)" in message
+    assert "object_2 is" not in message
+
+
 def test_nothing_unverified_is_published(bench):
     bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
     result, status = bench.run()
