@@ -23,7 +23,7 @@ from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, Phase, ToolMotion
 
 #: Seconds that a goal here may take.
-ALLOWED = 10.0
+ALLOWED = 60.0
 
 
 @pytest.fixture(scope="module")

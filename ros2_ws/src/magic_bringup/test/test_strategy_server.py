@@ -30,7 +30,7 @@ from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.msg import VerifiedMotion
 from magic_interfaces.srv import MatchContact
 
-DEADLINE = 15.0
+DEADLINE = 60.0
 
 
 class Bench:

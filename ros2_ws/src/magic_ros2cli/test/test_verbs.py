@@ -23,7 +23,7 @@ ENVIRONMENT = {
     "PYTHONUNBUFFERED": "1",
 }
 ROS2 = [sys.executable, "-c", "import sys; from magic_ros2cli.main import main; sys.exit(main())"]
-TIMEOUT = 20.0
+TIMEOUT = 60.0
 
 
 def ros2(*arguments: str) -> subprocess.CompletedProcess[str]:
