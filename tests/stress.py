@@ -15,7 +15,8 @@ Parts, each of which may be run alone:
     kills      each node killed while a run is at each stage: an answer within 5 s, and the next run works
 
 A process grows where its memory, its children's with it, has a slope over the cases after the warm-up that is above what is called
-flat below: the median of the slopes between any two cases, which a single step does not move.
+flat below: the median of the slopes between any two cases, which single outliers do not move.  A step that stays does, where it comes
+in the middle.
 
 What is done is kept in ``--out`` after every case; the same command goes on where it was interrupted.  It ends with a table, and with
 status 1 where something did not hold.  ``--quick``: a twentieth of each part.

@@ -89,6 +89,10 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
     except (MagicError, ParameterException) as error:
         print(f"{getattr(node_type, '__name__', 'node')} cannot start: {error}", file=sys.stderr)
         status = 1
+    except Exception:
+        # A library that the interrupt meets while it is being loaded makes an error of its own of it (Open3D: an ImportError).
+        if spinning or not _TOLD_TO_END.is_set():
+            raise
     finally:
         # A second signal during the shutdown must not leave a traceback behind.
         signal.signal(signal.SIGINT, signal.SIG_IGN)

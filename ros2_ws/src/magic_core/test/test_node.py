@@ -148,6 +148,29 @@ def test_a_signal_during_the_start_ends_it(start):
     assert process.wait() == 0, process.lines
 
 
+def test_a_signal_that_a_library_makes_another_error_of_during_the_start_ends_it_too(start):
+    """As Open3D does while it is being imported."""
+    process = start(
+        """
+            print("loading")
+            try:
+                time.sleep(1000.0)
+            except KeyboardInterrupt as error:
+                raise ImportError("initialization failed") from error
+        """
+    )
+    process.said("loading")
+    process.popen.send_signal(signal.SIGINT)
+    assert process.wait() == 0, process.lines
+    assert not any("Traceback" in line for line in process.lines), process.lines
+
+
+def test_an_error_during_the_start_that_no_signal_made_is_not_hidden(start):
+    process = start('raise ImportError("initialization failed")')
+    assert process.wait() == 1
+    assert any("ImportError: initialization failed" in line for line in process.lines), process.lines
+
+
 def test_a_goal_at_work_hears_that_its_process_is_to_end(start):
     process = start(
         """
