@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import gc
 import os
 import signal
 import sys
@@ -103,6 +104,12 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         rclpy.try_shutdown()
     if not ended:  # Python would wait for such a thread without a limit
         print("a callback has not ended in time and is left", file=sys.stderr, flush=True)
+        os._exit(status)
+    if _TOLD_TO_END.is_set() and not spinning:
+        # What was being loaded is there by half, and the destructors of such a library may set a status of their own (Open3D: 1).
+        gc.collect()  # of the node that was not finished, what ROS has of it
+        sys.stdout.flush()
+        sys.stderr.flush()
         os._exit(status)
     sys.exit(status)
 

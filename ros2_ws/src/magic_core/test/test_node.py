@@ -165,6 +165,21 @@ def test_a_signal_that_a_library_makes_another_error_of_during_the_start_ends_it
     assert not any("Traceback" in line for line in process.lines), process.lines
 
 
+def test_what_a_library_that_is_loaded_by_half_does_at_the_end_does_not_set_the_status(start):
+    """As the destructors of Open3D do."""
+    process = start(
+        """
+            import atexit, os
+            atexit.register(os._exit, 1)
+            print("loading")
+            time.sleep(1000.0)
+        """
+    )
+    process.said("loading")
+    process.popen.send_signal(signal.SIGTERM)
+    assert process.wait() == 0, process.lines
+
+
 def test_an_error_during_the_start_that_no_signal_made_is_not_hidden(start):
     process = start('raise ImportError("initialization failed")')
     assert process.wait() == 1
