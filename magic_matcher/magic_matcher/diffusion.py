@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -22,11 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
-from magic_core.scene import CanonicalView
 from magic_matcher import global_matching
-from magic_matcher.contour import Contour
 from magic_matcher.dinov2 import Dinov2Features
-from magic_matcher.features import GlobalMatch, Reference
 
 #: Step of the noise, up blocks, and draws of the noise that are averaged.
 DIFT_STEP, DIFT_BLOCKS, DIFT_DRAWS = 261, (1,), 8
@@ -89,14 +85,8 @@ class UNet:
 
     def key(self) -> str:
         """A name for weights (for a folder the files' sizes and times) and settings."""
-        digest = hashlib.sha256(
-            f"{self._weights} {self.size} {self._step} {self._blocks} {self._draws} {self._seed} {self._dtype}".encode()
-        )
-        folder = Path(self._weights)
-        if folder.is_dir():
-            for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-                digest.update(f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}".encode())
-        return digest.hexdigest()
+        text = f"{self.size} {self._step} {self._blocks} {self._draws} {self._seed} {self._dtype}"
+        return hashlib.sha256(f"{global_matching.state_of(self._weights)} {text}".encode()).hexdigest()
 
     def maps(self, picture: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
         """Feature maps (n_k, n_k, d_k), one for each of the blocks, of a picture (S, S, 3) uint8 RGB."""
@@ -125,20 +115,12 @@ class UNet:
                 hook.remove()
 
 
-def _unit(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    return features / np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-8)
-
-
-class DiffusionFeatures:
+class DiffusionFeatures(global_matching.NetworkFeatures):
     """A backend on :class:`UNet`, with DINOv2's tokens beside where ``dino`` is given.
 
     What it does with the feature maps is what :class:`magic_matcher.dinov2.Dinov2Features` does; aggregation, components, rotations and
     reflections as there.
     """
-
-    # As of DINOv2: cosines after a joint PCA have no common scale.
-    floor = 0.0
-    clear = float("inf")
 
     def __init__(
         self,
@@ -172,23 +154,15 @@ class DiffusionFeatures:
                 maps = self._unet.maps(picture)
             # Channel by channel: OpenCV resizes no more than 512 of them together.
             scaled = [np.stack([cv2.resize(plane, (n, n)) for plane in np.moveaxis(m, -1, 0)], axis=-1) for m in maps]
-            found.append(scaled[0] if len(scaled) == 1 else np.concatenate([_unit(m) for m in scaled], axis=-1))
+            found.append(scaled[0] if len(scaled) == 1 else np.concatenate([global_matching.unit(m) for m in scaled], axis=-1))
         features = np.stack(found)
         if self._dino is None:
             return features
         side = self._dino.size
         tokens = self._dino.extract(np.stack([cv2.resize(p, (side, side), interpolation=cv2.INTER_AREA) for p in pictures]))
-        return np.concatenate([np.sqrt(SHARE) * _unit(features), np.sqrt(1 - SHARE) * _unit(tokens)], axis=-1).astype(np.float32)
-
-    def prepare(self, reference: Reference) -> global_matching.PreparedGlobal:
-        """The reference's 24 views through the networks, once."""
-        return global_matching.prepare(reference.view, reference.pixel, self.extract, self.size, self._views)
-
-    def propose(
-        self, prepared: Any, view: CanonicalView, contour: Contour, target_radius: float | None, count: int, heatmap: bool = False
-    ) -> GlobalMatch:
-        """One pass of the networks, then the best places over all relative views."""
-        return global_matching.propose(prepared, view, self.extract, self.size, count, self.aggregation, self.components, heatmap)
+        return np.concatenate(
+            [np.sqrt(SHARE) * global_matching.unit(features), np.sqrt(1 - SHARE) * global_matching.unit(tokens)], axis=-1
+        ).astype(np.float32)
 
 
 def dift(weights: str, device: str = "cpu", size: int = 768, draws: int = DIFT_DRAWS, **options: Any) -> DiffusionFeatures:

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
-from magic_core.scene import CanonicalView
 from magic_matcher import global_matching
-from magic_matcher.contour import Contour
-from magic_matcher.features import GlobalMatch, Reference
 
 MODELS = ("dinov2", "dinov2_with_registers", "dinov3_vit")
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
@@ -22,7 +17,7 @@ _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
 
 
-class Dinov2Features:
+class Dinov2Features(global_matching.NetworkFeatures):
     """The paper's global stage.
 
     weights: a hub name or a folder; tokens: side n of the feature map, the picture is then n
@@ -33,9 +28,6 @@ class Dinov2Features:
     """
 
     name = "dinov2"
-    # Cosines after a joint PCA have no common scale; none was fitted, as no trained weights could be reached.
-    floor = 0.0
-    clear = float("inf")
 
     def __init__(
         self,
@@ -88,14 +80,8 @@ class Dinov2Features:
 
     def key(self) -> str:
         """Weights (name, and for a folder the files' sizes and times), grid and views: all that shapes what is kept of a reference."""
-        digest = hashlib.sha256(f"{self._weights} {self._n} {self._patch} {self._dtype} {self._views}".encode())
-        folder = Path(self._weights)
-        if folder.is_dir():
-            for path in sorted(folder.glob("*")):
-                if path.is_file():
-                    stat = path.stat()
-                    digest.update(f"{path.resolve()} {stat.st_size} {stat.st_mtime_ns}".encode())
-        return "dinov2-" + digest.hexdigest()[:24]
+        text = f"{global_matching.state_of(self._weights)} {self._n} {self._patch} {self._dtype} {self._views}"
+        return "dinov2-" + hashlib.sha256(text.encode()).hexdigest()[:24]
 
     def extract(self, pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Feature maps (V, n, n, d) of pictures (V, S, S, 3) uint8 RGB, S = self.size; a few pictures at a time, to bound memory."""
@@ -110,13 +96,3 @@ class Dinov2Features:
                 tokens = hidden[:, self._extra :].float().cpu().numpy()
                 maps.append(tokens.reshape(len(batch), self._n, self._n, -1))
         return np.concatenate(maps)
-
-    def prepare(self, reference: Reference) -> global_matching.PreparedGlobal:
-        """The reference's 24 views through the network, once."""
-        return global_matching.prepare(reference.view, reference.pixel, self.extract, self.size, self._views)
-
-    def propose(
-        self, prepared: Any, view: CanonicalView, contour: Contour, target_radius: float | None, count: int, heatmap: bool = False
-    ) -> GlobalMatch:
-        """One pass of the network, then the best places over all relative views."""
-        return global_matching.propose(prepared, view, self.extract, self.size, count, self.aggregation, self.components, heatmap)

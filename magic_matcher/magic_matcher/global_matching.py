@@ -21,6 +21,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +30,8 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
-from magic_matcher.features import GlobalMatch, Proposal, suppress
+from magic_matcher.contour import Contour
+from magic_matcher.features import GlobalMatch, Proposal, Reference, suppress
 
 ROTATIONS = 12
 #: Side of the patch as a share of the token grid (13 of 60 in the authors' code), and d'.
@@ -218,7 +221,8 @@ def _project(tokens: NDArray[np.float32], mean: NDArray[np.float32], w: NDArray[
         return torch.addmm(torch.from_numpy(-(mean @ w)), flat, torch.from_numpy(w)).numpy().reshape(*tokens.shape[:-1], -1)
 
 
-def _unit(tokens: NDArray[np.float32]) -> NDArray[np.float32]:
+def unit(tokens: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Tokens (..., d) scaled to length one."""
     length = np.sqrt(np.einsum("...d,...d->...", tokens, tokens))
     return tokens / np.maximum(length, 1e-9)[..., None]
 
@@ -247,7 +251,7 @@ def similarity(prepared: PreparedGlobal, features: NDArray[np.float32], aggregat
     if components is not None:
         mean, w = joint_pca(prepared, features.reshape(-1, features.shape[-1]), components)
         patches, features = _project(patches, mean, w), _project(features, mean, w)
-    patches, features = _unit(patches), _unit(features)
+    patches, features = unit(patches), unit(features)
     if aggregation == "aligned":
         return aligned_similarity(patches, inside, features)
     if aggregation == "none":
@@ -348,3 +352,36 @@ def _literal(
     on = np.stack([_coverage(m, n) for m in masks])
     relative = Views(np.where(views.flipped, views.rotation, -views.rotation) % (2 * np.pi), views.flipped)
     return scores, on, np.stack([cv2.invertAffineTransform(m) for m in matrices]), relative
+
+
+class NetworkFeatures:
+    """What backends on feature maps of a network share; each brings ``size``, ``aggregation``, ``components``, ``_views`` and :meth:`extract`."""
+
+    # Cosines after a joint PCA have no common scale; none was fitted, as no trained weights could be reached.
+    floor = 0.0
+    clear = float("inf")
+    size: int
+    aggregation: str
+    components: int | None
+    _views: Views
+
+    def extract(self, pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Feature maps (V, n, n, d) of pictures (V, S, S, 3) uint8 RGB, S = self.size."""
+        raise NotImplementedError
+
+    def prepare(self, reference: Reference) -> PreparedGlobal:
+        """The reference's 24 views through the network, once."""
+        return prepare(reference.view, reference.pixel, self.extract, self.size, self._views)
+
+    def propose(
+        self, prepared: Any, view: CanonicalView, contour: Contour, target_radius: float | None, count: int, heatmap: bool = False
+    ) -> GlobalMatch:
+        """One pass of the network, then the best places over all relative views."""
+        return propose(prepared, view, self.extract, self.size, count, self.aggregation, self.components, heatmap)
+
+
+def state_of(weights: str) -> str:
+    """A text that differs where weights do: their name, and for a folder its files with their sizes and times."""
+    folder = Path(weights)
+    files = sorted(path for path in folder.rglob("*") if path.is_file()) if folder.is_dir() else []
+    return " ".join([weights, *(f"{path.resolve()} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in files)])

@@ -1,7 +1,8 @@
-"""Groups of points (DBSCAN, Ester et al. 1996; paper, IV-B)."""
+"""Groups of points (DBSCAN, Ester et al. 1996; paper, IV-B) and of pixels."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,3 +55,12 @@ def largest(points: NDArray[np.floating], eps: float, min_points: int, voxel: fl
     if len(labels) == 0 or labels.max() < 0:
         return np.ones(len(points), bool)
     return labels == int(np.argmax(np.bincount(labels[labels >= 0])))
+
+
+def connected(field: NDArray[np.bool_], seed: NDArray[np.bool_], connectivity: int = 4) -> NDArray[np.bool_]:
+    """The connected regions of a field (H, W) in which there is something of the seed (H, W)."""
+    count, regions = cv2.connectedComponents(field.astype(np.uint8), connectivity=connectivity)
+    touched = np.zeros(count, bool)
+    touched[regions[seed & field]] = True
+    touched[0] = False
+    return touched[regions]

@@ -310,12 +310,7 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     core = raised | thin
     # Grow into pixels without depth that have another colour and touch what is there.
     unseen = other & ~valid
-    joined = core | unseen
-    count, labels = cv2.connectedComponents(joined.view(np.uint8), connectivity=4)
-    touched = np.zeros(count, bool)
-    touched[labels[core]] = True
-    touched[0] = False
-    result = touched[labels]
+    result = clusters.connected(core | unseen, core)
     result = _fill_bowls(result, looked, other, parameters)
     result = smear.cleared(
         result, looked.frame.color, looked.frame.depth, table, shaded, inside & (distance > 9), looked.frame.intrinsics.fx
@@ -404,11 +399,7 @@ def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_
         with np.errstate(invalid="ignore"):
             possible = ~(looked.heights[cut][where] <= -0.006)
         result[cut][where] = np.where(told, (part > 0.5) & (before | possible), result[cut][where])
-    count, labels = cv2.connectedComponents(result.view(np.uint8), connectivity=8)
-    touched = np.zeros(count, bool)
-    touched[labels[mask & result]] = True
-    touched[0] = False
-    return touched[labels]
+    return clusters.connected(result, mask, 8)
 
 
 def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...], margin: float) -> NDArray[np.bool_]:

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_perception.clusters import connected
+
 #: Pixels, at a focal length of 615, by which depth reaches past an edge or falls short of it, and to which a hole may lie inside a mask's edge.
 REACH, DEEP = 9, 26
 #: Log of the ratio of likelihoods from which a pixel near the edge is the table's, and one without support in depth is the thing's; and that
@@ -154,7 +156,7 @@ def _smeared(near: _Near, told: NDArray[np.float32], within: NDArray[np.float32]
             removed[cut] |= part
     # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
     own = _around(empty & ~removed & (within > reach + 1), reach + 1)
-    return removed | _connected(empty & (within <= reach) & ~own, outside)
+    return removed | connected(empty & (within <= reach) & ~own, outside)
 
 
 def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: NDArray[np.float32], cut: tuple[slice, slice]) -> bool:
@@ -172,15 +174,6 @@ def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: 
 def _around(mask: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:
     """What lies within ``reach`` pixels of a mask."""
     return mask if not mask.any() else cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3) <= reach
-
-
-def _connected(field: NDArray[np.bool_], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The connected regions of a field in which there is something of the seed."""
-    count, parts = cv2.connectedComponents(field.view(np.uint8), connectivity=4)
-    touched = np.zeros(count, bool)
-    touched[parts[seed & field]] = True
-    touched[0] = False
-    return touched[parts]
 
 
 def _enclosed(like: NDArray[np.bool_], mask: NDArray[np.bool_], share: float = 0.6) -> NDArray[np.bool_]:

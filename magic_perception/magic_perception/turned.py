@@ -400,7 +400,7 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
         beside = [_beside(sight, body) for sight in useful]
         thickness = min([thickness, *(_widest(sight, mask, plane) for sight, mask in zip(useful, beside, strict=True))])
         seen = [sight.look_up(plane, mask.astype(np.float32)) > 0.5 for sight, mask in zip(useful, beside, strict=True)]
-        near |= _connected(near | np.any(seen, axis=0), near)
+        near |= clusters.connected(near | np.any(seen, axis=0), near, 8)
         # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
         columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
         # Of a bar no wider than the smear of depth a measurement a little behind it says nothing: only one far behind shows a hole.
@@ -463,15 +463,6 @@ def _widest(sight: Sight, mask: NDArray[np.bool_], plane: NDArray[np.float64]) -
     distance = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, 5)
     away = float(np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye))
     return max(2 * float(distance.max()) * away / sight.intrinsics.fx, 0.005)
-
-
-def _connected(field: NDArray[np.bool_], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The connected regions of a field in which there is something of the seed."""
-    count, parts = cv2.connectedComponents(field.astype(np.uint8), connectivity=8)
-    touched = np.zeros(count, bool)
-    touched[parts[seed & field]] = True
-    touched[0] = False
-    return touched[parts]
 
 
 def _handle_plane(local: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

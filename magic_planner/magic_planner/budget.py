@@ -9,17 +9,23 @@ from magic_core.errors import Code, MagicError
 
 
 class Budget:
-    """A deadline and a cancel test, asked inside every long loop."""
+    """A deadline and a cancel test, asked inside every long loop; ``clock`` counts the seconds."""
 
-    def __init__(self, seconds: float = float("inf"), cancelled: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        seconds: float = float("inf"),
+        cancelled: Callable[[], bool] = lambda: False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.seconds = float(seconds)
-        self.started = time.monotonic()
+        self._clock = clock
+        self.started = clock()
         self._cancelled = cancelled
 
     @property
     def spent(self) -> float:
         """Seconds since the request began."""
-        return time.monotonic() - self.started
+        return self._clock() - self.started
 
     @property
     def left(self) -> float:

@@ -177,10 +177,10 @@ def drawn_in(
                     changed = _scaled(seated, meets, share)
                     if not _touches_on(held, poses_of(changed, 1), wall):
                         return changed
-    fixed = Body.from_object(target)
+    fixed, wall = Body.from_object(target), roomy(MARGIN)
     for share in SHARES:
         changed = _scaled(strategy, meets, share)
-        if not _touches_on(held, poses_of(changed, 0), fixed if share == 1 else roomy(MARGIN)):
+        if not _touches_on(held, poses_of(changed, 0), fixed if share == 1 else wall):
             return changed
     return strategy
 

@@ -316,21 +316,6 @@ def _reference(strategy: Strategy) -> Any:
     return from_strategy(strategy)
 
 
-def _budget(seconds: float) -> Any:
-    from magic_planner.budget import Budget
-
-    class Processor(Budget):
-        """A budget of processor time."""
-
-        begun = time.process_time()
-
-        @property
-        def spent(self) -> float:
-            return time.process_time() - self.begun
-
-    return Processor(seconds)
-
-
 def _try(
     options: Options,
     strategy: Strategy,
@@ -342,6 +327,7 @@ def _try(
     answer: dict[str, Any],
 ) -> tuple[dict[str, Any], _Tried | None]:
     """Plan and verify one trial: what is stored of it, and the motion if there was one."""
+    from magic_planner.budget import Budget
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
     from magic_verifier.verification import verify
@@ -354,7 +340,8 @@ def _try(
         motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap)
         if options.variant == "arm":
             given = (strategy, tool, target, candidate, reflection, motion, table, obstacles)
-            plan = _arm_planner().plan(*given, attempt=trial.attempt, seed=options.seed, budget=_budget(PLANNING_TIME))
+            budget = Budget(PLANNING_TIME, clock=time.process_time)
+            plan = _arm_planner().plan(*given, attempt=trial.attempt, seed=options.seed, budget=budget)
         else:
             plan = MotionPlan("fg", motion)
     except MagicError as error:

@@ -261,23 +261,20 @@ class Hook(GoalTest):
         metrics["hold_slip"] = max(slips)
         metrics["sides_held"] = float(sides)
         metrics["holds"] = float(sides > 0 and max(slips) < flat)
-        if self.nudge is None:  # decides nothing: told of the scene as given
-            metrics["holds_in_stronger_noise"] = float(self._slip(run, 0.0, STRONGER * self.radius) < held)
+        metrics["holds_in_stronger_noise"] = float(self._slip(run, 0.0, STRONGER * self.radius) < held)
         turned = (
             f"with the pull turned by {angle:g} degrees to either side it falls back by {100 * slips[0]:.0f} and {100 * slips[1]:.0f} % "
             "of the way"
         )
-        noisy = ""
-        if self.nudge is None:
-            noisy = f", in noise of {STRONGER:g} radii it {'stays' if metrics['holds_in_stronger_noise'] else 'is lost'}"
+        noisy = f"in noise of {STRONGER:g} radii it {'stays' if metrics['holds_in_stronger_noise'] else 'is lost'}"
         if not metrics["holds"]:
             return Judgement(
                 Code.DRIFT,
                 f"the tool pushes the target but does not hold it: {turned} (allowed: below {100 * held:.0f} % to one side and "
-                f"{100 * flat:.0f} % to the other){noisy}; the pull itself: {state}",
+                f"{100 * flat:.0f} % to the other), {noisy}; the pull itself: {state}",
                 metrics,
             )
-        return Judgement(Code.OK, f"the target was {state}; {turned}{noisy}", metrics)
+        return Judgement(Code.OK, f"the target was {state}; {turned}, {noisy}", metrics)
 
     def _slip(self, run: Any, turn: float, kick: float = 0.0) -> float:
         """By how much of its way the tool leaves the target behind, or to the side, in the last third of a pull that goes on turned

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_bringup.make_strategies import target_contact, target_view
+from magic_bringup.make_strategies import demonstrated, target_contact, target_view, through
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact
 from magic_core.shapes import Shape, make
@@ -88,16 +88,7 @@ def hammering() -> Strategy:
         description="A mallet, swung in the plane of the table, drives a peg into a slot.",
         view="top",
         mode="retarget",
-        tool_view=view,
-        tool_contact=contact,
-        target_view=seen,
-        target_contact=touched,
-        target_normal=normal,
-        target_view_direction=DOWN,
-        times=times,
-        target_from_tool=touched.object_from_contact @ contacts @ transforms.inverse(contact.object_from_contact),
-        tool_mesh=tool.mesh,
-        target_mesh=peg.mesh,
+        **demonstrated(tool, view, contact, peg, seen, touched, normal, DOWN, times, contacts),
         waypoints=waypoints,
         goal=Goal("drive"),
         physics=Physics(friction=0.3, tool_density=1500.0, target_density=2700.0),
@@ -127,24 +118,13 @@ def pushing() -> Strategy:
         Waypoint("clear", np.array([-0.13, 0, 0]), "retreat"),
         Waypoint("up", np.array([-0.13, 0, -0.12]), "retreat"),
     )
-    offsets = np.array([w.offset for w in waypoints])
-    times = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(offsets, axis=0), axis=1)) / 0.1])
-    contacts = np.stack([transforms.make(translation=offset) @ OPPOSED for offset in offsets])
+    times, contacts = through(waypoints)
     return Strategy(
         name="pushing",
         description="The handle of a mallet that lies on the table sweeps a row of cylinders away.",
         view="top",
         mode="plan",
-        tool_view=view,
-        tool_contact=contact,
-        target_view=seen,
-        target_contact=touched,
-        target_normal=normal,
-        target_view_direction=DOWN,
-        times=times,
-        target_from_tool=touched.object_from_contact @ contacts @ transforms.inverse(contact.object_from_contact),
-        tool_mesh=tool.mesh,
-        target_mesh=target.mesh,
+        **demonstrated(tool, view, contact, target, seen, touched, normal, DOWN, times, contacts),
         waypoints=waypoints,
         goal=Goal("sweep"),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),

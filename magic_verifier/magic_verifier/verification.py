@@ -633,9 +633,10 @@ def _verdict(task: Task, outcomes: list[Outcome], most: int, simulated: float, s
         message += f"; {'; '.join(failures)}"
     metrics = dict(judgements[shown].metrics)
     if count > 1:  # what the drawn rollouts found of it, in shares
-        found = [j.metrics["holds"] for j in judgements if "holds" in j.metrics]
-        if found:
-            metrics["holds_rate"] = float(np.mean(found))
+        for name in ("holds", "holds_in_stronger_noise"):
+            found = [j.metrics[name] for j in judgements if name in j.metrics]
+            if found:
+                metrics[f"{name}_rate"] = float(np.mean(found))
     return Verdict(
         success, code, message, good / count, metrics, simulated, seconds, outcomes[shown].recording, tuple(judgements), low, high, failures
     )

@@ -76,7 +76,7 @@ def target_contact(view: CanonicalView, point: NDArray[np.float64], normal: NDAr
     return Contact(pixel, picture, radius, False, 3.5 * radius, contact_frame(view, pixel, picture))
 
 
-def _through(waypoints: tuple[Waypoint, ...]) -> tuple[NDArray[np.float64], Poses]:
+def through(waypoints: tuple[Waypoint, ...]) -> tuple[NDArray[np.float64], Poses]:
     """Times (T,) and target_contact_from_tool_contact (T, 4, 4) through waypoints, squarely opposed."""
     times, offsets = _line([w.offset for w in waypoints], 0.1)
     return times, np.stack([transforms.make(translation=offset) @ OPPOSED for offset in offsets])
@@ -87,7 +87,7 @@ def _trajectory(target: Contact, contacts: Poses, tool: Contact) -> Poses:
     return target.object_from_contact @ contacts @ transforms.inverse(tool.object_from_contact)
 
 
-def _demonstrated(
+def demonstrated(
     tool: Shape,
     tool_view: CanonicalView,
     tool_contact: Contact,
@@ -134,13 +134,13 @@ def hooking() -> Strategy:
         Waypoint("clear", np.array([-0.25, 0, 0]), "retreat"),
         Waypoint("up", np.array([-0.25, 0, -0.12]), "retreat"),
     )
-    times, contacts = _through(waypoints)
+    times, contacts = through(waypoints)
     return Strategy(
         name="hooking",
         description="An L hook lying flat is lowered behind a ball and pulls it towards the robot.",
         view="top",
         mode="plan",
-        **_demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
+        **demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         # The demonstration had no kicks; a ball, other than a standing cylinder, does not bear them (it passes with 1 of 5 seeds).
         goal=Goal("hook", {"distance": 0.2, "max_speed": 0.5, "noise": 0.0}),
@@ -193,13 +193,13 @@ def hanging() -> Strategy:
         Waypoint("let_go", np.array([0.002, 0, 0]), "release"),
         Waypoint("away", np.array([0.002, 0, -0.15]), "retreat"),
     )
-    times, contacts = _through(waypoints[:4])
+    times, contacts = through(waypoints[:4])
     return Strategy(
         name="hanging",
         description="A coat hanger is slid on to a rod from its free end, lowered and let go.",
         view="side",
         mode="plan",
-        **_demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
+        **demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         goal=Goal("hang", {"height": 0.2, "max_speed": 0.5}),
         physics=Physics(friction=3.0, tool_density=600.0, target_density=2700.0, target_is_fixed=True),
@@ -287,7 +287,7 @@ def scooping() -> Strategy:
         description="A spoon, handle upright, pushes a ball on to a quarter pipe, turns it up and lifts it in the bowl.",
         view="section",
         mode="retarget",
-        **_demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
+        **demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         goal=Goal("scoop", {"height": 0.2, "max_speed": 0.1}),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=300.0),

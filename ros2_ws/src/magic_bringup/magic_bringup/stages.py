@@ -27,8 +27,6 @@ from magic_interfaces.srv import MatchContact
 OBJECTS_LAG = 5.0
 #: Points of a contact that are nearer than this are the same, m: it went through messages, but nobody measured it anew.
 SAME_POINT = 1e-6
-
-
 #: A reconstruction below this confidence is hardly ever right (``magic_perception/README.md``).
 DOUBTFUL = 0.2
 
