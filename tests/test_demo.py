@@ -3,6 +3,7 @@
 # In a file of its own: a graph that a module's fixture still holds would share its ROS context.
 
 import json
+import signal
 from pathlib import Path
 
 from magic_bringup import demo
@@ -11,7 +12,10 @@ BAGS = Path(__file__).resolve().parents[1] / "bags"
 
 
 def test_demo_writes_summary_and_report(tmp_path):
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
     assert demo.main(["--strategy", "hooking", "--variant", "fg", "--bag", str(BAGS / "hooking"), "--out", str(tmp_path)]) == 0
+    assert [signal.getsignal(number) for number in numbers] == before  # else what the caller starts next ignores Ctrl-C
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert list(summary) == [
         "strategy",
