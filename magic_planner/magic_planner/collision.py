@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import weakref
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,40 +15,41 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
+from magic_planner.recent import Recent
 
-#: Hulls of arrays seen lately: the same pieces are asked for by every stage of every attempt.
-_HULLS: OrderedDict[int, tuple[Any, tuple[NDArray[np.float64], NDArray[np.int32]]]] = OrderedDict()
-#: The same by content, for the next request brings the same pieces in other arrays.
-_EQUAL_HULLS: OrderedDict[bytes, tuple[NDArray[np.float64], NDArray[np.int32]]] = OrderedDict()
-_KEPT_HULLS = 4000
+#: Vertices (V, 3) and outward faces (F, 3) of a convex hull.
+Hull = tuple[NDArray[np.float64], NDArray[np.int32]]
+#: Hulls of arrays that still live: the same pieces are asked for by every stage of every attempt.  The arrays are a request's, and are
+#: not kept alive: every request brings others.
+_HULLS: dict[int, tuple[weakref.ref[NDArray[np.float64]], Hull]] = {}
+#: The same by content, for the next request brings the same pieces in other arrays: those of some objects of a hundred pieces.
+_EQUAL_HULLS: Recent[bytes, Hull] = Recent(8 * 2**20)
 
 
-def hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def hull(vertices: NDArray[np.float64]) -> Hull:
     """Vertices (V, 3) and outward faces (F, 3) of the convex hull of points (N, 3); not to be written to.
 
     A set without volume (a sheet, a line) is thickened by 0.1 mm each way first, so that it still has a hull.
     """
-    known = _HULLS.get(id(vertices))
-    if known is not None and known[0] is vertices:
+    key = id(vertices)
+    known = _HULLS.get(key)
+    if known is not None and known[0]() is vertices:
         return known[1]
     result = _equal_hull(vertices)
-    _HULLS[id(vertices)] = (vertices, result)
-    while len(_HULLS) > _KEPT_HULLS:
-        _HULLS.popitem(last=False)
+    _HULLS[key] = weakref.ref(vertices, lambda _: _HULLS.pop(key, None)), result
     return result
 
 
-def _equal_hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _equal_hull(vertices: NDArray[np.float64]) -> Hull:
     points = np.asarray(vertices, dtype=float)
     if points.size > 3 * MOST_VERTICES:
         return _hull(points)
     content = points.tobytes()
     known = _EQUAL_HULLS.get(content)
-    if known is None:
-        known = _EQUAL_HULLS[content] = _hull(points)
-        while len(_EQUAL_HULLS) > _KEPT_HULLS:
-            _EQUAL_HULLS.popitem(last=False)
-    return known
+    if known is not None:
+        return known
+    made = _hull(points)
+    return _EQUAL_HULLS.put(content, made, len(content) + made[0].nbytes + made[1].nbytes)
 
 
 #: A piece with more vertices than this is represented by its outermost ones in this many directions.
@@ -82,7 +83,7 @@ def outermost(points: NDArray[np.float64], count: int = DIRECTIONS) -> NDArray[n
     return points[np.unique(index)]
 
 
-def _hull(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _hull(vertices: NDArray[np.float64]) -> Hull:
     points = np.asarray(vertices, dtype=float).reshape(-1, 3)
     if len(points) == 0:
         raise MagicError(Code.BAD_MESH, "convex piece", "no vertices", "at least one vertex")
@@ -134,7 +135,7 @@ def grown(pieces: Iterable[Mesh], margin: float) -> tuple[Mesh, ...]:
     return tuple(Mesh(*_grown(piece, margin)) for piece in pieces)
 
 
-def _grown(piece: Mesh, margin: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _grown(piece: Mesh, margin: float) -> Hull:
     steps = margin * np.concatenate([np.eye(3), -np.eye(3)])
     return _equal_hull((hull(piece.vertices)[0][:, None] + steps).reshape(-1, 3))
 
@@ -177,25 +178,27 @@ def roomy_shell(pieces: Iterable[Mesh], margin: float) -> list[Any]:
     At least LEAST_GROWTH of the margin where a piece is sharp.  Pieces no larger than the margin become boxes.
     """
     pieces = tuple(pieces)
-    made = solid(pieces).roomy
-    if margin not in made:
-        hulls = [hull(piece.vertices) for piece in pieces]
+    hulls = [hull(piece.vertices) for piece in pieces]
+    key = (*_names(hulls), margin)
+    known = _SHELLS.get(key)
+    if known is None:
         extents = np.array([np.ptp(vertices, axis=0).max() for vertices, _ in hulls])
         small = [vertices for (vertices, _), extent in zip(hulls, extents, strict=True) if extent <= margin]
         large = [piece for piece, extent in zip(pieces, extents, strict=True) if extent > margin]
         surfaces = [_box(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in small]
-        made[margin] = _tree(*joined(surfaces + (_roomy(large, margin) if large else []))[:2])
-    return [made[margin]]
+        vertices, faces, _ = joined(surfaces + (_roomy(large, margin) if large else []))
+        known = _SHELLS.put(key, (hulls, _tree(vertices, faces)), len(faces) * TREE_BYTES)
+    return [known[1]]
 
 
-def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> Hull:
     """The surface of a box between two corners (3,)."""
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], dtype=np.int32)
     return corners, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def _roomy(pieces: Sequence[Mesh], margin: float) -> list[tuple[NDArray[np.float64], NDArray[np.int32]]]:
+def _roomy(pieces: Sequence[Mesh], margin: float) -> list[Hull]:
     """Surfaces about pieces: each corner goes out along the mean of the normals about it; pieces with corners too sharp for that
     are grown as :func:`grown` does it, which takes new convex hulls."""
     vertices, faces, first = joined([hull(piece.vertices) for piece in pieces])
@@ -218,7 +221,7 @@ def _roomy(pieces: Sequence[Mesh], margin: float) -> list[tuple[NDArray[np.float
 
 
 def joined(
-    surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]],
+    surfaces: Sequence[Hull],
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
     """Triangle surfaces as one: vertices (V, 3), faces (F, 3), and where the vertices of each begin (P,)."""
     first = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces[:-1]])
@@ -247,8 +250,7 @@ class Solid:
     """What collision tests need to know of P convex pieces, in their frame.
 
     tree: their surfaces; normals (P, F, 3), offsets (P, F): their planes, the shorter lists filled up, and how many (P,) there are
-    of each; centres (P, 3), radii (P,): balls about them; first (P, 3): a point of each; roomy: trees of :func:`roomy_shell` made
-    so far, by margin.
+    of each; centres (P, 3), radii (P,): balls about them; first (P, 3): a point of each.
     """
 
     tree: Any
@@ -258,26 +260,31 @@ class Solid:
     centres: NDArray[np.float64]
     radii: NDArray[np.float64]
     first: NDArray[np.float64]
-    roomy: dict[float, Any] = field(default_factory=dict)
 
 
-#: Solids of pieces seen lately, by their hulls, as of :data:`_HULLS`.
-_SOLIDS: OrderedDict[tuple[int, ...], tuple[list[tuple[NDArray[np.float64], NDArray[np.int32]]], Solid]] = OrderedDict()
-_KEPT_SOLIDS = 64
+#: What FCL's tree holds for each face, bytes.
+TREE_BYTES = 560
+#: Solids of pieces seen lately and shells about them, by their hulls, which are kept with them: an id is theirs for as long as they live.
+_SOLIDS: Recent[tuple[int, ...], tuple[list[Hull], Solid]] = Recent(32 * 2**20)
+_SHELLS: Recent[tuple[float, ...], tuple[list[Hull], Any]] = Recent(16 * 2**20)
+
+
+def _names(hulls: Iterable[Hull]) -> tuple[int, ...]:
+    return tuple(id(vertices) for vertices, _ in hulls)
 
 
 def solid(pieces: Iterable[Mesh]) -> Solid:
     """What is needed of convex pieces; made once for pieces of the same shape.  Not to be written to."""
     hulls = [hull(piece.vertices) for piece in pieces]
-    key = tuple(id(vertices) for vertices, _ in hulls)
+    key = _names(hulls)
     known = _SOLIDS.get(key)
     if known is not None:
-        _SOLIDS.move_to_end(key)
         return known[1]
     normals, offsets, counts = _planes(hulls)
+    vertices, faces, _ = joined(hulls)
     centres = np.array([(vertices.min(axis=0) + vertices.max(axis=0)) / 2 for vertices, _ in hulls])
-    result = Solid(
-        tree=_tree(*joined(hulls)[:2]),
+    made = Solid(
+        tree=_tree(vertices, faces),
         normals=normals,
         offsets=offsets,
         counts=counts,
@@ -285,11 +292,7 @@ def solid(pieces: Iterable[Mesh]) -> Solid:
         radii=np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, centres, strict=True)]),
         first=np.array([vertices[0] for vertices, _ in hulls]),
     )
-    # The hulls are kept with it: an id is theirs for as long as they live.
-    _SOLIDS[key] = (hulls, result)
-    while len(_SOLIDS) > _KEPT_SOLIDS:
-        _SOLIDS.popitem(last=False)
-    return result
+    return _SOLIDS.put(key, (hulls, made), len(faces) * TREE_BYTES + normals.nbytes + offsets.nbytes)[1]
 
 
 def face_planes(pieces: Iterable[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -361,7 +364,7 @@ def padded(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def _planes(
-    hulls: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]],
+    hulls: Sequence[Hull],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Outward unit normals (P, F, 3) of the hulls' faces, their offsets (P, F), and how many (P,) there are of each: inside is where
     normals @ x <= offsets.  Triangles of one flat face count once; the shorter lists are filled up with copies of their first."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -24,7 +25,8 @@ def _toppra(knots: Array, rows: Array, velocity: Array, acceleration: Array, ste
     import toppra.algorithm as algorithm
     import toppra.constraint as constraint
 
-    toppra.setup_logging("ERROR")
+    # Not toppra.setup_logging: each call of that adds one more handler to the library's logger.
+    logging.getLogger("toppra").setLevel(logging.ERROR)
     try:
         path = toppra.SplineInterpolator(knots, rows)
         # 0.1 % more than twice the number of knots: the limits are held between them as well.
