@@ -31,6 +31,7 @@ from magic_planner.collision import shell, solid_pieces
 from magic_planner.free_motion import FreeMotion
 from magic_planner.grasps import GraspSettings
 from magic_planner.hand_moves import HandMoves
+from magic_planner.held import grasp_in_hand
 from magic_planner.margins import margins
 from magic_planner.object_motion import table_plane, tool_contact_frame, waypoint_times
 from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
@@ -96,11 +97,16 @@ class ArmPlanner:
         start (J,): where the arm is (default: home).  attempt: 0 for the best grasp, n for the n-th next that differs from
         those before.  A tool's retreat that the arm cannot follow is left out.
 
+        A tool that hangs (``tool.hanging``) is in the hand, where its pose and ``start`` put it: it is not grasped anew but raised
+        where something is beneath it, and carried on; the gripper of such a plan closes at 0 s.
+
         Raises NO_GRASP, NO_IK, JOINT_LIMIT, START_IN_COLLISION, PATH_IN_COLLISION, NO_PATH, DYNAMIC_LIMIT,
         TIME_PARAMETERISATION, PLANNING_TIMEOUT, CANCELED, each naming the stage and the waypoint, pair or limit, and by how much a tool
         has to be tipped that lies otherwise than it is used.
         """
         budget = budget or Budget()
+        if tool.hanging and start is None:
+            raise MagicError(Code.BAD_REQUEST, f"start, with {tool.id} in the hand", "none", "where the arm is")
         given = (strategy, tool, target, candidate, reflection)
         rest = (table, obstacles, start, attempt, seed, budget, feedback)
         try:
@@ -195,16 +201,20 @@ class ArmPlanner:
             searches=self.settings.searches,
         )
         self.space.build(request)
-        robot.open_to(robot.config.opening)
+        held = grasp_in_hand(robot, tool, start) if tool.hanging else None
+        if held is None:
+            robot.open_to(robot.config.opening)
+        else:
+            self.space.carry_off(request, held)
         pair = robot.collision(start)
         if pair is not None:
             raise MagicError(Code.START_IN_COLLISION, "stage approach: the arm at its start", str(pair), "a start clear of everything")
 
-        feedback("grasp", "looking for grasps that serve the whole motion")
+        feedback("grasp", "looking for grasps that serve the whole motion" if held is None else "the tool is in the hand")
         failures = Failures()
         tool_from_contact = tool_contact_frame(candidate, reflection)
         choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact)
-        lots = choice.lots()
+        lots = choice.lots() if held is None else iter([[held]])
         chosen: list[Array] = []  # grasps of the attempts before, in order
         spare: list[Branch] = []  # those that close where one of these does, only from another side
         tried = 0
@@ -227,7 +237,7 @@ class ArmPlanner:
                         raise failures.error()
                     tried += 1
                     try:
-                        plan = self._complete(request, branch, len(chosen) < attempt)
+                        plan = self._complete(request, branch, len(chosen) < attempt, held is not None)
                         if plan is not None:
                             plan = self._with_margins(request.tool, choice.grasping, tool_from_contact, plan)
                     except StageError as failure:
@@ -260,18 +270,28 @@ class ArmPlanner:
             raise StageError("timing", MagicError(code, f"margin of {least}", f"{100 * least.left:.0f} % left", "0 % or more"))
         return replace(plan, margins=found)
 
-    def _complete(self, request: Request, branch: Branch, only_check: bool) -> MotionPlan | None:
-        """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError."""
+    def _complete(self, request: Request, branch: Branch, only_check: bool, in_hand: bool) -> MotionPlan | None:
+        """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError.
+
+        in_hand: the tool is there already, and the arm at the request's start.
+        """
         self.task.check(request, branch)
-        pick = self.hand.pick(request, branch)
+        if in_hand:
+            here = request.start[None]
+            pick = here, request.start, self.hand.raised(request, branch)
+        else:
+            pick = self.hand.pick(request, branch)
         task = self.task.follow(request, branch)
         retreat = self.hand.retreat(request, branch, task) if request.strategy.releases else None
         if only_check:
             return None
         request.feedback("transfer", "free motion with the tool in hand")
         carry = self.free.carry(request, branch, pick[2][-1], task[0])
-        request.feedback("approach", "free motion to the tool")
-        come = self.free.come(request, pick[0][0])
+        if in_hand:
+            come = pick[0]
+        else:
+            request.feedback("approach", "free motion to the tool")
+            come = self.free.come(request, pick[0][0])
         request.feedback("timing", "time parameterisation")
         return self.schedule.timed(request, branch, come, pick, carry, task, retreat)
 

@@ -76,26 +76,43 @@ class HandMoves:
                 )
             if len(ways) >= 3:
                 break
-        self.space.hold(request, branch.grasp)
-        # The tool leaves what it lies on.
-        robot.allow(request.tool.id, "table", *request.surroundings())
         for back, q in ways:
-            for height in (settings.lift, settings.lift / 2):
-                up = self.straight(tip, height * request.plane[:3], q[None])[0]
-                if up is None:
-                    problem = StageError(
-                        "lift",
-                        MagicError(
-                            Code.NO_IK, f"lifting {request.tool.id} by {height:.2f} m", "out of reach", "a lift that the arm can follow"
-                        ),
-                    )
-                    continue
-                hit = robot.first_collision(up, budget=request.budget, stage="lift")
-                if hit is None:
-                    return back, q, up
+            try:
+                return back, q, self._lift(request, branch, tip, q)
+            except StageError as error:
+                problem = error
+        assert problem is not None
+        raise problem
+
+    def raised(self, request: Request, branch: Branch) -> Array:
+        """Joint path (n, J) by which a tool that is in the hand leaves what is beneath it; where it is clear, only the start (1, J)."""
+        start = request.start
+        self.space.hold(request, branch.grasp)
+        if not self.robot.collides(start):
+            return start[None]
+        request.feedback("lift", "raising the tool")
+        return self._lift(request, branch, self.robot.chain.forward(start[None])[0], start)
+
+    def _lift(self, request: Request, branch: Branch, tip: Array, q: Array) -> Array:
+        """Joint path (n, J) of the lift from q (J,), the hand at ``tip``; raises StageError."""
+        problem: StageError | None = None
+        self.space.carry_off(request, branch.grasp)
+        for height in (self.settings.lift, self.settings.lift / 2):
+            up = self.straight(tip, height * request.plane[:3], q[None])[0]
+            if up is None:
                 problem = StageError(
-                    "lift", MagicError(Code.PATH_IN_COLLISION, f"lifting {request.tool.id}: {hit[1]}", "in collision", "a clear lift")
+                    "lift",
+                    MagicError(
+                        Code.NO_IK, f"lifting {request.tool.id} by {height:.2f} m", "out of reach", "a lift that the arm can follow"
+                    ),
                 )
+                continue
+            hit = self.robot.first_collision(up, budget=request.budget, stage="lift")
+            if hit is None:
+                return up
+            problem = StageError(
+                "lift", MagicError(Code.PATH_IN_COLLISION, f"lifting {request.tool.id}: {hit[1]}", "in collision", "a clear lift")
+            )
         assert problem is not None
         raise problem
 

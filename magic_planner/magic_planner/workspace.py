@@ -54,6 +54,11 @@ class Workspace:
         robot.allow(name, "table", *request.surroundings(), allowed=False)
         self.ignore_target(request, False)
 
+    def carry_off(self, request: Request, grasp: Grasp) -> None:
+        """As :meth:`hold`, and the tool may touch what it leaves, or is led to."""
+        self.hold(request, grasp)
+        self.robot.allow(request.tool.id, "table", *request.surroundings())
+
     def lay(self, request: Request, pose: Array) -> None:
         """The world with the tool lying at a pose and the hand open about it; only the fingers may touch it."""
         robot, name = self.robot, request.tool.id

@@ -263,3 +263,44 @@ def test_a_plan_carries_its_margins_and_a_heavy_tool_is_refused_with_its_number(
     with pytest.raises(StageError) as caught:
         arm._with_margins(tool, dataclasses.replace(arm.grasping, density=1.2 * 600.0 / shares[0], force=0.0), contact, plan)
     assert caught.value.error.code in (Code.NO_GRASP, Code.DYNAMIC_LIMIT) and "margin of grip: 120 %" in caught.value.error.message
+
+
+def in_hand(solved, arm, after, shift=(0.0, 0.0, 0.0)):
+    """The problem of ``solved`` with the tool in the hand, at some seconds of that plan, and off by ``shift`` in the hand, m."""
+    (strategy, tool, target, candidate, keep, _), plan = solved
+    row = int(np.searchsorted(plan.arm_motion.times, after))
+    start = plan.arm_motion.positions[row]
+    held = plan.arm_motion.tool_from_tcp @ transforms.make(translation=shift)
+    pose = arm.robot.chain.forward(start[None])[0] @ transforms.inverse(held)
+    tool = dataclasses.replace(tool, world_from_object=pose, hanging=True)
+    return (strategy, tool, target, candidate, keep, plan_tool_motion(strategy, tool, target, candidate)), start, held
+
+
+@pytest.mark.parametrize("where", ["grasped", "in the air"])
+def test_a_tool_in_the_hand_is_carried_on_as_it_is_held(arm, solved, where):
+    plan = solved[1]
+    after = plan.arm_motion.grasp_time if where == "grasped" else span(plan, "transfer").end
+    given, start, held = in_hand(solved, arm, after, (0.0, 0.0, 0.004))
+    again = arm.plan(*given, start=start)
+    motion = again.arm_motion
+    assert motion.grasp_time == 0
+    np.testing.assert_allclose(motion.positions[0], start)
+    np.testing.assert_allclose(motion.tool_from_tcp, held, atol=1e-9)
+    np.testing.assert_allclose(again.tool_motion.world_from_tool[0], given[1].world_from_object, atol=1e-6)
+    # It was off in the hand, and yet it does what it is to do.
+    np.testing.assert_allclose(again.tool_motion.world_from_tool[-1], given[-1].world_from_tool[-1], atol=1e-3)
+    assert motion.grasp_width == pytest.approx(plan.arm_motion.grasp_width, abs=1e-3)
+    lifted = again.tool_motion.world_from_tool[:, 2, 3].max() - given[1].world_from_object[2, 3]
+    assert where != "grasped" or lifted > 0.02
+    with pytest.raises(MagicError, match="0 to 0") as raised:
+        arm.plan(*given, start=start, attempt=1)
+    assert raised.value.code == Code.NO_GRASP
+
+
+def test_a_tool_that_hangs_elsewhere_is_not_in_the_hand(arm, solved):
+    given, start, _ = in_hand(solved, arm, solved[1].arm_motion.times[-1], (0.0, 0.0, 0.15))
+    with pytest.raises(MagicError, match="nothing of it") as raised:
+        arm.plan(*given, start=start)
+    assert raised.value.code == Code.BAD_REQUEST
+    with pytest.raises(MagicError, match="where the arm is"):
+        arm.plan(*given)

@@ -64,6 +64,8 @@ class ArmRun:
     ``time`` is the clock of the planned trajectory, which stands still while the
     gripper closes; ``world.time`` goes on.  With ``held`` the run begins at that moment
     of the trajectory, arm and tool as fast as they are then, the tool in the hand.
+    Where the gripper of a plan closes at its very start the tool is in the hand already:
+    the fingers are about it, and it does not fall before they have closed.
     ``lag``: seconds by which the arm follows its command late.
     """
 
@@ -85,7 +87,8 @@ class ArmRun:
             raise MagicError(Code.BAD_MOTION, "plan", "without an arm motion", "an arm motion")
         positions = np.asarray(motion.positions, dtype=float)
         times = np.asarray(motion.times, dtype=float)
-        if held is None:
+        in_hand = held is None and motion.grasp_time <= 0
+        if held is None and not in_hand:
             setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
         self.setup = setup
         self.options = options or ArmOptions()
@@ -121,7 +124,10 @@ class ArmRun:
         self._tracking = [sliding if joint.sliding else turning for joint in robot.arm]
         self._torque = np.zeros(len(robot.names))
         self._metrics = {"torque_ratio": 0.0, "grip_load": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
-        if held is None:
+        if in_hand:
+            self._arm.place(self._q[0], min(motion.grasp_width + WIDER, robot.config.opening))
+            self.world.component(TOOL).disable_gravity = True
+        elif held is None:
             self._arm.place(self._q[0])
             self._arm.open_fingers()
         else:
@@ -235,6 +241,7 @@ class ArmRun:
     def _take(self, patch: Patch) -> None:
         """The tool is held, as it is between the pads."""
         self._patch = patch
+        self.world.component(TOOL).disable_gravity = False
         self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
         self._from_reference = self._arm.tcp_pose.inv() * self.world.component(TOOL).entity_pose
         self._metrics["grip_width"] = self._arm.width()

@@ -18,6 +18,7 @@ from demonstrations import demonstration
 pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import conversions as convert
+from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_core.testing import six_axis
@@ -81,6 +82,24 @@ def test_a_six_axis_arm_pulls_with_the_hook(config, pull):
     assert np.array_equal(verdict.recording.joints, again.recording.joints)
     film = film_strip(verdict.recording, *scene[1:5], frames=2, columns=2, size=(160, 120), robot=robot)
     assert film.std() > 10
+
+
+def test_a_tool_that_is_in_the_hand_off_its_place_is_carried_on(config, pull):
+    """Planned on from where the lift ends with the tool 4 mm deeper in the hand than it was grasped."""
+    (strategy, tool, target, obstacles, table, candidate), before = pull
+    robot, arm = Description(config), before.arm_motion
+    still = (arm.times > arm.grasp_time + 0.6) & (np.abs(arm.velocities).max(axis=1) < 1e-6)
+    start = arm.positions[np.flatnonzero(still)[0]]
+    off = arm.tool_from_tcp @ transforms.make(translation=[0.0, 0.0, 0.004])
+    held = replace(tool, world_from_object=robot.forward(start)[0] @ transforms.inverse(off), hanging=True)
+    motion = plan_tool_motion(strategy, held, target, candidate, "keep", table, obstacles)
+    plan = ArmPlanner(Robot(config)).plan(
+        strategy, held, target, candidate, "keep", motion, table, obstacles, start=start, budget=Budget(60.0)
+    )
+    verdict = verify(strategy, held, target, obstacles, table, candidate, plan, repetitions=3, arm_options=GAINS, robot=robot)
+    assert len(verdict.runs) > 1 and all(run.code == Code.OK for run in verdict.runs), verdict.message
+    assert verdict.metrics["pulled_distance"] > 0.25 and verdict.metrics["grasp_slip"] < 0.005
+    assert verdict.metrics["grasp_shift"] < 0.002  # it is held where it is said to be, and has not fallen meanwhile
 
 
 @pytest.mark.parametrize(
