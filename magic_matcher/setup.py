@@ -1,12 +1,25 @@
+import xml.etree.ElementTree as ElementTree
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = "magic_matcher"
+HERE = Path(__file__).resolve().parent
+VERSION = ElementTree.parse(HERE / "package.xml").getroot().findtext("version")
+
+
+def beside(name: str) -> str:
+    """A package of this repository as pip is told where it lies; by its name alone where it does not lie beside this one."""
+    for folder in (HERE.parent / name, HERE.parent / "ros2_ws" / "src" / name):
+        if (folder / "setup.py").is_file():
+            return f"{name} @ {folder.resolve().as_uri()}"
+    return name
+
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=VERSION,
     packages=find_packages(exclude=["test"]),
     package_data={PACKAGE: ["*.json"]},
     data_files=[
@@ -14,7 +27,8 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
     ],
-    install_requires=["setuptools"],
+    install_requires=["numpy<2", "scipy", "opencv-python-headless", "open3d", "shapely", "contourpy", beside("magic_core")],
+    extras_require={"dinov2": ["torch", "transformers"], "diffusion": ["torch", "transformers", "diffusers"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

@@ -1,8 +1,19 @@
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = "magic_bringup"
+HERE = Path(__file__).resolve().parent
+VERSION = ElementTree.parse(HERE / "package.xml").getroot().findtext("version")
+
+
+def beside(name: str) -> str:
+    """A package of this repository as pip is told where it lies; by its name alone where it does not lie beside this one."""
+    for folder in (HERE.parent / name, HERE.parent / "ros2_ws" / "src" / name):
+        if (folder / "setup.py").is_file():
+            return f"{name} @ {folder.resolve().as_uri()}"
+    return name
 
 
 def tree(*folders: str) -> list[tuple[str, list[str]]]:
@@ -17,14 +28,23 @@ def tree(*folders: str) -> list[tuple[str, list[str]]]:
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=VERSION,
     packages=find_packages(exclude=["test"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         *tree("launch", "config", "strategies", "rviz"),
     ],
-    install_requires=["setuptools"],
+    install_requires=[
+        "numpy<2",
+        "opencv-python-headless",
+        "matplotlib",
+        "Jinja2",
+        "rosbags",
+        "PyYAML",
+        beside("magic_core"),
+        beside("magic_perception"),
+    ],
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

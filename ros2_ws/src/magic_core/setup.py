@@ -1,16 +1,34 @@
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
 from setuptools import find_packages, setup
 
 PACKAGE = "magic_core"
+HERE = Path(__file__).resolve().parent
+VERSION = ElementTree.parse(HERE / "package.xml").getroot().findtext("version")
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=VERSION,
     packages=find_packages(exclude=["test"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["setuptools"],
+    install_requires=[
+        "numpy<2",
+        "scipy",
+        "opencv-python-headless",
+        "open3d",
+        "trimesh",
+        "shapely",
+        "manifold3d",
+        "matplotlib",
+        "Pillow",
+        "PyYAML",
+        "threadpoolctl",
+        "example-robot-data",
+    ],
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

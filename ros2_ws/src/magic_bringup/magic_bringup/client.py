@@ -34,6 +34,7 @@ from magic_bringup.pipeline import split_metrics
 from magic_bringup.remote import RemoteAction, RemoteService, Token
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
+from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
 from magic_core.motion import VARIANTS
@@ -352,7 +353,7 @@ def _strategy_name(name: str) -> str:
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(prog="magic", description="What the graph sees, matches, plans and verifies, from a terminal.")
-    top.add_argument("--version", action="version", version=f"magic {importlib.metadata.version('magic_bringup')}")
+    top.add_argument("--version", action="version", version=f"magic_bringup {version('magic_bringup')}")
     verbs = top.add_subparsers(dest="verb", required=True)
     one = verbs.add_parser("run", help="use a tool as a demonstration showed it")
     one.add_argument("strategy", help="hooking, hanging, scooping, or the folder of a strategy")

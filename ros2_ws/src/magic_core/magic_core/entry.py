@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import signal
 import sys
 from collections.abc import Callable
@@ -11,20 +12,33 @@ from magic_core import environment
 from magic_core.errors import MagicError
 
 
+def version(package: str = "magic_core") -> str:
+    """The version of an installed package of this project, from its package.xml by way of setup.py."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # used from its folder, without an installation
+        return "not installed"
+
+
 def program(module: str, function: str = "main") -> Callable[[], object]:
     """An entry point that prepares the environment, imports a module and calls its function.
 
-    The imports take seconds.  Ctrl-C during them ends the process as a signal does, without a traceback.
+    The imports take seconds.  Ctrl-C during them ends the process as a signal does, without a traceback.  ``--version`` alone is
+    answered without them.
     """
+    package = module.partition(".")[0]
 
     def begin() -> object:
+        if sys.argv[1:] == ["--version"]:
+            print(f"{package} {version(package)}")
+            return 0
         before = signal.getsignal(signal.SIGINT)
         if before is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
         try:
             environment.prepare()
         except MagicError as error:
-            print(f"{module.partition('.')[0]}: {error}", file=sys.stderr)
+            print(f"{package}: {error}", file=sys.stderr)
             return 1
         main = getattr(importlib.import_module(module), function)
         signal.signal(signal.SIGINT, before)

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from magic_core import arguments, environment
+from magic_core.entry import program, version
 from magic_core.errors import Code, MagicError
 
 BEGIN = "import sys; from magic_core.entry import program; sys.exit(program('slow_module')())"
@@ -80,3 +81,10 @@ def test_installed_middlewares_are_found_by_the_index(tmp_path, monkeypatch):
 )
 def test_command_lines_are_parted(words, own, ros):
     assert arguments.split(words.split()) == (own.split(), ros.split())
+
+
+def test_the_version_is_told_without_the_imports(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["anything", "--version"])
+    assert program("magic_core.no_such_module")() == 0
+    name, number = capsys.readouterr().out.split()
+    assert name == "magic_core" and number == version() and number[0].isdigit()
