@@ -7,10 +7,12 @@
 # --variant   fg: a floating gripper moves the tool; arm: the Panda grasps and moves it (default arm)
 # --bag       the recorded bag to replay (default bags/<strategy>)
 # --features  what finds the contact: embedded ships with the package, dinov2 needs weights, auto takes what is at hand (default auto)
+# --weights   of the features: a hub name (facebook/dinov2-base) or a local folder
 # --out       folder for summary.json and report.html (default out/<strategy>_<variant>)
 # --cameras   names of the cameras, as they stand in the topics /camera/NAME/... (default left right)
 # --topics    /RECORDED:=/PLAYED ...: topics of the bag under other names
 # --perception-params, --matcher-params, --planner-params, --verifier-params, --server-params, --robot-params FILE: parameters files
+# --launch    FILE [NAME:=VALUE ...]: a launch file of your own starts the nodes instead
 # --tool, --target, --seed, --timeout: see python -m magic_bringup.demo --help
 #
 # Sets up the workspace first where that is needed. Exit status 0: a verified trajectory was published.

@@ -28,6 +28,15 @@ def test_demo_writes_summary_and_report(tmp_path):
         "simulations",
         "seconds",
         "peak_memory_mb",
+        "rollouts",
+        "success_rate",
+        "rate_interval",
+        "failures",
+        "notes",
+        "executed",
+        "date",
+        "version",
+        "command",
     ]
     assert (summary["success"], summary["code"], summary["features"]) == (True, 0, "embedded")
     assert list(summary["seconds"]) == ["perceive", "match", "plan", "verify", "total"]

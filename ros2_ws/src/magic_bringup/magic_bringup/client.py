@@ -12,6 +12,7 @@ import contextlib
 import importlib.metadata
 import importlib.util
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -24,16 +25,19 @@ import cv2
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import CompressedImage, Image
 
 from magic_bringup.graph import NODES
 from magic_bringup.pipeline import split_metrics
+from magic_bringup.record import IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
 from magic_bringup.remote import RemoteAction, RemoteService, Token
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
+from magic_core.arguments import split
 from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
@@ -115,8 +119,55 @@ def say(line: str = "") -> None:
 # ------------------------------------------------------------ run
 
 
+class Witness:
+    """What a run was made from, for its report: the newest objects, and the first picture of every camera topic there is.
+
+    Topics are found while the run goes on; of each the first message is kept as it came (serialised) and no more is listened to.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._group = ReentrantCallbackGroup()
+        self._scene: Any = None
+        self._heard: dict[str, tuple[type, bytes]] = {}
+        self._open: dict[str, Any] = {}
+        node.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=self._group)
+        self._timer = node.create_timer(0.5, self._look, MutuallyExclusiveCallbackGroup())
+
+    def _on_objects(self, message: Any) -> None:
+        self._scene = message
+
+    def _look(self) -> None:
+        for topic in [t for t in self._open if t in self._heard]:
+            self._node.destroy_subscription(self._open.pop(topic))
+        space = self._node.get_namespace().rstrip("/") + "/"
+        there = {
+            t: kinds[0] for t, kinds in self._node.get_topic_names_and_types() if t.startswith(space) and self._node.count_publishers(t)
+        }
+        for topic, name in there.items():
+            compressed = topic != raw_topic(topic)
+            if not is_picture(topic) or name not in IMAGES or topic in self._open or topic in self._heard:
+                continue
+            if compressed and raw_topic(topic) in there:
+                continue
+            kind = CompressedImage if compressed else Image
+            self._open[topic] = self._node.create_subscription(
+                kind, topic, lambda m, t=topic, k=kind: self._heard.setdefault(t, (k, m)), qos.SENSOR, callback_group=self._group, raw=True
+            )
+
+    def record(self, summary: dict[str, Any], result: Any) -> Record:
+        """The record of the run that has ended."""
+        self._node.destroy_timer(self._timer)
+        images = {}
+        for topic, (kind, data) in sorted(self._heard.items()):
+            with contextlib.suppress(MagicError):  # a picture less in the report
+                images[raw_topic(topic)] = shown(deserialize_message(data, kind))
+        return Record(summary, images, self._scene, result)
+
+
 def run(client: Client, given: argparse.Namespace) -> int:
     """A run with its progress, what came of it, and why."""
+    witness = Witness(client.node) if given.out is not None else None
     begin, said = time.monotonic(), [""]
 
     def progress(feedback: Any) -> None:
@@ -138,10 +189,23 @@ def run(client: Client, given: argparse.Namespace) -> int:
     result = server.call(goal, given.timeout or 3600.0, client.token, grace=GRACE, feedback=progress).result
     for line in run_lines(result):
         say(line)
-    if given.out is not None:
+    if witness is not None:
         for path in pictures(result, given.out):
             say(f"  picture    {path}")
+        summary = empty_summary(goal.strategy, given.variant, command=given.command)
+        take(summary, result)
+        say(f"  report     {written(witness.record(summary, result), given.out)}")
     return 0 if result.code == Code.OK else 1
+
+
+def written(record: Record, folder: Path) -> Path:
+    """Write ``summary.json``, the messages and ``report.html`` of a run into a folder that is there; the page's path."""
+    from magic_bringup import report
+
+    write_summary(record, folder)
+    report.save(record, folder)
+    report.write(record, folder / "report.html")
+    return folder / "report.html"
 
 
 def run_lines(result: Any) -> list[str]:
@@ -362,7 +426,7 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
     one.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
     one.add_argument("--timeout", type=float, default=0.0, help="s for everything (default: the server's)")
-    one.add_argument("--out", type=Path, help="folder for pictures: the simulation, the heat map")
+    one.add_argument("--out", type=Path, help="folder for report.html, summary.json and pictures: the simulation, the heat map")
     two = verbs.add_parser("match", help="find the corresponding contacts")
     two.add_argument("strategy", help="hooking, hanging, scooping, or the folder of a strategy")
     two.add_argument("--tool", nargs="+", default=[], help="object ids to choose the tool from (default: all)")
@@ -380,8 +444,9 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb; returns the exit status."""
-    plain = remove_ros_args(sys.argv if arguments is None else ["magic", *arguments])[1:]
+    plain, _ = split(sys.argv[1:] if arguments is None else arguments)
     given = parser().parse_args(plain)
+    given.command = shlex.join(["ros2", "run", "magic_bringup", "magic", *plain])
     try:
         if given.verb == "strategies":
             return list_strategies(given.folder)

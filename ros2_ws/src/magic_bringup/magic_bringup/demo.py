@@ -9,9 +9,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import os
-import re
+import shlex
 import signal
 import sys
 import threading
@@ -24,9 +23,10 @@ from typing import Any
 from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, peak_memory
 from magic_bringup.pipeline import split_metrics
-from magic_bringup.record import Record
+from magic_bringup.record import CAMERA_TOPIC, IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
 from magic_core import environment
 from magic_core import strategy as strategies
+from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS
 
@@ -37,11 +37,6 @@ START_TIMEOUT = 120.0
 PATIENCE, PATIENCE_AFTER_ERROR = 60.0, 8.0
 #: Between the advertisement and the first message of the replay, s, so that the subscriptions have met their publishers.
 PLAYER_DELAY = 0.7
-
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-STAGES = ("perceive", "match", "plan", "verify", "total")
-CAMERA_TOPIC = re.compile(r"^(?P<camera>.*/)(?P<image>color|aligned_depth_to_color)/(?P<part>image_raw|camera_info)$")
-
 
 #: Option of a parameters file -> the nodes that get it, and the nodes that know an arm.
 FILES = {
@@ -58,7 +53,8 @@ ROBOT_NODES = ("perception", "planner", "verifier", "strategy_server")
 class Options:
     """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself.  pictures: for the report.
 
-    cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it is played.
+    command: what the user typed, for the report.  weights: of the features.  launch: a launch file and its arguments, which start the
+    nodes instead.  cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it is played.
     files: parameters files by node.
     """
 
@@ -72,45 +68,12 @@ class Options:
     seed: int = 0
     timeout: float = 300.0
     pictures: bool = True
+    command: str = ""
+    weights: str = ""
+    launch: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     topics: tuple[tuple[str, str], ...] = ()
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
-
-
-def empty_summary(options: Options) -> dict[str, Any]:
-    """The summary of a run that has not begun."""
-    return {
-        "strategy": options.strategy,
-        "variant": options.variant,
-        "features": options.features,
-        "success": False,
-        "code": int(Code.INTERNAL),
-        "message": "the run did not begin",
-        "candidates": [],
-        "simulations": 0,
-        "seconds": dict.fromkeys(STAGES, 0.0),
-        "peak_memory_mb": {},
-    }
-
-
-def candidate_summary(report: Any) -> dict[str, Any]:
-    """One CandidateReport as plain data."""
-    c = report.candidate
-    reason, metrics = split_metrics(report.message)
-    return {
-        "tool_id": c.tool_id,
-        "score": round(c.score, 6),
-        "s_dino": round(c.s_dino, 6),
-        "s_curv": round(c.s_curv, 6),
-        "rotation": round(c.rotation, 6),
-        "flipped": c.flipped,
-        "reflection": report.reflection,
-        "stage": report.stage,
-        "code": int(report.code),
-        "reason": f"{Code(report.code).name}: {reason}" if reason else Code(report.code).name,
-        # JSON knows no infinity.
-        "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
-    }
 
 
 def look_into(bag: Path, topics: Sequence[tuple[str, str]] = (), cameras: Sequence[str] = ()) -> tuple[tuple[str, ...], float]:
@@ -146,30 +109,14 @@ def first_images(bag: Path, topics: Sequence[tuple[str, str]] = ()) -> dict[str,
     found: dict[str, Any] = {}
 
     def wanted(topic: str, kind: str) -> bool:
-        match = CAMERA_TOPIC.match(_raw(renamed.get(topic, topic)))
-        return match is not None and match["part"] == "image_raw" and match[0] not in found and kind in IMAGES
+        name = renamed.get(topic, topic)
+        return is_picture(name) and raw_topic(name) not in found and kind in IMAGES
 
     for topic, _, message in bag_messages.messages(bag, wanted):
         name = renamed.get(topic, topic)
         with contextlib.suppress(MagicError):  # a picture less in the report
-            found[_raw(name)] = _shown(message)
+            found[raw_topic(name)] = shown(message)
     return found
-
-
-def _raw(topic: str) -> str:
-    """The name that image_transport's raw image would have."""
-    return topic.removesuffix("/compressed").removesuffix("/compressedDepth")
-
-
-def _shown(message: Any) -> Any:
-    """An image message, decoded where it is a compressed one."""
-    if type(message).__name__ != "CompressedImage":
-        return message
-    from magic_core import conversions
-
-    if "compressedDepth" in message.format:
-        return conversions.image_to_msg(conversions.depth_from_compressed_msg(message), "32FC1", message.header)
-    return conversions.image_to_msg(conversions.color_from_compressed_msg(message), "rgb8", message.header)
 
 
 def perceive_seconds(heard: Mapping[str, float], topics: Collection[str], objects_at: float, replay_at: float) -> float:
@@ -343,7 +290,7 @@ class Demo:
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        self.record = Record(empty_summary(options))
+        self.record = Record(empty_summary(options.strategy, options.variant, options.features, options.command))
         self._begin = time.monotonic()
         self._length = 0.0
 
@@ -374,8 +321,9 @@ class Demo:
         topics, self._length = look_into(options.bag, options.topics, options.cameras)
         env = isolated()
         os.environ.update({k: env[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
+        matcher: dict[str, object] = {"features": options.features, **({"weights": options.weights} if options.weights else {})}
         parameters: dict[str, dict[str, object]] = {
-            "matcher": {"features": options.features},
+            "matcher": matcher,
             # The bag's last scene is what there is, however long the run takes.
             "strategy_server": {"objects_timeout": 5.0, "recorded": True},
         }
@@ -383,7 +331,10 @@ class Demo:
             parameters["perception"] = {"cameras": json.dumps(options.cameras)}
         with Graph(options.out / "logs", env) as graph:
             self.say(f"starting the graph (ROS domain {env['ROS_DOMAIN_ID']})")
-            graph.start_nodes(parameters, files=options.files)
+            if options.launch:
+                graph.start_launch(options.launch)
+            else:
+                graph.start_nodes(parameters, files=options.files)
             watcher = Watcher(topics, self.say)
             try:
                 self._drive(graph, watcher)
@@ -435,28 +386,17 @@ class Demo:
         else:
             ids = ", ".join(o.id for o in watcher.scene.objects)
             self.say(f"perceive: objects after {watcher.perceive_seconds():.2f} s: {ids}")
-            # What is known by now is enough; the replay would only take time from the stages after it.
-            player.sample()
-            player.signal(signal.SIGINT)
+            if not options.launch:  # whose strategy server does not know that what comes is a recording
+                # What is known by now is enough; the replay would only take time from the stages after it.
+                player.sample()
+                player.signal(signal.SIGINT)
         pending = watcher.send(options)
         if not self._wait(graph, watcher, lambda: pending.result is not None, options.timeout + 30.0):
             raise MagicError(Code.SERVER_TIMEOUT, f"the strategy_server (run_strategy) did not answer within {options.timeout + 30:g} s")
         result = self.record.result = pending.result
         summary = self.record.summary
-        summary.update(code=int(result.code), message=split_metrics(result.message)[0], simulations=int(result.simulations))
-        summary["features"] = result.features or options.features
-        summary["candidates"] = [candidate_summary(r) for r in result.candidates]
-        times = result.times
-        perceive = watcher.perceive_seconds()
-        summary["seconds"] = {
-            "perceive": perceive,
-            "match": times.match,
-            "plan": times.plan,
-            "verify": times.verify,
-            # The server's own perceive is its wait for objects that are there already.
-            "total": perceive + times.total - times.perceive,
-        }
-        summary["seconds"] = {k: round(v, 3) for k, v in summary["seconds"].items()}
+        take(summary, result, watcher.perceive_seconds())
+        summary["success"] = False  # until the trajectory has come
         if result.verified and result.code == 0:
             came = self._wait(graph, watcher, lambda: watcher.trajectory is not None, 5.0)
             summary["success"] = came
@@ -480,6 +420,7 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument("--variant", default="arm", choices=VARIANTS, help="fg: a floating gripper; arm: the Panda (default arm)")
     parser.add_argument("--bag", type=Path, help="folder of the bag (default bags/<strategy>)")
     parser.add_argument("--features", default="auto", help="feature backend: auto, embedded or dinov2 (default auto)")
+    parser.add_argument("--weights", default="", help="weights of the features: a hub name or a local folder (facebook/dinov2-base)")
     parser.add_argument("--out", type=Path, help="folder for summary.json and report.html (default out/<strategy>_<variant>)")
     parser.add_argument("--tool", default="", help="object id of the tool (default: the matcher chooses)")
     parser.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
@@ -500,8 +441,27 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument(
         "--robot-params", type=Path, metavar="FILE", help="parameters file of the arm, for all nodes, after their own files"
     )
+    parser.add_argument(
+        "--launch",
+        nargs="+",
+        default=[],
+        metavar=("FILE", "NAME:=VALUE"),
+        help="a launch file that starts the nodes instead, with its arguments; parameters are then its own business",
+    )
+    parser.add_argument("--version", action="version", version=f"magic_bringup {version('magic_bringup')}")
     parser.add_argument("--root", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
-    a = parser.parse_args(argv)
+    given = sys.argv[1:] if argv is None else argv
+    a = parser.parse_args(given)
+    if a.launch:
+        if not Path(a.launch[0]).is_file():
+            parser.error(f"--launch: {a.launch[0]}: no such file")
+        beside = [
+            o
+            for o in ("features", "weights", "cameras", *(f"{n}_params" for n in (*FILES, "robot")))
+            if getattr(a, o) != parser.get_default(o)
+        ]
+        if beside:
+            parser.error(f"--launch: not together with --{beside[0].replace('_', '-')}: give the launch file's own arguments (NAME:=VALUE)")
     topics = [tuple(rule.split(":=")) for rule in a.topics]
     for rule in topics:
         if len(rule) != 2 or not all(name.startswith("/") and len(name) > 1 for name in rule):
@@ -526,10 +486,19 @@ def parse(argv: list[str] | None = None) -> Options:
         target=a.target,
         seed=a.seed,
         timeout=a.timeout,
+        command=shlex.join(["bash", "ros2_ws/demo.sh", *_typed(given)]),
+        weights=str(Path(a.weights).resolve()) if Path(a.weights).is_dir() and a.weights else a.weights,
+        launch=(str(Path(a.launch[0]).resolve()), *a.launch[1:]) if a.launch else (),
         cameras=tuple(a.cameras),
         topics=tuple(topics),
         files=files,
     )
+
+
+def _typed(arguments: Sequence[str]) -> list[str]:
+    """The command line without what ``demo.sh`` adds to it."""
+    words = list(arguments)
+    return words[2:] if words[:1] == ["--root"] else words
 
 
 def _no_parameters(path: Path) -> str:
@@ -577,7 +546,7 @@ def _run(options: Options) -> int:
     # Once everything has stopped, a further signal must not leave half a file.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    (options.out / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    write_summary(record, options.out)
     try:
         from magic_bringup import report
 

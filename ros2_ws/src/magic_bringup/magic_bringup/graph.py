@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -22,6 +23,9 @@ NODES: dict[str, tuple[str, str]] = {
     "verifier": ("magic_verifier", "verifier"),
     "strategy_server": ("magic_bringup", "strategy_server"),
 }
+
+#: What the process of a launch file is called.
+LAUNCH = "launch"
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
@@ -151,6 +155,15 @@ class Graph:
             ]
             self.start(name, package, program, *(["--ros-args", *arguments] if arguments else []))
 
+    def start_launch(self, arguments: Sequence[str]) -> Process:
+        """Start a launch file (its path, then NAME:=VALUE ...) by ``ros2 launch``; it counts as a node: its end is an error."""
+        ros2 = shutil.which("ros2", path=self.env.get("PATH"))
+        if ros2 is None:
+            raise MagicError(Code.SERVER_UNAVAILABLE, "ros2 is not on the PATH", allowed="a shell that has sourced ros2_ws/env.sh")
+        process = Process.start(LAUNCH, [ros2, "launch", *arguments], self.logs / f"{LAUNCH}.log", self.env)
+        self.processes[LAUNCH] = process
+        return process
+
     def sample(self) -> None:
         """Note every process's peak of memory."""
         for process in self.processes.values():
@@ -159,7 +172,7 @@ class Graph:
     def check(self) -> None:
         """Raise SERVER_UNAVAILABLE naming a node that has ended by itself, with the end of its log."""
         for name, process in self.processes.items():
-            if name in NODES and not process.stopped and process.status is not None:
+            if (name in NODES or name == LAUNCH) and not process.stopped and process.status is not None:
                 status = process.status
                 how = f"exit status {status}" if status >= 0 else f"signal {signal.Signals(-status).name}"
                 last = [line for line in process.tail().splitlines() if line.strip()][-1:]

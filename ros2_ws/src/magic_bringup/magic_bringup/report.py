@@ -1,24 +1,25 @@
 """The report of a run: one HTML file that needs nothing else.
 
-``ros2 run magic_bringup report DIR`` draws it again from what the demo left in DIR.
+``demo.sh`` and ``magic run --out DIR`` write it; ``ros2 run magic_bringup report DIR`` draws it again from what they left in DIR.
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
-import html
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_bringup.record import Record
+from magic_bringup.record import Record, empty_summary
 from magic_core import conversions, transforms
 from magic_core import strategy as strategies
 from magic_core.camera import Intrinsics
@@ -34,22 +35,21 @@ PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114
 NORMAL, CIRCLE, POINT = (0, 200, 255), (255, 80, 200), (255, 40, 40)
 PICTURE = 520
 
-STYLE = """
-:root{--ink:#1d2430;--soft:#5b6678;--line:#e3e7ee;--good:#12805c;--bad:#b3261e;--paper:#fff;--ground:#f4f6f9;--accent:#1f5fbf}
-*{box-sizing:border-box}body{margin:0;background:var(--ground);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
-main{max-width:1180px;margin:0 auto;padding:28px 20px 60px}h1{font-size:26px;margin:0 0 4px}h2{font-size:18px;margin:0 0 12px}
-p{margin:4px 0 12px}.soft{color:var(--soft)}section,header{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:20px 22px;margin:0 0 18px}
-.badge{display:inline-block;padding:4px 12px;border-radius:999px;color:#fff;font-weight:600;font-size:14px}.good{background:var(--good)}.bad{background:var(--bad)}
-.row{display:flex;flex-wrap:wrap;gap:16px}.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(195px,1fr));gap:16px}.wide{grid-template-columns:repeat(auto-fill,minmax(330px,1fr))}figure{margin:0;flex:1 1 240px;min-width:0}
-.metrics{display:grid;grid-template-columns:repeat(auto-fill,minmax(180px,1fr));gap:2px 18px;margin-top:6px;font-size:12.5px;color:var(--soft)}
-.metrics span{display:flex;justify-content:space-between;gap:8px;border-bottom:1px dotted var(--line)}.metrics b{font-weight:500;color:var(--ink);font-variant-numeric:tabular-nums}
-figure img{width:100%;border-radius:8px;display:block;background:#0b0d11}
-figcaption{font-size:13px;color:var(--soft);margin-top:6px}table{border-collapse:collapse;width:100%;font-size:14px}th,td{text-align:left;padding:7px 10px;border-bottom:1px solid var(--line);vertical-align:top}
-th{color:var(--soft);font-weight:600;white-space:nowrap}td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}tr.kept td{background:#eaf6f0}
-.bar{display:flex;height:26px;border-radius:8px;overflow:hidden;background:var(--line);margin:6px 0 10px}.bar div{color:#fff;font-size:12px;line-height:26px;padding-left:6px;white-space:nowrap;overflow:hidden}
-.facts{display:flex;flex-wrap:wrap;gap:8px 28px;margin-top:12px}.facts b{display:block;font-size:12px;color:var(--soft);font-weight:600}
-pre{background:#0f1420;color:#d5dbe6;padding:12px;border-radius:8px;overflow:auto;font-size:12px;max-height:260px}details summary{cursor:pointer;color:var(--accent)}
-"""
+#: What the words of the page mean.
+TERMS = (
+    ("verified", "The lower end of the success rate's 95 % interval reached what the verifier asks for. Nothing else is published."),
+    ("rollout", "One simulation of the motion, with what nobody knows drawn at random: friction, masses, places, shapes, the tool in the hand."),
+    ("candidate", "One contact on one tool that may correspond to the demonstrated one, with the motion that follows from it."),
+    ("contact, normal, circle", "Where tool and target touch; the direction out of the tool there; the circle of curvature of its outline there."),
+    ("score", "global + 0.1 x local, by default: how well a candidate corresponds to the demonstrated contact."),
+    ("global", "Likeness of the surroundings of the contact by features, at most 1."),
+    ("local", "Likeness of the curvature at the contact, at most 1."),
+    ("turn, face", "By how much the tool's view was turned, and whether it was mirrored, to look like the demonstration's. "
+     "keep, turn: whether the tool keeps the side that lies up, or is turned over."),
+    ("stage", "How far a candidate came: match, plan, verify."),
+    ("fg, arm", "fg: a floating gripper moves the tool, without an arm. arm: the robot grasps the tool and moves it."),
+    ("peak memory", "The most memory that a process held at any time."),
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- pictures
@@ -256,82 +256,95 @@ def motion_picture(plan: Any) -> Image:
 # ---------------------------------------------------------------- the page
 
 
-def _figure(image: Image, caption: str, quality: int = 0) -> str:
-    return f'<figure><img alt="{html.escape(caption)}" src="{data_uri(image, quality)}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+@dataclass(frozen=True)
+class Picture:
+    """A picture on the page: data URI and what stands below it."""
+
+    uri: str
+    caption: str
 
 
-def _section(title: str, body: str, note: str = "") -> str:
-    note = f'<p class="soft">{html.escape(note)}</p>' if note else ""
-    return f"<section><h2>{html.escape(title)}</h2>{note}{body}</section>"
+@dataclass(frozen=True)
+class Section:
+    """Pictures in rows under a title; layout: the template's class for a row (row, cards, cards wide)."""
+
+    title: str
+    rows: tuple[tuple[Picture, ...], ...] = ()
+    layout: str = "cards"
+    note: str = ""
+    texts: tuple[str, ...] = ()
 
 
-def _guard(title: str, draw: Callable[[], str]) -> str:
+def _picture(image: Image, caption: str, quality: int = 0) -> Picture:
+    return Picture(data_uri(image, quality), caption)
+
+
+def _guard(title: str, draw: Callable[[], Section]) -> Section:
     """A section; one that cannot be drawn says why and leaves the others alone."""
     try:
         return draw()
     except Exception as error:
-        return _section(title, f'<p class="soft">could not be drawn: {html.escape(f"{type(error).__name__}: {error}")}</p>')
+        return Section(title, note=f"could not be drawn: {type(error).__name__}: {error}")
 
 
-def _header(summary: dict[str, Any]) -> str:
-    success = summary["success"]
-    code = Code(summary["code"]).name
-    verdict = "verified" if success else f"{summary['code']} {code}"
-    badge = f'<span class="badge {"good" if success else "bad"}">{html.escape(verdict)}</span>'
-    facts = "".join(
-        f"<span><b>{label}</b>{html.escape(str(value))}</span>"
-        for label, value in (
-            ("strategy", summary["strategy"]),
-            ("variant", summary["variant"]),
-            ("features", summary["features"]),
-            ("simulations", summary["simulations"]),
-            ("perceive to verify", f"{summary['seconds']['total']:.2f} s"),
+def _facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    facts = [
+        ("strategy", summary["strategy"]),
+        ("variant", summary["variant"]),
+        ("features", summary["features"]),
+        ("simulations", str(summary["simulations"])),
+        ("perceive to verify", f"{summary['seconds']['total']:.2f} s"),
+    ]
+    if summary["rollouts"]:
+        low, high = summary["rate_interval"]
+        rate = (
+            f"{100 * summary['success_rate']:.0f} % of {summary['rollouts']} rollouts, 95 % interval {100 * low:.0f} to {100 * high:.0f} %"
         )
-    )
-    title = "Verified trajectory" if success else "No verified trajectory"
-    return f'<header><h1>{title} {badge}</h1><p>{html.escape(summary["message"])}</p><div class="facts">{facts}</div></header>'
+        facts.insert(2, ("success", rate))
+    facts += [("executed", "yes")] if summary["executed"] else []
+    return facts + [("date", summary["date"].replace("T", " ")), ("version", summary["version"])]
 
 
-def _cameras(record: Record, scene: Scene | None) -> str:
-    blocks = []
+def _cameras(record: Record, scene: Scene | None) -> Section:
+    title, rows, texts = "What the cameras saw", [], []
     colors = {t: m for t, m in record.images.items() if "/color/" in t}
     for topic, message in sorted(colors.items()):
         prefix = topic.rsplit("color/", 1)[0]
         name = prefix.rstrip("/").rsplit("/", 1)[-1]
-        figures = []
+        pictures = []
         try:
             color = conversions.color_from_msg(message)
-            figures.append(_figure(color, f"{name}: colour, {color.shape[1]} x {color.shape[0]}", 88))
+            pictures.append(_picture(color, f"{name}: colour, {color.shape[1]} x {color.shape[0]}", 88))
         except MagicError as error:
             color = None
-            figures.append(f"<p>{html.escape(f'{topic}: {error.message}')}</p>")
+            texts.append(f"{topic}: {error.message}")
         depth = record.images.get(prefix + "aligned_depth_to_color/image_raw")
         if depth is not None:
             try:
                 values = conversions.depth_from_msg(depth)
                 share = float(np.isfinite(values).mean())
-                figures.append(_figure(depth_picture(values), f"{name}: depth, {100 * share:.0f} % of the pixels have one"))
+                pictures.append(_picture(depth_picture(values), f"{name}: depth, {100 * share:.0f} % of the pixels have one"))
             except MagicError as error:
-                figures.append(f"<p>{html.escape(f'{name} depth: {error.message}')}</p>")
+                texts.append(f"{name} depth: {error.message}")
         if scene is not None and color is not None:
             masks = [
                 (o.id, o.mask, PALETTE[i % len(PALETTE)]) for i, o in enumerate(scene.objects) if o.mask is not None and o.camera == name
             ]
             if masks:
-                figures.append(_figure(masks_picture(color, masks), f"{name}: masks of {', '.join(m[0] for m in masks)}", 90))
-        blocks.append(f'<div class="row">{"".join(figures)}</div>')
-    return _section("What the cameras saw", "<br>".join(blocks) or '<p class="soft">No image came.</p>')
+                pictures.append(_picture(masks_picture(color, masks), f"{name}: masks of {', '.join(m[0] for m in masks)}", 90))
+        rows.append(tuple(pictures))
+    return Section(title, tuple(rows), "row", "" if rows or texts else "No image came.", tuple(texts))
 
 
-def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -> str:
+def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -> Section:
     from magic_core.views import view_of_contact
 
-    figures = [
-        _figure(
+    pictures = [
+        _picture(
             contact_picture(strategy.tool_view, strategy.tool_contact),
             f"demonstration: tool; r = {1000 * strategy.tool_contact.radius:.1f} mm, {'concave' if strategy.tool_contact.concave else 'convex'}",
         ),
-        _figure(
+        _picture(
             contact_picture(strategy.target_view, strategy.target_contact),
             f"demonstration: target; r = {1000 * strategy.target_contact.radius:.1f} mm",
         ),
@@ -345,34 +358,26 @@ def _contacts(strategy: strategies.Strategy, scene: Scene | None, result: Any) -
         if len(result.heatmap.data):
             heat = conversions.float_image_from_msg(result.heatmap)
             first = view_of_contact(scene.find(best.tool_id), strategy.view, best.tool.object_from_contact)
-            figures.append(
-                _figure(
-                    contact_picture(first, best.tool, heat_picture(first, heat)),
-                    f"{best.tool_id}: heat map of the match and the best candidate",
-                )
-            )
+            caption = f"{best.tool_id}: heat map of the match and the best candidate"
+            pictures.append(_picture(contact_picture(first, best.tool, heat_picture(first, heat)), caption))
         what = "the contact that was kept" if kept.code == Code.OK else "the best candidate, not kept"
         radius = f"r = {1000 * candidate.tool.radius:.1f} mm, {'concave' if candidate.tool.concave else 'convex'}"
-        figures.append(_figure(contact_picture(view, candidate.tool), f"{candidate.tool_id}: {what}; {radius}"))
+        pictures.append(_picture(contact_picture(view, candidate.tool), f"{candidate.tool_id}: {what}; {radius}"))
         if candidate.target is not None and result.target_id:
             target = scene.find(result.target_id)
-            figures.append(
-                _figure(
-                    contact_picture(target_view(target, strategy), candidate.target),
-                    f"{result.target_id}: its contact; r = {1000 * candidate.target.radius:.1f} mm",
-                )
-            )
+            caption = f"{result.target_id}: its contact; r = {1000 * candidate.target.radius:.1f} mm"
+            pictures.append(_picture(contact_picture(target_view(target, strategy), candidate.target), caption))
     note = "Point: the contact. Arrow: its outward normal. Circle: the circle of curvature."
-    return _section("From the demonstrated contact to the new one", f'<div class="cards">{"".join(figures)}</div>', note)
+    return Section("From the demonstrated contact to the new one", (tuple(pictures),), note=note)
 
 
-def _meshes(scene: Scene, result: Any) -> str:
+def _meshes(scene: Scene, result: Any) -> Section:
     from magic_core.rendering import Raycaster, shade
 
     path = None
     if result is not None and result.plan.tool_trajectory.points:
         path = np.array([[getattr(p.transforms[0].translation, a) for a in "xyz"] for p in result.plan.tool_trajectory.points])
-    figures = [_figure(scene_picture(scene, path), "the reconstructed scene" + (" with the tool's path" if path is not None else ""), 92)]
+    pictures = [_picture(scene_picture(scene, path), "the reconstructed scene" + (" with the tool's path" if path is not None else ""), 92)]
     for index, item in enumerate(scene.objects):
         mesh = item.mesh if item.mesh.colors is not None and item.mesh.colors.any() else item.mesh.painted(PALETTE[index % len(PALETTE)])
         low, high = mesh.bounds
@@ -382,23 +387,8 @@ def _meshes(scene: Scene, result: Any) -> str:
         cast, _ = Raycaster([mesh]).perspective(intrinsics, camera)
         extent = " x ".join(f"{1000 * x:.0f}" for x in mesh.extents)
         caption = f"{item.id} ({item.source}): {extent} mm, {len(mesh.faces)} triangles, {len(item.pieces)} convex pieces"
-        figures.append(_figure(shade(cast, light=(-0.5, -0.3, 1.0), background=(236, 239, 244)), caption, 90))
-    return _section("What was reconstructed", f'<div class="cards wide">{"".join(figures)}</div>')
-
-
-def _candidates(summary: dict[str, Any]) -> str:
-    if not summary["candidates"]:
-        return _section("Candidates", '<p class="soft">None was tried.</p>')
-    head = "<tr><th>#</th><th>tool</th><th>score</th><th>global</th><th>local</th><th>turn</th><th>face</th><th>stage</th><th>what became of it</th></tr>"
-    rows = ""
-    for index, c in enumerate(summary["candidates"], 1):
-        face = ("mirrored, " if c["flipped"] else "") + c["reflection"]
-        rows += (
-            f'<tr class="{"kept" if c["code"] == 0 else ""}"><td class="n">{index}</td><td>{html.escape(c["tool_id"])}</td><td class="n">{c["score"]:.3f}</td>'
-            f'<td class="n">{c["s_dino"]:.3f}</td><td class="n">{c["s_curv"]:.3f}</td><td class="n">{np.degrees(c["rotation"]):.0f}&deg;</td>'
-            f"<td>{face}</td><td>{c['stage']}</td><td>{html.escape(c['reason'])}{_metrics(c.get('metrics') or {})}</td></tr>"
-        )
-    return _section("Candidates, in the order in which they were tried", f"<table>{head}{rows}</table>")
+        pictures.append(_picture(shade(cast, light=(-0.5, -0.3, 1.0), background=(236, 239, 244)), caption, 90))
+    return Section("What was reconstructed", (tuple(pictures),), "cards wide")
 
 
 #: Units of what verifiers measure, by the name's last word; what is not here has none.
@@ -406,50 +396,39 @@ UNITS = {"distance": "m", "drift": "m", "height": "m", "highest": "m", "overlap"
          "speed": "m/s", "turn": "rad", "error": "rad"}  # fmt: skip
 
 
-def _metrics(metrics: dict[str, float | None]) -> str:
-    """What was measured, in columns, lengths in mm."""
-    cells = ""
+def measured(metrics: Mapping[str, float | None]) -> list[tuple[str, str]]:
+    """What was measured, in words: names and values, lengths in mm."""
+    shown = []
     for name, value in metrics.items():
         unit = UNITS.get(name.rsplit("_", 1)[-1], "")
         if value is None:
-            shown = "not finite"
+            text = "not finite"
         elif unit == "m":
-            shown = f"{1000 * value:.1f} mm"
+            text = f"{1000 * value:.1f} mm"
         else:
-            shown = f"{value:.3g} {unit}".strip()
-        cells += f"<span>{html.escape(name.replace('_', ' '))}<b>{shown}</b></span>"
-    return f'<div class="metrics">{cells}</div>' if cells else ""
+            text = f"{value:.3g} {unit}".strip()
+        shown.append((name.replace("_", " "), text))
+    return shown
 
 
-def _costs(summary: dict[str, Any]) -> str:
-    seconds = summary["seconds"]
-    total = max(sum(seconds[s] for s in ("perceive", "match", "plan", "verify")), 1e-9)
-    bar = "".join(
-        f'<div style="width:{100 * seconds[s] / total:.2f}%;background:{color}" title="{s} {seconds[s]:.3f} s">{s} {seconds[s]:.2f} s</div>'
-        for s, color in (("perceive", "#1f5fbf"), ("match", "#7b4fb5"), ("plan", "#c2741b"), ("verify", "#12805c"))
-    )
-    rows = "".join(f'<tr><td>{html.escape(n)}</td><td class="n">{mb:.0f} MB</td></tr>' for n, mb in summary["peak_memory_mb"].items())
-    stages = "".join(
-        f'<tr><td>{s}</td><td class="n">{seconds[s]:.3f} s</td></tr>' for s in ("perceive", "match", "plan", "verify", "total")
-    )
-    tables = (
-        f'<div class="row"><figure><table><tr><th>stage</th><th>wall time</th></tr>{stages}</table></figure>'
-        f"<figure><table><tr><th>process</th><th>peak memory</th></tr>{rows}</table></figure></div>"
-    )
-    return _section("Time and memory", f'<div class="bar">{bar}</div>{tables}')
+def _bar(seconds: Mapping[str, float]) -> list[dict[str, str]]:
+    colors = {"perceive": "#1f5fbf", "match": "#7b4fb5", "plan": "#c2741b", "verify": "#12805c"}
+    total = max(sum(seconds[s] for s in colors), 1e-9)
+    return [
+        {"name": s, "seconds": f"{seconds[s]:.2f}", "share": f"{100 * seconds[s] / total:.2f}", "color": color}
+        for s, color in colors.items()
+    ]
 
 
-def _logs(folder: Path | None) -> str:
-    blocks = ""
-    for path in sorted(folder.glob("*.log")) if folder is not None and folder.is_dir() else []:
-        text = "\n".join(path.read_text(errors="replace").splitlines()[-60:])
-        blocks += f"<details><summary>{html.escape(path.stem)}</summary><pre>{html.escape(text)}</pre></details>"
-    return _section("Logs", blocks) if blocks else ""
+def _logs(folder: Path | None) -> list[tuple[str, str]]:
+    files = sorted(folder.glob("*.log")) if folder is not None and folder.is_dir() else []
+    return [(path.stem, "\n".join(path.read_text(errors="replace").splitlines()[-60:])) for path in files]
 
 
 def render(record: Record, logs: Path | None = None) -> str:
-    """The whole page."""
-    summary, result = record.summary, record.result
+    """The whole page; logs: a folder of log files whose ends are shown."""
+    # A summary of an earlier version lacks what came later.
+    summary, result = {**empty_summary("", ""), "date": "", "version": "", **record.summary}, record.result
     scene: Scene | None = None
     strategy: strategies.Strategy | None = None
     problems = []
@@ -461,28 +440,41 @@ def render(record: Record, logs: Path | None = None) -> str:
         strategy = strategies.find(summary["strategy"])
     except (MagicError, LookupError) as error:
         problems.append(f"strategy: {error}")
-    parts = [_header(summary), _candidates(summary)]
-    parts.append(_guard("What the cameras saw", lambda: _cameras(record, scene)))
+    sections = [_guard("What the cameras saw", lambda: _cameras(record, scene))]
     if strategy is not None:
-        parts.append(_guard("From the demonstrated contact to the new one", lambda: _contacts(strategy, scene, result)))
+        sections.append(_guard("From the demonstrated contact to the new one", lambda: _contacts(strategy, scene, result)))
     if scene is not None:
-        parts.append(_guard("What was reconstructed", lambda: _meshes(scene, result)))
+        sections.append(_guard("What was reconstructed", lambda: _meshes(scene, result)))
     if result is not None and len(result.film.data):
-        caption = "the last simulation, in reading order"
-        parts.append(_guard("Simulation", lambda: _section("Simulation", _figure(conversions.color_from_msg(result.film), caption, 90))))
+        sections.append(_guard("Simulation", lambda: _single("Simulation", _film(result), "the last simulation, in reading order", 90)))
     if result is not None and result.plan.tool_trajectory.points:
         title = "Joints" if summary["variant"] == "arm" else "Motion of the tool"
         note = "" if summary["success"] else "This motion was not verified."
-        parts.append(_guard(title, lambda: _section(title, _figure(motion_picture(conversions.plan_from_msg(result.plan)), title), note)))
-    parts.append(_costs(summary))
+        sections.append(_guard(title, lambda: _single(title, motion_picture(conversions.plan_from_msg(result.plan)), title, 0, note)))
     if problems:
-        parts.append(_section("Left out", "".join(f"<p>{html.escape(p)}</p>" for p in problems)))
-    parts.append(_logs(logs))
-    title = f"{summary['strategy']} ({summary['variant']})"
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
+        sections.append(Section("Left out", texts=tuple(problems)))
+    page = _environment().get_template("report.html")
+    return page.render(
+        summary=summary, code=Code(summary["code"]).name, facts=_facts(summary), sections=sections, bar=_bar(summary["seconds"]), terms=TERMS,
+        logs=_logs(logs),
+    )  # fmt: skip
+
+
+def _film(result: Any) -> Image:
+    return conversions.color_from_msg(result.film)
+
+
+def _single(title: str, image: Image, caption: str, quality: int, note: str = "") -> Section:
+    return Section(title, ((_picture(image, caption, quality),),), "row", note)
+
+
+def _environment() -> jinja2.Environment:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
+    made = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
+    made.filters["measured"] = measured
+    return made
 
 
 def write(record: Record, path: Path, logs: Path | None = None) -> None:
@@ -517,7 +509,9 @@ def load(folder: Path) -> Record:
     from magic_interfaces.msg import SceneObjectArray
 
     if not (folder / "summary.json").is_file():
-        raise MagicError(Code.BAD_REQUEST, "folder of a run", str(folder), "one with a summary.json, as demo.sh writes it")
+        raise MagicError(
+            Code.BAD_REQUEST, "folder of a run", str(folder), "one with a summary.json, as demo.sh and magic run --out write it"
+        )
     record = Record(json.loads((folder / "summary.json").read_text()))
     messages = folder / "messages"
     for path in sorted(messages.glob("image*.cdr")):
@@ -531,8 +525,10 @@ def load(folder: Path) -> Record:
 
 def main(argv: list[str] | None = None) -> None:
     """``ros2 run magic_bringup report DIR``."""
-    parser = argparse.ArgumentParser(prog="report", description="Draw report.html again from a folder that demo.sh wrote.")
-    parser.add_argument("folder", type=Path, help="the folder given to demo.sh by --out")
+    parser = argparse.ArgumentParser(
+        prog="report", description="Draw report.html again from a folder that demo.sh or magic run --out wrote."
+    )
+    parser.add_argument("folder", type=Path, help="the folder that was given by --out")
     parser.add_argument("-o", "--output", type=Path, help="file to write (default FOLDER/report.html)")
     arguments = parser.parse_args([a for a in (sys.argv[1:] if argv is None else argv) if a != "--ros-args"])
     try:

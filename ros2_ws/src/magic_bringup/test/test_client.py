@@ -4,10 +4,12 @@ import os
 import signal
 import threading
 
+import numpy as np
 import pytest
+from sensor_msgs.msg import Image
 from test_strategy_server import Bench
 
-from magic_bringup import client, fakes
+from magic_bringup import client, fakes, report
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
 from magic_core.errors import Code
@@ -52,6 +54,36 @@ def test_a_run_is_told_in_a_screenful(magic, tmp_path):
     assert any(line.startswith("  tool       object_") for line in told)
     assert len(told) <= 20
     assert max(map(len, told)) < 400
+
+
+def test_a_live_run_has_a_report_with_what_the_cameras_see(magic, bench, tmp_path):
+    picture = conversions.image_to_msg(np.full((48, 64, 3), 90, np.uint8), "rgb8")
+    publisher = bench.node.create_publisher(Image, "/camera/left/color/image_raw", qos.SENSOR)
+    timer = bench.node.create_timer(0.05, lambda: publisher.publish(picture))
+    bench.fakes.on_verify, before = delayed(bench.fakes.on_verify, 1.5), bench.fakes.on_verify
+    try:
+        status, lines = magic("run", "fake", "--variant", "fg", "--out", str(tmp_path / "run"))
+    finally:
+        bench.fakes.on_verify = before
+        bench.node.destroy_timer(timer)
+        bench.node.destroy_publisher(publisher)
+    assert status == 0, lines
+    assert f"  report     {tmp_path / 'run' / 'report.html'}" in lines
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "left: colour, 64 x 48" in page and "object_1 (" in page and "could not be drawn" not in page
+    assert "ros2 run magic_bringup magic run fake --variant fg --out" in page
+    again = report.load(tmp_path / "run")
+    assert again.summary["success"] and list(again.images) == ["/camera/left/color/image_raw"] and again.scene.objects
+
+
+def delayed(answer, seconds):
+    """An answer that comes later: a real verification takes its time, too."""
+
+    def late(goal, canceled):
+        threading.Event().wait(seconds)
+        return answer(goal, canceled)
+
+    return late
 
 
 def test_a_refused_run_says_why(magic, bench):

@@ -63,10 +63,24 @@ def test_what_the_command_line_names_is_looked_for_before_anything_starts(tmp_pa
         ["--robot-params", str(bad)],
         ["--topics", "rgb"],
         ["--topics", "/a:=b"],
+        ["--launch", str(tmp_path / "none.launch.xml")],
+        ["--launch", str(good), "features:=embedded", "--features", "embedded"],
     ):
         with pytest.raises(SystemExit) as caught:
             parse(words)
         assert caught.value.code == 2 and words[0] in capsys.readouterr().err
+
+
+def test_weights_and_a_launch_file_are_taken_whole(tmp_path, monkeypatch):
+    """Nodes have another working directory: folders become absolute, names of a hub stay as they are."""
+    (tmp_path / "dino").mkdir()
+    (tmp_path / "own.launch.xml").write_text("<launch/>")
+    monkeypatch.chdir(tmp_path)
+    assert parse(["--weights", "dino"]).weights == str(tmp_path / "dino")
+    assert parse(["--features", "dinov2", "--weights", "facebook/dinov2-base"]).weights == "facebook/dinov2-base"
+    options = parse(["--root", "/r", "--launch", "own.launch.xml", "robot:=my arm"])
+    assert options.launch == (str(tmp_path / "own.launch.xml"), "robot:=my arm")
+    assert options.command == "bash ros2_ws/demo.sh --launch own.launch.xml 'robot:=my arm'"
 
 
 def test_topics_of_other_names_and_compressed_images_are_those_of_a_camera(tmp_path):

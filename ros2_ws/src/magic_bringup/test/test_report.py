@@ -1,13 +1,13 @@
 """The report: complete for a full record, and whole even where parts are missing or broken."""
 
 import re
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
 from magic_bringup import fakes, report
-from magic_bringup.demo import Options, candidate_summary, empty_summary
-from magic_bringup.record import Record
+from magic_bringup.record import Record, empty_summary, take, write_summary
 from magic_core import conversions
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
@@ -23,8 +23,10 @@ def folder(tmp_path_factory):
 
 
 def full(folder, tmp_path, variant="arm"):
-    record = Record(empty_summary(Options(str(folder), variant, tmp_path, tmp_path)))
-    result = RunStrategy.Result(code=0, verified=True, tool_id="object_1", target_id="object_2")
+    record = Record(empty_summary(str(folder), variant, command="bash ros2_ws/demo.sh --out 'a <folder>'"))
+    result = RunStrategy.Result(code=0, verified=True, tool_id="object_1", target_id="object_2", message="passed")
+    result.rollouts, result.success_rate, result.rate_low, result.rate_high = 9, 1.0, 0.71, 1.0
+    result.failures, result.notes = ["1 x DRIFT"], ["the arm <i>stands</i> at home"]
     result.plan = conversions.plan_to_msg(fakes.plan(variant), "object_1")
     result.candidates = [
         CandidateReport(
@@ -33,6 +35,7 @@ def full(folder, tmp_path, variant="arm"):
             stage="verify",
             code=int(code),
             message="why <b>so</b>",
+            rollouts=9,
         )
         for code in (Code.DRIFT, Code.OK)
     ]
@@ -47,7 +50,8 @@ def full(folder, tmp_path, variant="arm"):
         "/camera/left/color/image_raw": conversions.image_to_msg(color, "rgb8"),
         "/camera/left/aligned_depth_to_color/image_raw": conversions.image_to_msg(depth, "16UC1"),
     }
-    record.summary.update(success=True, code=0, message="passed", candidates=[candidate_summary(r) for r in result.candidates])
+    take(record.summary, result)
+    record.summary["peak_memory_mb"] = {"perception": 470.0}
     return record
 
 
@@ -68,11 +72,77 @@ def test_a_full_report_is_self_contained(folder, tmp_path, variant):
     # Nothing is fetched from elsewhere, and what nodes say is not taken for markup.
     assert not re.search(r"""(src|href)=["'](?!data:)""", page)
     assert "<b>so</b>" not in page
+    assert "<i>stands" not in page and "<folder>" not in page
     assert page.count("data:image/") >= 9
 
 
+class Page(HTMLParser):
+    """The elements of a page; raises where tags do not close in order."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.found, self.style, self.text = [], [], "", []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        (self.text.append(data) if self.open[-1:] != ["style"] else setattr(self, "style", self.style + data))
+
+
+def test_nothing_on_the_page_asks_for_more_than_a_phone_is_wide(folder, tmp_path):
+    """At 390 px less the margins: no width or column of a fixed size beyond that, tables whose rows become cards, boxes that break or scroll."""
+    page = Page(report.render(full(folder, tmp_path), tmp_path))
+    assert ("meta", {"name": "viewport", "content": "width=device-width,initial-scale=1"}) in page.found
+    room = 390 - 2 * 8 - 2 * 12 - 2
+    screen, phone = page.style.split("@media (max-width:640px)")
+    for pixels in re.findall(r"(?<!max-)(?<!-)(?:min-width|width|flex-basis):(\d+)px", page.style):
+        assert int(pixels) <= room
+    for columns in re.findall(r"grid-template-columns:([^;}]+)", page.style):
+        assert "100%" in columns or "minmax(0,1fr)" in columns, columns
+    assert "img{width:100%" in screen and "overflow-wrap:anywhere" in screen and "pre{" in screen and "overflow:auto" in screen
+    assert "table.cells td::before{content:attr(data-label)" in phone
+    for tag, attributes in page.found:
+        assert not re.search(r"width:\s*\d+px", attributes.get("style", "") or "") and "width" not in attributes, tag
+    # Of tables that stay tables on a phone none has more than two columns, of those that become cards every cell says what it is.
+    for table in re.findall(r"<table>.*?</table>", report.render(full(folder, tmp_path)), re.DOTALL):
+        assert max(row.count("<td") + row.count("<th") for row in table.split("</tr>")) <= 2
+    (cells,) = re.findall(r'<table class="cells">.*?</table>', report.render(full(folder, tmp_path)), re.DOTALL)
+    assert cells.count("<td") == cells.count("data-label") == 2 * 9
+
+
+def test_the_page_says_when_by_what_and_what_its_words_mean(folder, tmp_path):
+    record = full(folder, tmp_path)
+    text = " ".join(Page(report.render(record)).text)
+    for words in (record.summary["date"].replace("T", " "), record.summary["version"], "bash ros2_ws/demo.sh --out 'a <folder>'"):
+        assert words in text
+    assert "100 % of 9 rollouts, 95 % interval 71 to 100 %" in text and "1 x DRIFT" in text
+    for term, meaning in report.TERMS:
+        assert term in text and meaning in text
+    # What stands in the heads of tables is explained.
+    heads = set(re.findall(r"<th>([^<#]+)</th>", report.render(record))) - {"tool", "what became of it", "process", "wall time"}
+    explained = {word for term, _ in report.TERMS for word in re.split(r", ", term)}
+    assert heads <= explained, heads - explained
+
+
+def test_an_older_summary_is_drawn_as_well(folder, tmp_path):
+    record = full(folder, tmp_path)
+    for later in ("rollouts", "rate_interval", "date", "version", "command", "failures", "notes", "executed"):
+        del record.summary[later]
+    assert "could not be drawn" not in report.render(record)
+
+
 def test_a_run_that_never_began_has_a_report_too(tmp_path):
-    record = Record(empty_summary(Options("hooking", "arm", tmp_path, tmp_path)))
+    record = Record(empty_summary("hooking", "arm"))
     record.summary.update(code=int(Code.BAD_BAG), message="the bag is empty")
     page = report.render(record)
     assert "111 BAD_BAG" in page
@@ -90,10 +160,8 @@ def test_broken_parts_leave_the_others_alone(folder, tmp_path):
 
 
 def test_a_record_comes_back_from_disk(folder, tmp_path):
-    import json
-
     record = full(folder, tmp_path)
-    (tmp_path / "summary.json").write_text(json.dumps(record.summary))
+    write_summary(record, tmp_path)
     report.save(record, tmp_path)
     again = report.load(tmp_path)
     assert report.render(again) == report.render(record)
