@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_matcher import global_matching
 from magic_matcher.dinov2 import Dinov2Features
@@ -53,7 +54,7 @@ class UNet:
             ) from error
         try:
             self._torch = torch
-            self._device = torch.device(device)
+            self._device = torch.device(devices.chosen(device))
             half = "float32" if self._device.type == "cpu" else "float16"
             self._dtype = getattr(torch, half if precision == "auto" else precision)
 
@@ -165,13 +166,13 @@ class DiffusionFeatures(global_matching.NetworkFeatures):
         ).astype(np.float32)
 
 
-def dift(weights: str, device: str = "cpu", size: int = 768, draws: int = DIFT_DRAWS, **options: Any) -> DiffusionFeatures:
+def dift(weights: str, device: str = devices.AUTO, size: int = 768, draws: int = DIFT_DRAWS, **options: Any) -> DiffusionFeatures:
     """DIFT; ``size`` in pixels, the grid has one token for 16 of them."""
     unet = UNet(weights, device, _size(size), DIFT_STEP, DIFT_BLOCKS, draws)
     return DiffusionFeatures("dift", unet, size // 16, **options)
 
 
-def sd_dino(weights: str, device: str = "cpu", size: int = 960, tokens: int = 60, **options: Any) -> DiffusionFeatures:
+def sd_dino(weights: str, device: str = devices.AUTO, size: int = 960, tokens: int = 60, **options: Any) -> DiffusionFeatures:
     """SD-DINO; ``weights``: Stable Diffusion's and DINOv2's, a comma between them."""
     diffusion, comma, dino = weights.partition(",")
     if not (diffusion and comma and dino):

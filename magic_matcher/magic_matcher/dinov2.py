@@ -8,6 +8,7 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_matcher import global_matching
 
@@ -32,7 +33,7 @@ class Dinov2Features(global_matching.NetworkFeatures):
     def __init__(
         self,
         weights: str,
-        device: str = "cpu",
+        device: str = devices.AUTO,
         tokens: int = 37,
         aggregation: str = "aligned",
         components: int | None = global_matching.COMPONENTS,
@@ -54,7 +55,7 @@ class Dinov2Features(global_matching.NetworkFeatures):
             if config.model_type not in MODELS:
                 raise MagicError(Code.FEATURE_WEIGHTS, f"model type of {weights}", config.model_type, MODELS)
             self._torch = torch
-            self._device = torch.device(device)
+            self._device = torch.device(devices.chosen(device))
             half = "float32" if self._device.type == "cpu" else "float16"
             self._dtype = getattr(torch, half if precision == "auto" else precision)
             self._model = AutoModel.from_pretrained(weights, dtype=self._dtype).to(self._device).eval()

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
 from magic_core.strategy import Strategy
@@ -173,7 +174,7 @@ def from_strategy(strategy: Strategy) -> Reference:
 MAKERS: dict[str, Callable[..., Features]] = {}
 
 
-def load(name: str = "auto", weights: str = "", device: str = "cpu", **options: Any) -> Features:
+def load(name: str = "auto", weights: str = "", device: str = devices.AUTO, **options: Any) -> Features:
     """A backend by name; raises ``UNKNOWN_FEATURES`` or ``FEATURE_WEIGHTS`` saying what was looked for."""
     import_module("magic_matcher.backends")  # by its name: the backends are made of what this module defines
     if name == "auto":

@@ -30,6 +30,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from magic_core import devices
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_matcher import backends, curvature, drawing, features, images, matching
@@ -151,7 +152,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--target-mask", metavar="M.png", help="its mask")
     p.add_argument("--features", default="auto", choices=backends.BACKENDS, help="feature backend (default: auto)")
     p.add_argument("--weights", default="", help="hub name or folder of weights, for dinov2")
-    p.add_argument("--device", default="cpu", help="torch device (default: cpu)")
+    p.add_argument(
+        "--device", default=devices.AUTO, help="torch device of the network; auto (default): cuda where there is a GPU, else cpu"
+    )
     p.add_argument("--top", type=int, default=3, metavar="K", help="how many candidates (default: 3)")
     p.add_argument("--cache", default="", metavar="DIR", help="keep the prepared reference in this folder")
     p.add_argument("--out", required=True, metavar="DIR", help="folder for match.json and match.png")

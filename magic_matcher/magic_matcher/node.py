@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 
-from magic_core import conversions, diagnostics, qos, strategy
+from magic_core import conversions, devices, diagnostics, qos, strategy
 from magic_core import node as nodes
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
@@ -33,7 +33,7 @@ class MatcherNode(Node):
     (magic_interfaces/SceneObjectArray, latched).
 
     Parameters: ``features`` (auto, embedded, dinov2, dift, sd_dino), ``weights`` (hub name or folder,
-    for dinov2), ``device`` (cpu, cuda), ``top_k``, ``curvature_weight`` (lambda),
+    for dinov2), ``device`` (auto, cpu, cuda), ``top_k``, ``curvature_weight`` (lambda),
     ``strategies`` (folder; empty: the installed ones), ``cache`` (folder of what is kept
     of references; empty: the user's cache folder; ``none``: memory only).
     """
@@ -44,7 +44,9 @@ class MatcherNode(Node):
             self, "features", "auto", "feature backend: auto takes dinov2 where weights are named", choices=BACKENDS, read_only=True
         )
         weights = nodes.parameter(self, "weights", "", "hub name or local folder of DINOv2 or DINOv3 weights", read_only=True)
-        device = nodes.parameter(self, "device", "cpu", "torch device of the network", read_only=True)
+        device = nodes.parameter(
+            self, "device", devices.AUTO, "torch device of the network; auto: cuda where there is a GPU, else cpu", read_only=True
+        )
         nodes.parameter(
             self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50, read_only=False
         )

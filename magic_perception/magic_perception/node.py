@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from magic_core import conversions as cv
 from magic_core import depth as depths
-from magic_core import transforms
+from magic_core import devices, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
@@ -106,7 +106,7 @@ class Perception(Node):
             depths.metres(self.depth_unit)
         name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS)
         weights = p("weights", "", "weights of the segmenter: a hub name or a local folder; empty: its default")
-        device = p("device", "cpu", "torch device of the segmenter")
+        device = p("device", devices.AUTO, "torch device of the segmenter; auto: cuda where there is a GPU, else cpu")
         self.parameters = self._algorithm()
         self.given = {camera: pose for camera in self.cameras if (pose := self._extrinsics(camera)) is not None}
         self.segmenter = make_segmenter(name, weights, device)

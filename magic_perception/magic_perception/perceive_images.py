@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from magic_core import depth as depths
-from magic_core import images, transforms
+from magic_core import devices, images, transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_perception.parameters import METHODS, Parameters
@@ -77,7 +77,9 @@ def main(args: list[str] | None = None) -> None:
     )
     parser.add_argument("--segmenter", choices=SEGMENTERS, default="depth")
     parser.add_argument("--weights", default="", help="weights of the segmenter: a hub name or a local folder")
-    parser.add_argument("--device", default="cpu", help="torch device of the segmenter")
+    parser.add_argument(
+        "--device", default=devices.AUTO, help="torch device of the segmenter; auto (default): cuda where there is a GPU, else cpu"
+    )
     parser.add_argument("--method", choices=METHODS, default="completed", help="reconstruction")
     parser.add_argument(
         "--max-distance", type=float, default=1.3, help="how far from below the camera objects are looked for, m (default 1.3)"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception.parameters import Parameters
@@ -28,18 +29,17 @@ class SamSegmenter:
     Raises ``SEGMENTER_WEIGHTS`` where the weights cannot be loaded.
     """
 
-    def __init__(self, name: str, weights: str = "", device: str = "cpu", agree: float = 0.5) -> None:
+    def __init__(self, name: str, weights: str = "", device: str = devices.AUTO, agree: float = 0.5) -> None:
         self.name = name
         self.agree = agree
-        self.device = device
         source = weights or DEFAULTS[name]
         try:
             import torch
             import transformers
 
             kind = transformers.SamModel if name == "sam" else transformers.Sam2Model
-            self._torch = torch
-            self._model: Any = kind.from_pretrained(source).eval().to(device)
+            self._torch, self.device = torch, devices.chosen(device)
+            self._model: Any = kind.from_pretrained(source).eval().to(self.device)
         except Exception as error:  # transformers raises many kinds: no network, no such folder, wrong kind of model
             raise MagicError(
                 Code.SEGMENTER_WEIGHTS, f"weights of segmenter {name}", f"{source}: {str(error).splitlines()[0] if str(error) else type(error).__name__}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_perception.segmentation import DepthSegmenter, Segmenter
 
@@ -30,7 +31,7 @@ MAKERS: dict[str, Callable[[str, str], Segmenter]] = {
 SEGMENTERS = tuple(MAKERS)
 
 
-def make_segmenter(name: str, weights: str = "", device: str = "cpu") -> Segmenter:
+def make_segmenter(name: str, weights: str = "", device: str = devices.AUTO) -> Segmenter:
     """The segmenter of that name; raises ``UNKNOWN_SEGMENTER``, or ``SEGMENTER_WEIGHTS`` where its weights cannot be loaded."""
     if name not in MAKERS:
         raise MagicError(Code.UNKNOWN_SEGMENTER, "segmenter", name, SEGMENTERS)

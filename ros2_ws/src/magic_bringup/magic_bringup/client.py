@@ -9,29 +9,25 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.metadata
-import importlib.util
-import os
 import shlex
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CompressedImage, Image
 
-from magic_bringup.graph import NODES
+from magic_bringup.doctor import examine
 from magic_bringup.pipeline import split_metrics
 from magic_bringup.record import IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
 from magic_bringup.remote import RemoteAction, RemoteService, Token
@@ -42,24 +38,12 @@ from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
 from magic_core.motion import VARIANTS
-from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
+from magic_interfaces.action import RunStrategy
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
 
 #: What is waited beyond a run's own time for its answer, s.
 GRACE = 30.0
-#: What the doctor listens for at least: every node reports once a second.
-LISTEN = 3.0
-#: Modules whose versions matter when somebody is asked for help, with the packages that bring them.
-MODULES = {
-    "numpy": "numpy",
-    "torch": "torch",
-    "open3d": "open3d",
-    "sapien": "sapien",
-    "mplib": "mplib",
-    "cv2": "opencv-python-headless",
-    "sklearn": "scikit-learn",
-}
 
 
 class Client:
@@ -72,17 +56,17 @@ class Client:
         )
         self.node = Node("magic", context=self.context)
         self.token = Token()
-        self._group = ReentrantCallbackGroup()
+        self.group = ReentrantCallbackGroup()
         self._executor = ThreadedExecutor(2, context=self.context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
 
     def action(self, kind: Any, name: str, server: str) -> RemoteAction:
-        return RemoteAction(self.node, kind, name, server, self._group)
+        return RemoteAction(self.node, kind, name, server, self.group)
 
     def service(self, kind: Any, name: str, server: str) -> RemoteService:
-        return RemoteService(self.node, kind, name, server, self._group)
+        return RemoteService(self.node, kind, name, server, self.group)
 
     def objects(self, timeout: float) -> Any:
         """The newest ``objects`` message; raises NO_FRAMES where none comes within ``timeout`` seconds."""
@@ -320,23 +304,7 @@ def list_strategies(folder: str) -> int:
 
 def doctor(client: Client, given: argparse.Namespace) -> int:
     """What is missing for the graph to work, and how to mend it."""
-    heard: dict[str, DiagnosticStatus] = {}
-
-    def listen(message: Any) -> None:
-        for status in message.status:
-            heard[status.name] = status
-
-    client.node.create_subscription(DiagnosticArray, "/diagnostics", listen, qos.RELIABLE)
-    wanted = _expected(client)
-    enough = time.monotonic() + LISTEN
-
-    def complete() -> bool:
-        return time.monotonic() > enough and all(there() == 1 for _, there, _ in wanted)
-
-    client.token.wait(complete, time.monotonic() + max(LISTEN, given.timeout), alive=lambda: None)
-    findings = list(environment_findings())
-    findings += [_server_finding(what, there(), mend) for what, there, mend in wanted]
-    findings += diagnostic_findings(heard, client.node.get_namespace())
+    findings = examine(client, given.timeout, given.cameras)
     for level, text, mend in findings:
         say(f"{level:<5} {text}")
         if mend and level != "ok":
@@ -344,66 +312,6 @@ def doctor(client: Client, given: argparse.Namespace) -> int:
     bad = sum(level == "FAIL" for level, _, _ in findings)
     say(f"{bad} to mend" if bad else "nothing is missing")
     return 1 if bad else 0
-
-
-#: (ok, note or FAIL; what was found; how to mend it)
-Finding = tuple[str, str, str]
-
-
-def environment_findings() -> Iterator[Finding]:
-    """Of this process: middleware, domain, versions, what the features have to work with."""
-    rmw = os.environ.get("RMW_IMPLEMENTATION", "the default one")
-    where = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    yield "ok", f"ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}, discovery {where}, middleware {rmw}", ""
-    versions, missing = [], []
-    for module, package in MODULES.items():
-        if importlib.util.find_spec(module) is None:
-            missing.append(package)
-            continue
-        try:
-            versions.append(f"{package} {importlib.metadata.version(package)}")
-        except importlib.metadata.PackageNotFoundError:  # a distribution's own package has no such record
-            versions.append(f"{package} as installed by the system")
-    yield "ok", "versions: " + ", ".join(versions), ""
-    if missing:
-        yield "FAIL", "not installed here: " + ", ".join(missing), "bash ros2_ws/setup.sh, then source ros2_ws/env.sh"
-
-
-def _expected(client: Client) -> list[tuple[str, Callable[[], int], str]]:
-    """What has to be there: its name, how many there are, and how to start it."""
-    node = client.node
-    remotes = {
-        "matcher": client.service(MatchContact, "match_contact", "matcher"),
-        "planner": client.action(PlanMotion, "plan_motion", "planner"),
-        "verifier": client.action(VerifyMotion, "verify_motion", "verifier"),
-        "strategy_server": client.action(RunStrategy, "run_strategy", "strategy server"),
-    }
-    found: list[tuple[str, Callable[[], int], str]] = []
-    for name, (package, program) in NODES.items():
-        mend = f"ros2 run {package} {program}, or all at once: ros2 launch magic_bringup magic.launch.xml"
-        if name in remotes:
-            remote = remotes[name]
-            found.append((f"{name} ({remote.name})", lambda r=remote: len(r.servers()), mend))
-        else:
-            topic = node.resolve_topic_name("objects")
-            found.append((f"{name} ({topic})", lambda t=topic: node.count_publishers(t), mend))
-    return found
-
-
-def _server_finding(what: str, count: int, mend: str) -> Finding:
-    if count == 1:
-        return "ok", f"{what} is there", ""
-    if count == 0:
-        return "FAIL", f"{what} is not there", mend
-    return "FAIL", f"{what} is there {count} times", "end all but one: their answers cannot be told apart (ros2 node list)"
-
-
-def diagnostic_findings(heard: dict[str, DiagnosticStatus], namespace: str) -> list[Finding]:
-    """What the nodes of a namespace say about themselves."""
-    prefix = namespace.strip("/")
-    own = {n: s for n, s in sorted(heard.items()) if not prefix or n.startswith(f"{prefix}/")}
-    levels = {DiagnosticStatus.OK: "ok", DiagnosticStatus.WARN: "note"}
-    return [(levels.get(status.level, "FAIL"), f"{name}: {status.message}", "") for name, status in own.items()]
 
 
 # ------------------------------------------------------------ command line
@@ -439,6 +347,7 @@ def parser() -> argparse.ArgumentParser:
     four.add_argument("--folder", default="", help="of strategies (default: the installed ones)")
     five = verbs.add_parser("doctor", help="what is missing for the graph to work")
     five.add_argument("--timeout", type=float, default=10.0, help="s for the nodes to be found (default 10)")
+    five.add_argument("--cameras", nargs="+", default=[], metavar="NAME", help="cameras to look at (default: those of perception)")
     return top
 
 
