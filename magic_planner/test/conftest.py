@@ -20,8 +20,10 @@ if _shadow is not None and getattr(_shadow, "__file__", None) is None:
 def arm():
     """The Panda, ready to plan."""
     from magic_planner.arm import ArmPlanner
+    from magic_planner.request import ArmSettings
     from magic_planner.robot import Robot
 
-    planner = ArmPlanner(Robot())
+    # The same paths are found on a machine that has other things to do.
+    planner = ArmPlanner(Robot(), ArmSettings(free_time=3.0))
     planner.warm_up()
     return planner
