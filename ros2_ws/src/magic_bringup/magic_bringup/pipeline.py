@@ -59,7 +59,7 @@ GRASP_ONLY = frozenset({Code.GRASP_SLIPPED})
 
 @dataclass(frozen=True)
 class Request:
-    """One run.  tool_id and target_id may be empty: the matcher chooses.  timeout in seconds for everything."""
+    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`) or empty: the matcher chooses.  timeout in seconds for everything."""
 
     strategy: str
     variant: str
@@ -179,8 +179,8 @@ def split_metrics(message: str) -> tuple[str, dict[str, float]]:
 class Stages(Protocol):
     """The work itself.  Each method ends within ``timeout`` seconds, by a result or by a :class:`MagicError`."""
 
-    def perceive(self, request: Request, timeout: float) -> None:
-        """Make sure that there are objects to work on, and that the request's ids are among them."""
+    def perceive(self, request: Request, timeout: float) -> tuple[Request, str]:
+        """Make sure that there are objects to work on.  The request with its ids among them, and how names in words were read."""
 
     def match(self, request: Request, timeout: float) -> Matches:
         """Find the contacts."""
@@ -243,6 +243,11 @@ def check(request: Request) -> None:
         raise MagicError(Code.UNKNOWN_VARIANT, "variant", request.variant, VARIANTS)
     if not 0 < request.timeout < float("inf"):
         raise MagicError(Code.BAD_REQUEST, "timeout", request.timeout, "seconds above 0")
+    check_different(request)
+
+
+def check_different(request: Request) -> None:
+    """Refuse one object for both."""
     if request.tool_id and request.tool_id == request.target_id:
         raise MagicError(Code.BAD_REQUEST, "tool_id and target_id", request.tool_id, "two different objects")
 
@@ -289,9 +294,11 @@ class Run:
             return self._outcome(Code(code), message)
 
     def _work(self) -> Outcome:
-        request = self._request
         self._tell("perceive", 0, "waiting for objects")
-        self._timed("perceive", lambda left: self._stages.perceive(request, left))
+        request, reading = self._timed("perceive", lambda left: self._stages.perceive(self._request, left))
+        self._request = request
+        if reading:
+            self._tell("perceive", 0, reading)
         self._tell("match", 0, "matching contacts")
         matches = self._matches = self._timed("match", lambda left: self._stages.match(request, left))
         self._tell("match", 0, matches.message or f"{len(matches.candidates)} candidates")

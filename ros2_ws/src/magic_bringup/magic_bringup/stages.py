@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ from magic_bringup.joints import JointStates, check_range
 from magic_bringup.permission import Verdict, check_single
 from magic_bringup.remote import RemoteAction, RemoteService, Token
 from magic_bringup.settings import Settings
-from magic_core import conversions
+from magic_core import conversions, naming
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_interfaces.action import PlanMotion, VerifyMotion
@@ -88,8 +89,8 @@ class Stages:
         self._last_goal: VerifyMotion.Goal | None = None
         self._last_code = 0
 
-    def perceive(self, request: pipeline.Request, timeout: float) -> None:
-        """Take the objects there are, or wait for them; see that every server is there."""
+    def perceive(self, request: pipeline.Request, timeout: float) -> tuple[pipeline.Request, str]:
+        """Take the objects there are, or wait for them; see that every server is there.  Names in words become ids."""
         server, self.strategy = self._server, request.strategy
         # First the servers: a run that cannot be verified is not begun.
         deadline = time.monotonic() + min(timeout, server.settings.presence)
@@ -122,8 +123,23 @@ class Stages:
             raise self._no_objects(scene, wait)
         unknown = self._unknown(scene, request)
         if unknown:
-            raise MagicError(Code.UNKNOWN_OBJECT, unknown[0], unknown[1], [o.id for o in scene.objects])
+            there = [o.id for o in scene.objects]
+            raise MagicError(Code.UNKNOWN_OBJECT, unknown[0], unknown[1], f"{', '.join(there)}, or a name such as 'the longest tool'")
         self._take(scene, time.monotonic() + wait)
+        return self._named(request)
+
+    def _named(self, request: pipeline.Request) -> tuple[pipeline.Request, str]:
+        """The request with its names read, and how; a name is of the objects as the robot's base sees them."""
+        assert self.scene is not None
+        ids = {o.id for o in self.scene.objects}
+        given = {what: value for what in ("tool_id", "target_id") if (value := getattr(request, what)) and value not in ids}
+        if not given:
+            return request, ""
+        objects = [conversions.object_from_msg(o) for o in self.scene.objects]
+        readings = {what: naming.resolve(value, objects) for what, value in given.items()}
+        request = replace(request, **{what: reading.id for what, reading in readings.items()})
+        pipeline.check_different(request)
+        return request, "; ".join(reading.sentence for reading in readings.values())
 
     def _verifier(self) -> tuple[RemoteAction, ...]:
         """The verifier, where this run needs it."""
@@ -159,7 +175,7 @@ class Stages:
     def _unknown(scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
         ids = [o.id for o in scene.objects]
         for what, value in (("tool_id", request.tool_id), ("target_id", request.target_id)):
-            if value and ids and value not in ids:
+            if value and ids and value not in ids and not naming.is_name(value):
                 return what, value
         return None
 

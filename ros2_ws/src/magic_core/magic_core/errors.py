@@ -50,6 +50,7 @@ class Code(IntEnum):
     NO_CURVATURE = 208
     BAD_STRATEGY = 209
     OBJECT_CUT_OFF = 210
+    AMBIGUOUS_OBJECT = 211
 
     # Planning
     BAD_MOTION = 300
