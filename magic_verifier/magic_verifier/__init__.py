@@ -1,1 +1,1 @@
-"""Physics says yes or no: simulation of a planned motion and the goal tests that judge it."""
+"""Physics says yes or no: simulation of a planned motion and the goals that judge it."""

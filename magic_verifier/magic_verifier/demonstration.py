@@ -22,7 +22,7 @@ from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.strategy import Physics
 from magic_verifier.floating import TARGET, TOOL, FloatingRun, make_setup
-from magic_verifier.goals import TOUCH
+from magic_verifier.predicates import TOUCH
 from magic_verifier.simulation import DYNAMIC, Settings
 
 #: Of a target that is held where it is, kg/m^3.

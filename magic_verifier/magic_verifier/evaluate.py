@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
+from magic_core.goal import words
 from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
@@ -428,14 +429,13 @@ def truths(done: list[dict[str, Any]]) -> dict[str, Any]:
 def _test_sentence(options: Options) -> str:
     """What success means here, in words and numbers."""
     strategy = _strategy(options)
-    values = ", ".join(f"{key} {value:g}" for key, value in sorted(strategy.goal.values.items()))
     own = ""
     if options.task == "hooking":
         noise = strategy.goal.values["noise"]
         kicks = f"the target's sideways velocity is kicked by N(0, {noise:g} r) at every step" if noise > 0 else "no velocity noise"
         same = " as in the released code" if noise == HOOK_NOISE else ", unlike the released code's test"
         own = f"; {kicks}{same}; a watch must pull {WATCH_DISTANCE:g} m"
-    return f"goal test {strategy.goal.test} ({values}){own}"
+    return "; ".join(line.strip() for line in words(strategy.goal)) + own
 
 
 def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path: Path, columns: int = 4, most: int = 80) -> None:

@@ -226,8 +226,7 @@ _known: dict[tuple[Any, ...], str] = {}
 
 def _impossible(strategy: Strategy, name: str, target_name: str) -> str:
     key = (
-        strategy.goal.test,
-        tuple(sorted(strategy.goal.values.items())),
+        repr(strategy.goal),
         strategy.view,
         strategy.target_contact.radius,
         name,
@@ -241,7 +240,9 @@ def _impossible(strategy: Strategy, name: str, target_name: str) -> str:
 def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
     mesh, pieces, shape, _ = load_object(name, strategy.view)
     target, _, meeting = scene_for(strategy, target_name)
-    if strategy.goal.test == "scoop":
+    asked = list(strategy.goal.tree.nodes())
+    hangs_on = [node for node in asked if node.kind == "below_support"]
+    if any(node.kind in ("touching_only", "held_by") and (node.args["what"], node.args["whom"]) == ("target", "tool") for node in asked):
         radius = _round_radius(target.mesh)
         if radius is None:
             return ""
@@ -249,7 +250,7 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
         if depth >= SCOOP_RISE:
             return ""
         return f"a ball of {1000 * radius:.0f} mm lies {1000 * depth:.1f} mm deep in it (needed: {1000 * SCOOP_RISE:.1f} mm)"
-    if strategy.goal.test not in ("hook", "hang"):
+    if not hangs_on and not any(node.kind == "encloses" for node in asked):
         return ""
     if shape is not None:
         view = shape.view(strategy.view)
@@ -257,7 +258,7 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
         from magic_core.views import find_view
 
         view = find_view(mesh, pieces, strategy.view)
-    if strategy.goal.test == "hook":
+    if not hangs_on:
         radius = _round_radius(target.mesh)
         if radius is None:
             return ""
@@ -271,7 +272,7 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
         top = float(transforms.apply(target.world_from_object, target.mesh.vertices)[:, 2].max())
     else:
         top = float(transforms.apply(target.world_from_object, meeting.point[None])[0, 2])
-    drop = top - strategy.goal.values.get("height", 0.2)
+    drop = top - max((node.args["height"] for node in asked if node.kind == "above" and node.args["what"] == "tool"), default=-np.inf)
     solid = mesh.to_trimesh()
     view_from_object = transforms.inverse(view.object_from_view)
     weight = solid.center_mass if solid.is_volume else solid.centroid

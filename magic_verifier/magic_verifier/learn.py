@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import goal as goals
 from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
@@ -296,8 +297,10 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--bag", type=Path, required=True, help="the recorded demonstration")
     parser.add_argument("--out", type=Path, required=True, help="the new strategy's folder; its name is the strategy's")
-    parser.add_argument("--goal", required=True, help="goal test (hook, hang, scoop, sweep), or 'none': simulation cannot judge it")
-    parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal test")
+    parser.add_argument(
+        "--goal", required=True, help="name of a goal tree that ships (hook, hang, scoop, ...), or 'none': simulation cannot judge it"
+    )
+    parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal")
     parser.add_argument("--tool-pose", help=f"topic with the poses of a frame fixed to the tool (default {TOOL_POSE})")
     parser.add_argument("--tool-frame", help="a frame of /tf fixed to the tool, instead")
     parser.add_argument("--world", default="panda_link0", help="the arm's base frame")
@@ -323,8 +326,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 def goal_of(given: argparse.Namespace) -> Goal:
     """The goal, its name and numbers checked; raises UNKNOWN_GOAL or BAD_REQUEST."""
-    from magic_verifier import goals
-
     values: dict[str, float] = {}
     for text in given.value:
         name, equals, number = text.partition("=")
@@ -339,9 +340,9 @@ def goal_of(given: argparse.Namespace) -> Goal:
         if values:
             raise MagicError(Code.BAD_REQUEST, "--value", ", ".join(values), "no numbers with --goal none: nothing is judged")
         return Goal("none")
-    if given.goal not in goals.GOALS:
-        raise MagicError(Code.UNKNOWN_GOAL, "goal test", given.goal, [*goals.GOALS, "none"])
-    known = goals.GOALS[given.goal].defaults
+    if given.goal not in goals.names():
+        raise MagicError(Code.UNKNOWN_GOAL, "goal test", given.goal, [*goals.names(), "none"])
+    known = goals.named(given.goal).values
     for name, value in values.items():
         if name not in known:
             raise MagicError(Code.BAD_REQUEST, f"--value of goal {given.goal}", name, list(known))
@@ -349,7 +350,7 @@ def goal_of(given: argparse.Namespace) -> Goal:
             least = "above 0" if name in ABOVE_ZERO else "from 0"
             raise MagicError(Code.BAD_REQUEST, f"--value {name}", value, f"{least} to {LARGEST:g}")
     # The kicks of the released code's test belong to its set of standing cylinders, not to whatever was demonstrated.
-    return Goal(given.goal, {"noise": 0.0, **values} if "noise" in known else values)
+    return goals.shipped(given.goal, **({"noise": 0.0, **values} if "noise" in known else values))
 
 
 def check_given(given: argparse.Namespace) -> None:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from magic_bringup.make_strategies import demonstrated, target_contact, target_view, through
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact
+from magic_core.goal import shipped
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import pose_data
-from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import Physics, Strategy, Waypoint
 
 DOWN = np.array([0.0, 0.0, -1.0])
 #: The demonstrated tool: a T of a wooden handle and a block.
@@ -90,7 +91,7 @@ def hammering() -> Strategy:
         mode="retarget",
         **demonstrated(tool, view, contact, peg, seen, touched, normal, DOWN, times, contacts),
         waypoints=waypoints,
-        goal=Goal("drive"),
+        goal=shipped("drive"),
         physics=Physics(friction=0.3, tool_density=1500.0, target_density=2700.0),
         environment={
             "world_from_target": pose_data(transforms.make(translation=[0.62, 0.0, PEG["side"] / 2])),
@@ -126,7 +127,7 @@ def pushing() -> Strategy:
         mode="plan",
         **demonstrated(tool, view, contact, target, seen, touched, normal, DOWN, times, contacts),
         waypoints=waypoints,
-        goal=Goal("sweep"),
+        goal=shipped("sweep"),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
         environment={
             "world_from_target": pose_data(transforms.make(translation=[0.45, 0.0, SWEPT])),

@@ -1,4 +1,4 @@
-"""Run a plan in physics and judge it by the strategy's goal test.
+"""Run a plan in physics and judge it by the strategy's goal.
 
 :func:`verify` is the one entry point: it never raises for anything that the scene,
 the plan or the simulation may bring up, but answers a :class:`Verdict` with a code
@@ -327,7 +327,7 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
         recorder = _Recorder(run) if record else None
         if plan.variant == "fg":
             metrics = _refuse_intrusions(strategy, run, limits, stop)
-        end = goal.until(run)
+        end = goal.until()
         # A kinematic tool touches nothing static, see _refuse_intrusions.
         watched = [TARGET] if setup.target_kind == DYNAMIC or plan.variant == "arm" else []
         watched += [o.id for o in setup.obstacles] if plan.variant == "arm" else []
@@ -347,9 +347,9 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
         for step in range(int(np.ceil((end + 10.0) * setup.settings.frequency))):
             if run.time >= end - 1e-9:
                 break
-            goal.disturb(run)
+            goal.disturb()
             advance(step)
-            goal.observe(run)
+            goal.observe()
             if held is None and drawn is None and plan.variant == "arm" and run.time >= task.start:
                 held = run.held()
             if step % 6 == 0 and run.time < run.contact_time:
@@ -361,7 +361,7 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
                 advance(step)
             run.world.check(names)
 
-        judgement = goal.judge(run, go_on)
+        judgement = goal.judge(go_on)
         judgement = replace(judgement, metrics={**metrics, **getattr(run, "metrics", dict)(), **judgement.metrics})
     except MagicError as error:
         if error.code in (Code.CANCELED, Code.SIMULATION_TIMEOUT):
@@ -409,7 +409,7 @@ def _start(strategy: Strategy, setup: Setup, plan: MotionPlan) -> float:
     fine = np.append(np.arange(first, contact, 0.02), contact)
     # Nothing that is fixed meets a tool that is led along its path; an arm may press on it.
     others = (setup.target, *(setup.obstacles if plan.arm_motion is not None else ()))
-    near = nears(setup, transforms.interpolate(times, poses, fine), fine, NEAR + goals.GOALS[strategy.goal.test].around(strategy), others)
+    near = nears(setup, transforms.interpolate(times, poses, fine), fine, NEAR + goals.around(strategy), others)
     return float(np.clip((contact if near is None else near) - LEAD, first, contact))
 
 

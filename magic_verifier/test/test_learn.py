@@ -48,7 +48,7 @@ def learned(tmp_path_factory):
 def test_a_recorded_demonstration_becomes_a_strategy(learned):
     strategy = load(learned)
     assert (strategy.name, strategy.view, strategy.mode) == ("pulling", "top", "plan")
-    assert strategy.goal.values == {"noise": 0.0} and strategy.target_outline == "outer"
+    assert strategy.goal.values["noise"] == 0.0 and strategy.goal.test.has("encloses") and strategy.target_outline == "outer"
     np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.05)
     assert strategy.tool_contact.concave
     assert (learned / "contacts.png").stat().st_size > 1000

@@ -13,7 +13,6 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.strategy import Goal, Physics, load, save
 from magic_matcher.matching import target_contact, target_view
-from magic_verifier.goals import Hook
 from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, learn, levelled, smoothed
 
 
@@ -103,7 +102,7 @@ def test_smoothing_keeps_the_motion_and_takes_the_jitter():
 
 
 #: Pulled or pushed, whatever encloses whom.
-MOVED = Goal("hook", {name: value for name, value in {"noise": 0.0, "hold": 0.0}.items() if name in Hook.defaults})
+MOVED = Goal("hook", {"noise": 0.0, "hold": 0.0})
 
 
 def test_a_push_is_learned_and_where_the_box_was_met():

@@ -293,7 +293,7 @@ def list_strategies(folder: str) -> int:
     for path in found:
         try:
             strategy = strategies.load(path)
-            say(f"  {path.name:<14} goal {strategy.goal.test}, {strategy.mode}: {strategy.description}")
+            say(f"  {path.name:<14} goal {strategy.goal.title}, {strategy.mode}: {strategy.description}")
         except MagicError as error:
             say(f"  {path.name:<14} cannot be used: {error}")
     return 0 if found else 1

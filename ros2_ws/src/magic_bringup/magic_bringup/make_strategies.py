@@ -29,11 +29,12 @@ from numpy.typing import NDArray
 from magic_core import strategy as strategies
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact, contact_frame
+from magic_core.goal import shipped
 from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView
 from magic_core.shapes import Shape, make, section_view
 from magic_core.shapes.fixtures import pose_data
-from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import Physics, Strategy, Waypoint
 
 Poses = NDArray[np.float64]
 
@@ -143,7 +144,7 @@ def hooking() -> Strategy:
         **demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
         # The demonstration had no kicks; a ball, other than a standing cylinder, does not bear them (it passes with 1 of 5 seeds).
-        goal=Goal("hook", {"distance": 0.2, "max_speed": 0.5, "noise": 0.0}),
+        goal=shipped("hook", noise=0.0),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
         environment={
             "world_from_target": pose_data(transforms.make(translation=[0.70, 0.0, 0.025])),
@@ -201,7 +202,7 @@ def hanging() -> Strategy:
         mode="plan",
         **demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
-        goal=Goal("hang", {"height": 0.2, "max_speed": 0.5}),
+        goal=shipped("hang"),
         physics=Physics(friction=3.0, tool_density=600.0, target_density=2700.0, target_is_fixed=True),
         releases=True,
         environment={
@@ -289,7 +290,7 @@ def scooping() -> Strategy:
         mode="retarget",
         **demonstrated(tool, tool_view, tool_contact, target, seen, touched, normal, direction, times, contacts),
         waypoints=waypoints,
-        goal=Goal("scoop", {"height": 0.2, "max_speed": 0.1}),
+        goal=shipped("scoop"),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=300.0),
         reflections=("turn",),
         environment={

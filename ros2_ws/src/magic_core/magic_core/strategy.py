@@ -23,9 +23,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from magic_core import goal as goals
 from magic_core import images, transforms
 from magic_core.contact import Contact, contact_frame
 from magic_core.errors import Code, MagicError
+from magic_core.goal import Goal
 from magic_core.mesh import Mesh
 from magic_core.mesh import load as load_mesh
 from magic_core.scene import CanonicalView
@@ -53,14 +55,6 @@ class Waypoint:
     offset: NDArray[np.float64]
     phase: str
     speed: float = 0.1
-
-
-@dataclass(frozen=True)
-class Goal:
-    """The test that decides success in simulation: ``test`` is a name the verifier knows, ``values`` its numbers."""
-
-    test: str
-    values: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -138,15 +132,14 @@ def _contact(view: CanonicalView, data: dict[str, Any]) -> Contact:
 
 def _check(strategy: Strategy) -> None:
     """Refuse numbers with which nothing can be matched, planned or simulated; raises ValueError that names them."""
-    times, physics, goal = strategy.times, strategy.physics, strategy.goal
+    times, physics = strategy.times, strategy.physics
     numbers = {
         "friction": physics.friction,
         "tool_density": physics.tool_density,
         "target_density": physics.target_density,
-        **{f"goal {name}": value for name, value in goal.values.items()},
         **{f"speed of waypoint {w.name}": w.speed for w in strategy.waypoints},
     }
-    positive = [name for name in numbers if not name.startswith(("goal", "friction"))]
+    positive = [name for name in numbers if name != "friction"]
     rules = {
         f"outline of the target {strategy.target_outline!r}: one of {OUTLINES}": strategy.target_outline in OUTLINES,
         f"reflections {strategy.reflections}: of {REFLECTIONS}, at least one": bool(strategy.reflections)
@@ -218,7 +211,7 @@ def load(folder: str | Path) -> Strategy:
                 Waypoint(w["name"], np.array(w["offset"], dtype=float), w["phase"], float(w.get("speed", 0.1)))
                 for w in data.get("waypoints", [])
             ),
-            goal=Goal(data["goal"]["test"], {k: float(v) for k, v in data["goal"].get("values", {}).items()}),
+            goal=goals.from_data(data["goal"], f"{path}: goal"),
             physics=Physics(**physics),
             target_outline=str(data["target"].get("outline", "outer")),
             reflections=tuple(data.get("reflections", REFLECTIONS)),
@@ -283,6 +276,26 @@ def _view_data(view: CanonicalView, contact: Contact) -> dict[str, Any]:
     }
 
 
+def _depth(value: Any) -> int:
+    """How many mappings and lists are in each other."""
+    if isinstance(value, dict):
+        return 1 + max(map(_depth, value.values()), default=0)
+    return 1 + max(map(_depth, value), default=0) if isinstance(value, (list, tuple)) else 0
+
+
+class _Dumper(yaml.SafeDumper):
+    """What is flat stands in one line, and there are no anchors: a strategy, its goal above all, is to be read."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
+        return super().represent_mapping(tag, mapping, flow_style=_depth(dict(mapping)) <= 2)
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> yaml.SequenceNode:
+        return super().represent_sequence(tag, sequence, flow_style=_depth(sequence) <= 1)
+
+
 def save(strategy: Strategy, folder: str | Path) -> None:
     """Write a strategy folder that :func:`load` reads back."""
     folder = Path(folder)
@@ -313,7 +326,7 @@ def save(strategy: Strategy, folder: str | Path) -> None:
         "releases": strategy.releases,
         "simulatable": strategy.simulatable,
         "waypoints": [{"name": w.name, "offset": _floats(w.offset), "phase": w.phase, "speed": w.speed} for w in strategy.waypoints],
-        "goal": {"test": strategy.goal.test, "values": dict(strategy.goal.values)},
+        "goal": goals.to_data(strategy.goal),
         "physics": {
             "friction": strategy.physics.friction,
             "tool_density": strategy.physics.tool_density,
@@ -322,4 +335,4 @@ def save(strategy: Strategy, folder: str | Path) -> None:
         },
         "environment": dict(strategy.environment),
     }
-    (folder / "strategy.yaml").write_text(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+    (folder / "strategy.yaml").write_text(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=140))

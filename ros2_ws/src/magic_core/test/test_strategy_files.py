@@ -129,7 +129,7 @@ def edit(folder, change):
         (lambda d: d["waypoints"][0].update(offset=[0.1, 0.2, float("nan")]), "offset of waypoint behind"),
         (lambda d: d["waypoints"][0].update(speed=0.0), "speed of waypoint behind: above 0"),
         (lambda d: d["waypoints"][0].update(speed=float("inf")), "speed of waypoint behind: a finite"),
-        (lambda d: d["goal"]["values"].update(distance=float("nan")), "goal distance"),
+        (lambda d: d["goal"]["values"].update(distance=float("nan")), "goal.values.distance: nan"),
         (lambda d: d["physics"].update(friction=-0.1), "friction"),
         (lambda d: d["physics"].update(tool_density=0.0), "tool_density"),
         (lambda d: d["tool"]["contact"].update(pixel=[32.0, 3.0]), "pixel of the tool's contact"),
