@@ -21,6 +21,7 @@ KEYS = {
     "yaml": "python3-yaml",
     "matplotlib": "python3-matplotlib",
     "PIL": "python3-pil",
+    "jinja2": "python3-jinja2",
     "contourpy": "python3-contourpy",
     "shapely": "python3-shapely",
     "skimage": "python3-skimage",

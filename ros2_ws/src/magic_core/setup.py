@@ -30,6 +30,7 @@ setup(
         "threadpoolctl",
         "example-robot-data",
     ],
+    extras_require={"networks": ["torch"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",
