@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory, GripperCommand
+from control_msgs.msg import JointTolerance
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from std_msgs.msg import Header
@@ -34,11 +35,15 @@ class ArmSettings:
     joint for a metre of opening (0.5 where the joint is one of two fingers).  squeeze: m that the fingers are told to close
     beyond the tool's thickness (for drivers that only control position).  effort: of the gripper, N; 0: the driver's own.
     grasp_tolerance: m that the opening of the closed fingers may differ from the planned one.  presence: s to wait for a
-    server.
+    server.  path_tolerance, goal_tolerance: rad that a joint may be off its trajectory on the way, and at the end within goal_time s
+    after its time; 0: the controller's own.  They are sent with each move, and the controller ends it where one is exceeded.
     """
 
     speed: float = 1.0
     start_tolerance: float = 0.02
+    path_tolerance: float = 0.1
+    goal_tolerance: float = 0.01
+    goal_time: float = 1.0
     state_age: float = 0.5
     opening: float = 0.08
     finger_scale: float = 0.5
@@ -108,15 +113,15 @@ class Arm:
             point.velocities = [v * speed for v in point.velocities]
             point.accelerations = [a * speed**2 for a in point.accelerations]
             goal.trajectory.points.append(point)
+        names = trajectory.joint_names
+        goal.path_tolerance = [JointTolerance(name=name, position=self.settings.path_tolerance) for name in names]
+        goal.goal_tolerance = [JointTolerance(name=name, position=self.settings.goal_tolerance) for name in names]
+        goal.goal_time_tolerance = duration_to_msg(self.settings.goal_time)
         seconds = (times[move.last] - times[move.first]) / speed
         response = self._mover.respond(goal, PATIENCE * seconds + MARGIN, token, self.settings.presence)
         result = response.result
         if response.status != GoalStatus.STATUS_SUCCEEDED or result.error_code != FollowJointTrajectory.Result.SUCCESSFUL:
-            raise MagicError(
-                Code.EXECUTION_FAILED,
-                f"the arm's controller ended the trajectory with error {result.error_code}, status {response.status}: "
-                f"{result.error_string or 'no reason given'}",
-            )
+            raise execution.controller_error(result.error_code, response.status, result.error_string)
 
     def _fingers(self, fingers: execution.Fingers, token: Token) -> None:
         settings = self.settings

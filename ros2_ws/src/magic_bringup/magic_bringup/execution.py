@@ -28,6 +28,26 @@ class Fingers:
 
 Step = Move | Fingers
 
+#: What the error codes of control_msgs/FollowJointTrajectory say: name, what has happened, what it asks for.
+_ENDINGS = {
+    0: ("SUCCESSFUL", "it ended as if carried out", "look at the controller's state"),
+    -1: ("INVALID_GOAL", "the controller cannot use this trajectory", "see its log"),
+    -2: ("INVALID_JOINTS", "the controller moves other joints than the trajectory names", "parameter trajectory_action"),
+    -3: ("OLD_HEADER_TIMESTAMP", "the trajectory came too late to be begun", "compare the clocks of both computers"),
+    -4: ("PATH_TOLERANCE_VIOLATED", "a joint left the path further than path_tolerance", "what the arm met, or a lower speed"),
+    -5: ("GOAL_TOLERANCE_VIOLATED", "a joint did not come within goal_tolerance of the end in goal_time", "what holds the arm up"),
+}
+
+
+def controller_error(error_code: int, status: int, reason: str) -> MagicError:
+    """What a trajectory controller that did not carry a trajectory out has said, by its FollowJointTrajectory result, as EXECUTION_FAILED."""
+    name, what, look = _ENDINGS.get(error_code, ("an error of its own", "no code of FollowJointTrajectory", "see the controller's log"))
+    return MagicError(
+        Code.EXECUTION_FAILED,
+        f"the arm's controller ended the trajectory with error {error_code} ({name}: {what}; {look}), status {status}: "
+        f"{reason or 'no reason given'}",
+    )
+
 
 def steps(
     times: Sequence[float],

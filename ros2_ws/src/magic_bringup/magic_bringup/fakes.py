@@ -220,7 +220,7 @@ class FakeServers(Node):
 class FakeArm(Node):
     """A trajectory controller, a gripper and joint states: an arm that is where its last point told it to be, at once.
 
-    ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort).  ``thickness`` is what is
+    ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort); ``goals`` the moves' goals.  ``thickness`` is what is
     between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code, error_string).
     ``asked`` is set by the first trajectory, which is accepted once ``admits`` is set; ``moving`` by the first accepted one.
     ``positions`` of the joints, rad, and ``velocity``, rad/s, are told at 50 Hz while ``tells`` is set, ``late`` seconds late,
@@ -230,6 +230,7 @@ class FakeArm(Node):
     def __init__(self, name: str = "fake_arm", thickness: float = 0.03, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.log: list[Any] = []
+        self.goals: list[Any] = []
         self.thickness = thickness
         self.opening = 0.08
         self.positions = [0.0] * len(JOINTS)
@@ -274,6 +275,7 @@ class FakeArm(Node):
     def _move(self, handle: Any) -> Any:
         trajectory = handle.request.trajectory
         self.log.append(trajectory)
+        self.goals.append(handle.request)
         self.moving.set()
         code, reason = self.on_move(trajectory, lambda: handle.is_cancel_requested)
         result = FollowJointTrajectory.Result(error_code=code, error_string=reason)

@@ -112,6 +112,11 @@ def read_arm(node: Node, presence: float) -> ArmSettings:
     return ArmSettings(
         speed=number("speed", "of the execution, as a share of the planned speed", 0.01, 1.0),
         start_tolerance=number("start_tolerance", "rad that a joint may be off where a move begins", 0.0, 0.5),
+        path_tolerance=number(
+            "path_tolerance", "rad that a joint may be off its trajectory while it moves; 0: the controller's own", 0.0, 1.0
+        ),
+        goal_tolerance=number("goal_tolerance", "rad that a joint may be off where a move ends; 0: the controller's own", 0.0, 0.5),
+        goal_time=number("goal_time", "s that a joint may take to get there after its time; 0: the controller's own", 0.0, 30.0),
         state_age=number("state_age", "s that joint_states may be old where a move begins", 0.01, 10.0),
         opening=number("opening", "m between the open fingers", 0.0, 0.5),
         finger_scale=number("finger_scale", "position of the gripper's joint for a metre between the fingers", 0.01, 100.0),

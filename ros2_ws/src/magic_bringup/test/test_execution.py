@@ -14,7 +14,7 @@ from rclpy.node import Node
 from test_strategy_server import Bench
 
 from magic_bringup import fakes
-from magic_bringup.execution import Fingers, Move, check_grasp, steps
+from magic_bringup.execution import Fingers, Move, check_grasp, controller_error, steps
 from magic_core import conversions
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
@@ -73,6 +73,18 @@ def test_what_is_between_the_fingers(found, says):
     assert says in caught.value.message
 
 
+def test_each_code_of_a_trajectory_controller_is_told_by_its_name():
+    """Against the constants of the installed FollowJointTrajectory."""
+    result = FollowJointTrajectory.Result
+    for name in ("INVALID_GOAL", "INVALID_JOINTS", "OLD_HEADER_TIMESTAMP", "PATH_TOLERANCE_VIOLATED", "GOAL_TOLERANCE_VIOLATED"):
+        error = controller_error(getattr(result, name), GoalStatus.STATUS_ABORTED, "because")
+        assert error.code == Code.EXECUTION_FAILED
+        assert f"({name}: " in error.message
+        assert error.message.endswith(": because")
+    assert "SUCCESSFUL" in controller_error(result.SUCCESSFUL, GoalStatus.STATUS_CANCELED, "").message
+    assert "an error of its own" in controller_error(-77, GoalStatus.STATUS_ABORTED, "").message
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("strategies")
@@ -103,6 +115,7 @@ def bench(shared):
     shared.fakes.clear()
     shared.feedback.clear()
     arm.log.clear()
+    arm.goals.clear()
     arm.moving.clear()
     arm.positions, arm.thickness, arm.opening, arm.tells, arm.squeezes, arm.late = [0.0] * 7, 0.03, 0.08, True, False, 0.0
     arm.velocity, arm.apart = 0.0, False
@@ -152,6 +165,10 @@ def test_arm_and_gripper_carry_a_verified_plan_out(bench):
     assert [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in task.points] == pytest.approx([0.0, 1.0, 2.0, 3.0, 4.0])
     assert list(there.points[1].velocities) == pytest.approx([0.05] * 7)
     assert list(task.points[0].positions) == list(there.points[-1].positions)
+    for goal in bench.arm.goals:
+        for tolerances, allowed in ((goal.path_tolerance, 0.1), (goal.goal_tolerance, 0.01)):
+            assert [(t.name, t.position, t.velocity, t.acceleration) for t in tolerances] == [(n, allowed, 0.0, 0.0) for n in fakes.JOINTS]
+        assert (goal.goal_time_tolerance.sec, goal.goal_time_tolerance.nanosec) == (1, 0)
     assert {f.stage for f in bench.feedback} >= {"plan", "verify", "execute"}
     assert any("step 3 of 4: the fingers close" in f.message for f in bench.feedback)
 
@@ -290,7 +307,7 @@ def test_fingers_that_meet_something_thicker_end_it(bench):
 def test_a_controller_that_gives_up_ends_it(bench):
     bench.arm.on_move = lambda trajectory, canceled: (-4, "joint 3 lags")
     message = refused(bench, Code.EXECUTION_FAILED)
-    assert "error -4" in message
+    assert "error -4 (PATH_TOLERANCE_VIOLATED" in message
     assert "joint 3 lags" in message
     assert told(bench) == [("open", 0.04, 20.0), "move"]
 
