@@ -72,9 +72,7 @@ class ArmPlanner:
     def warm_up(self) -> None:
         """Load and build what the first request would otherwise wait for."""
         self.robot.warm_up()
-        timing.parameterise(
-            np.stack([self.robot.home, self.robot.home + 0.05]), self.robot.velocity_limits, self.robot.acceleration_limits, 0.02
-        )
+        timing.parameterise(np.stack([self.robot.home, self.robot.home + 0.05]), self.robot.limits, 0.02)
 
     def plan(
         self,

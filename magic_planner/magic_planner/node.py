@@ -16,6 +16,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import check_solid
 from magic_core.motion import VARIANTS, MotionPlan
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
+from magic_core.presets import config_of
 from magic_core.robot import Description, RobotConfig
 from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
@@ -59,12 +60,17 @@ class PlannerNode(Node):
         from magic_planner.robot import Robot
 
         started = time.monotonic()
+        given = robot_parameters(self)
+        default = config_of(given["preset"])
+
+        def share(name: str, of: str) -> float:
+            return parameter(self, f"robot.{name}", getattr(default, name), f"Share of the {of} limits that is used.", low=0.001, high=1.0)
+
         config = RobotConfig(
-            **robot_parameters(self),
-            velocity_scale=parameter(self, "robot.velocity_scale", 0.3, "Share of the velocity limits that is used.", low=0.01, high=1.0),
-            acceleration_scale=parameter(
-                self, "robot.acceleration_scale", 0.2, "Share of the acceleration limits that is used.", low=0.01, high=1.0
-            ),
+            **given,
+            velocity_scale=share("velocity_scale", "velocity"),
+            acceleration_scale=share("acceleration_scale", "acceleration"),
+            jerk_scale=share("jerk_scale", "jerk"),
         )
         #: The frame of everything that comes and goes.
         self._base = Description(config).base_frame

@@ -25,6 +25,7 @@ from magic_core.robot import Description, RobotConfig
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, fcl_pose, hull
 from magic_planner.kinematics import Chain, load_chain
+from magic_planner.timing import Limits
 
 #: Joint positions that are tried as starts of the inverse kinematics.
 SEEDS = 6000
@@ -59,7 +60,9 @@ class Robot:
         self.description = Description(config)
         self.config, urdf = self.description.config, self.description.urdf
         limits = np.array([(joint.lower, joint.upper) for joint in self.description.arm])
-        self.chain: Chain = replace(load_chain(urdf, self.config.move_group), lower=limits[:, 0], upper=limits[:, 1])
+        chain = load_chain(urdf, self.config.move_group)
+        velocity = np.minimum(chain.velocity, self.description.velocity)
+        self.chain: Chain = replace(chain, lower=limits[:, 0], upper=limits[:, 1], velocity=velocity)
         # MPlib writes a copy of a URDF that names package:// beside it; ours goes to a folder that can be written.
         with tempfile.TemporaryDirectory() as scratch:
             copy = Path(scratch) / urdf.name
@@ -76,11 +79,13 @@ class Robot:
         self.world = self.planner.planning_world
         self.count = self.chain.count
         self.home = np.array(self.config.home, dtype=float)
-        self.velocity_limits = self.chain.velocity * self.config.velocity_scale
-        acceleration = np.array(self.config.acceleration, dtype=float)
-        if acceleration.size not in (1, self.count):
-            raise MagicError(Code.BAD_REQUEST, "acceleration limits", acceleration.tolist(), f"1 or {self.count} numbers")
-        self.acceleration_limits = np.broadcast_to(acceleration, (self.count,)) * self.config.acceleration_scale
+        #: What motions are timed by: the shares of the arm's limits that are used.
+        self.limits = Limits(
+            velocity * self.config.velocity_scale,
+            self.description.acceleration * self.config.acceleration_scale,
+            self.description.jerk * self.config.jerk_scale,
+            self.description.braking.velocities if self.description.braking is not None else None,
+        )
         names = self.planner.user_joint_names
         if list(names[: self.count]) != list(self.chain.names):
             raise MagicError(Code.BAD_REQUEST, "joints of the URDF", list(names), f"the arm's joints first: {list(self.chain.names)}")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import transforms
+from magic_core import interpolation, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_planner import timing
@@ -40,20 +40,21 @@ class Schedule:
         Raises StageError where no timing keeps the limits of joints and torques.
         """
         robot, settings = self.robot, self.settings
-        velocity, acceleration, step = robot.velocity_limits, robot.acceleration_limits, settings.time_step
+        limits, step = robot.limits, settings.time_step
+        near = limits.slower(0.6)
         track = timing.Track(robot.count)
         names: list[tuple[str, float]] = []
         with _feasible("time parameterisation"):
-            track.append(timing.parameterise(come, velocity, acceleration, step, corners=True))
-            track.append(timing.parameterise(pick[0], velocity * 0.6, acceleration, step))
+            track.append(timing.parameterise(come, limits, step, corners=True))
+            track.append(timing.parameterise(pick[0], near, step))
             grasp_time = track.now
             track.hold(settings.dwell, step)
             names.append(("grasp", track.now))
-            track.append(timing.parameterise(pick[2], velocity * 0.6, acceleration, step))
-            track.append(timing.parameterise(carry, velocity, acceleration, step, corners=True))
+            track.append(timing.parameterise(pick[2], near, step))
+            track.append(timing.parameterise(carry, limits, step, corners=True))
             names.append(("transfer", track.now))
             began = track.now
-            clock = track.follow(request.times, task, self._rests(request), velocity, acceleration, step)
+            clock = track.follow(request.times, task, self._rests(request), limits, step)
         for phase in request.motion.phases:
             if phase.start < request.times[-1] - 1e-9:
                 names.append((phase.name, began + float(clock(min(phase.end, float(request.times[-1]))))))
@@ -63,7 +64,7 @@ class Schedule:
             track.hold(settings.dwell, step)
             names.append(("release", track.now))
             with _feasible("time parameterisation of the retreat"):
-                track.append(timing.parameterise(retreat, velocity * 0.6, acceleration, step))
+                track.append(timing.parameterise(retreat, near, step))
             names.append(("retreat", track.now))
         times, q, qd, qdd = track.arrays()
         self._check_limits(request, branch, times, q, qd, qdd, grasp_time, release_time)
@@ -108,11 +109,14 @@ class Schedule:
                     f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad",
                 ),
             )
+        fast, strong, sharp = interpolation.extremes(times, q, qd, qdd)
+        published = robot.description
         for values, limits, unit in (
-            (qd, robot.chain.velocity, "rad/s"),
-            (qdd, np.array(robot.acceleration_limits) / robot.config.acceleration_scale, "rad/s^2"),
+            (fast, robot.chain.velocity, "rad/s"),
+            (strong, published.acceleration, "rad/s^2"),
+            (sharp, published.jerk, "rad/s^3"),
         ):
-            over = np.argwhere(np.abs(values) > limits * 1.001)
+            over = np.argwhere(values > limits)
             if len(over):
                 i, j = over[0]
                 raise StageError(
@@ -154,7 +158,7 @@ def _feasible(what: str) -> Iterator[None]:
     try:
         yield
     except timing.Infeasible as error:
-        allowed = "a path that velocity and acceleration limits allow"
+        allowed = "a path that the limits of velocity, acceleration and jerk allow"
         raise StageError("timing", MagicError(Code.TIME_PARAMETERISATION, what, str(error), allowed)) from error
 
 

@@ -53,7 +53,7 @@ def test_it_pulls_with_the_hook(planner):
     arm, chain = plan.arm_motion, planner.robot.chain
     assert arm.joint_names == chain.names and arm.positions.shape[1] == 6
     assert np.all(arm.positions >= chain.lower) and np.all(arm.positions <= chain.upper)
-    assert np.all(np.abs(arm.velocities) <= planner.robot.velocity_limits * 1.001)
+    assert np.all(np.abs(arm.velocities) <= planner.robot.limits.velocity * 1.001)
     held = arm.times >= arm.grasp_time
     tips = chain.forward(arm.positions[held])
     expected = plan.tool_motion.world_from_tool[held] @ arm.tool_from_tcp

@@ -2,7 +2,8 @@
 
 What is published is the trajectory, not what was simulated of it: names, times,
 positions, velocities and accelerations all reach the controller.  Each of them is
-therefore held against the arm's limits and against the others.
+therefore held against the arm's limits and against the others, and so is what the
+controller makes of them between the points (:mod:`magic_core.interpolation`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magic_core import transforms
+from magic_core import interpolation, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.robot import Description
@@ -36,6 +37,8 @@ RELEASE_SPEED = 0.02
 SLACK = 1e-3
 #: At rest is slower than this, rad/s or m/s: a thousandth of what the joints can do.
 REST = 2e-3
+#: Acceleration at rest is less than this share of a joint's limit: a controller that begins or ends a move with more jumps.
+REST_PULL = 0.01
 #: How far (m, rad) the tool's own motion may be from where joints and grasp take it.  Positions between samples are interpolated.
 HELD_SHIFT = 0.002
 HELD_TURN = 0.02
@@ -167,14 +170,14 @@ def check_arm(motion: ArmMotion, robot: Description) -> None:
             )
         columns[what] = values
     _check_limits(times, columns, robot)
-    _check_rest(motion, times, columns["velocities"], robot)
+    _check_rest(motion, times, columns["velocities"], columns["accelerations"], robot)
     _check_grasp(motion, float(times[-1]), robot)
 
 
 def _check_limits(times: Array, columns: dict[str, Array], robot: Description) -> None:
     q, speed, pull = columns["positions"], columns["velocities"], columns["accelerations"]
     lower, upper = (np.array([getattr(joint, side) for joint in robot.arm]) for side in ("lower", "upper"))
-    fastest, hardest = np.array([joint.velocity for joint in robot.arm]), robot.acceleration
+    fastest, hardest, sharpest = robot.velocity, robot.acceleration, robot.jerk
     over = np.argwhere((q < lower - SLACK) | (q > upper + SLACK))
     if len(over):
         i, j = over[0]
@@ -193,6 +196,13 @@ def _check_limits(times: Array, columns: dict[str, Array], robot: Description) -
             raise _beyond(
                 Code.DYNAMIC_LIMIT, what, robot, times, i + len(times) - len(values), j, values[i, j], f"up to {most[j]:g} either way", per
             )
+    if robot.braking is not None:
+        slowest, quickest = robot.braking.velocities(q)
+        over = np.argwhere((speed < slowest - SLACK) | (speed > quickest + SLACK))
+        if len(over):
+            i, j = over[0]
+            allowed = f"{slowest[i, j]:.3f} to {quickest[i, j]:.3f} this near to the end of its range"
+            raise _beyond(Code.DYNAMIC_LIMIT, "velocity", robot, times, i, j, speed[i, j], allowed, "/s")
     # Within its acceleration a joint can between two samples leave the straight course of its velocities by a quarter of a t^2.
     gap = np.abs(moved - dt * (speed[1:] + speed[:-1]) / 2)
     allowed = hardest * dt**2 / 4 + 1e-4
@@ -211,6 +221,17 @@ def _check_limits(times: Array, columns: dict[str, Array], robot: Description) -
             f"{moved[i, j] / dt[i, 0]:.4f} +- {allowed[i, j] / dt[i, 0]:.4f} by the positions",
             "/s",
         )
+    fast, strong, sharp = interpolation.extremes(times, q, speed, pull)
+    for values, most, what, per in (
+        (fast, fastest, "velocity", "/s"),
+        (strong, hardest, "acceleration", "/s^2"),
+        (sharp, sharpest, "jerk", "/s^3"),
+    ):
+        over = np.argwhere(values > most * (1 + SLACK) + SLACK)
+        if len(over):
+            i, j = over[0]
+            what = f"{what} that a controller makes of it up to the next"
+            raise _beyond(Code.DYNAMIC_LIMIT, what, robot, times, i, j, values[i, j], f"up to {most[j]:g} either way", per)
 
 
 def _beyond(code: Code, what: str, robot: Description, times: Array, i: int, j: int, value: float, allowed: str, per: str) -> MagicError:
@@ -218,7 +239,7 @@ def _beyond(code: Code, what: str, robot: Description, times: Array, i: int, j: 
     return MagicError(code, f"{what} of {robot.names[j]} at waypoint {i} ({times[i]:.2f} s)", f"{value:.4f} {unit}", f"{allowed} {unit}")
 
 
-def _check_rest(motion: ArmMotion, times: Array, speed: Array, robot: Description) -> None:
+def _check_rest(motion: ArmMotion, times: Array, speed: Array, pull: Array, robot: Description) -> None:
     moments = {"start": 0.0, "end": float(times[-1]), "grasp": float(motion.grasp_time)}
     if motion.release_time is not None:
         moments["release"] = float(motion.release_time)
@@ -230,6 +251,12 @@ def _check_rest(motion: ArmMotion, times: Array, speed: Array, robot: Descriptio
         if fastest[j] > REST:
             i = int(np.abs(times - when).argmin())
             raise _beyond(Code.BAD_MOTION, f"velocity at the {name}", robot, times, i, j, float(fastest[j]), f"rest, up to {REST:g}", "/s")
+        pulled = np.array([np.interp(when, times, np.abs(pull[:, j])) for j in range(pull.shape[1])])
+        j = int((pulled / robot.acceleration).argmax())
+        if pulled[j] > REST_PULL * robot.acceleration[j]:
+            i = int(np.abs(times - when).argmin())
+            most = f"rest, up to {REST_PULL * robot.acceleration[j]:g}"
+            raise _beyond(Code.BAD_MOTION, f"acceleration at the {name}", robot, times, i, j, float(pulled[j]), most, "/s^2")
     if motion.release_time is not None and not motion.grasp_time < motion.release_time:
         raise MagicError(
             Code.BAD_MOTION, "time of the release", f"{motion.release_time:g} s", f"after the grasp at {motion.grasp_time:g} s"

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
-from magic_core.robot import Description
+from magic_core.presets import PRESETS
+from magic_core.robot import Description, RobotConfig
 from magic_verifier import motion_check
 from magic_verifier.verification import verify
 
@@ -114,6 +115,42 @@ def test_positions_and_velocities_that_contradict_each_other_are_found(what, row
 
 def test_velocities_that_are_all_zero_contradict_a_motion():
     refused(with_arm(velocities=np.zeros((COUNT, JOINTS))), Code.BAD_MOTION, "contradict", "rad/s")
+
+
+def test_a_jerk_beyond_the_limits_is_refused():
+    """The swing's own is 60 / 2^3 rad/s^3 at its ends, times how far a joint goes: 3.75 for the first."""
+    motion_check.check(PLAN, Description(RobotConfig(jerk=(3.8,))))
+    with pytest.raises(MagicError) as error:
+        motion_check.check(PLAN, Description(RobotConfig(jerk=(3.7,))))
+    assert error.value.code == Code.DYNAMIC_LIMIT
+    assert "jerk that a controller makes of it" in error.value.message and "rad/s^3" in error.value.message
+
+
+def test_an_arm_that_pushes_off_at_once_where_it_stands_is_refused():
+    """A controller begins and ends its moves without acceleration: more would be a jump."""
+    for name, row in (("start", 0), ("grasp", int(np.searchsorted(PLAN.arm_motion.times, 0.4))), ("end", COUNT - 1)):
+        pull = PLAN.arm_motion.accelerations.copy()
+        pull[row, 1] = 0.5
+        refused(with_arm(accelerations=pull), Code.BAD_MOTION, f"acceleration at the {name}", ROBOT.names[1], "up to 0.075 rad/s^2")
+
+
+def test_an_fr3_goes_slowly_towards_the_end_of_a_joint():
+    """Away from the end of its second joint, or towards it: 0.49 rad/s, 53 mrad before it."""
+    files = {"urdf": str(ROBOT.urdf), "srdf": str(ROBOT.srdf), "move_group": ROBOT.config.move_group}
+    fr3 = Description(replace(PRESETS["fr3"].config, **files))
+    arm = PLAN.arm_motion
+    end = fr3.arm[1].upper - 0.003
+    q = arm.positions + np.where(np.arange(JOINTS) == 1, end - arm.positions[:, 1].max(), 0.0)
+    # Three times as fast; away from the end, and the same towards it.
+    speeds, pulls = 3 * arm.velocities, 9 * arm.accelerations
+    away = replace(arm, times=arm.times / 3, positions=q, velocities=speeds, accelerations=pulls, grasp_time=0.13)
+    motion_check.check_arm(away, fr3)
+    back = {"positions": q[::-1], "velocities": -speeds[::-1], "accelerations": pulls[::-1]}
+    towards = replace(away, **back, grasp_time=0.0)
+    with pytest.raises(MagicError) as error:
+        motion_check.check_arm(towards, fr3)
+    assert error.value.code == Code.DYNAMIC_LIMIT
+    assert "this near to the end of its range" in error.value.message
 
 
 @given(first=st.integers(0, JOINTS - 1), second=st.integers(0, JOINTS - 1))

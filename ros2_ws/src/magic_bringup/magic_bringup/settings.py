@@ -8,6 +8,7 @@ from rclpy.node import Node
 
 from magic_bringup.arm import ArmSettings
 from magic_core.node import parameter
+from magic_core.presets import PRESETS
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,9 @@ class Settings:
     recorded: bool
 
 
-def read(node: Node) -> Settings:
-    """Declare the parameters of a run and read them."""
+def read(node: Node, preset: str = "") -> Settings:
+    """Declare the parameters of a run and read them; ``preset``: the arm's, which names its driver's actions (empty: the Panda's)."""
+    driver = PRESETS[preset or "panda"]
 
     def count(name: str, default: int, text: str, high: int) -> int:
         return parameter(node, name, default, text, low=1, high=high, read_only=True)
@@ -77,12 +79,12 @@ def read(node: Node) -> Settings:
         trajectory_action=parameter(
             node,
             "trajectory_action",
-            "panda_arm_controller/follow_joint_trajectory",
+            driver.trajectory_action,
             "action of the arm's controller (control_msgs/FollowJointTrajectory)",
             read_only=True,
         ),
         gripper_action=parameter(
-            node, "gripper_action", "panda_gripper/gripper_action", "action of the gripper (control_msgs/GripperCommand)", read_only=True
+            node, "gripper_action", driver.gripper_action, "action of the gripper (control_msgs/GripperCommand)", read_only=True
         ),
         objects_age=seconds("objects_age", 5.0, "s that the objects may be old where a trajectory is published or the arm begins to move"),
         object_tolerance=parameter(

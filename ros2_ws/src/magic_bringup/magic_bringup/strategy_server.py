@@ -75,13 +75,14 @@ class StrategyServer(Node):
 
     def __init__(self) -> None:
         super().__init__("strategy_server")
-        settings = self.settings = parameters.read(self)
+        robot = robot_parameters(self)
+        settings = self.settings = parameters.read(self, robot["preset"])
         arm = parameters.read_arm(self, settings.presence)
         if settings.execute and settings.recorded:
             raise MagicError(
                 Code.BAD_REQUEST, "parameters execute and recorded", "both true", "one of them: no arm is moved by a recording"
             )
-        self.robot = Description(RobotConfig(**robot_parameters(self)))
+        self.robot = Description(RobotConfig(**robot))
         self._limits = Limits(
             self.robot.base_frame,
             settings.required_rate,

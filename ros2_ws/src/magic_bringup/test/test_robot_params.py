@@ -2,24 +2,56 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+import rclpy
 import yaml
+from rclpy.context import Context
+from rclpy.parameter import Parameter
 
+from magic_bringup import settings
+from magic_core.node import robot_parameters
+from magic_core.presets import PRESETS
 from magic_core.robot import RobotConfig
 
 SHARE = Path(__file__).resolve().parents[1]
 
 
 def test_it_holds_the_defaults():
-    content = yaml.safe_load((SHARE / "config/robot.param.yaml").read_text())
-    given = content["/**"]["ros__parameters"]["robot"]
+    """What is set and what is only shown, which a preset would otherwise not get past."""
+    text = (SHARE / "config/robot.param.yaml").read_text()
     default = vars(RobotConfig())
-    assert set(given) == set(default)
-    for name, value in given.items():
+    shown = yaml.safe_load(re.sub(r"^      # (\w+:)", r"      \1", text, flags=re.MULTILINE))["/**"]["ros__parameters"]["robot"]
+    assert set(shown) == set(default)
+    for name, value in shown.items():
         assert value == (pytest.approx(default[name]) if isinstance(value, list) else default[name]), name
+    assert set(yaml.safe_load(text)["/**"]["ros__parameters"]["robot"]) == {"preset", "urdf", "srdf", "package_root", "base_frame"}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_what_every_node_reads(name, ros):
+    """Through the parameters, with one of them given besides; and the server's actions are the driver's."""
+    given = [Parameter("robot.preset", value=name), Parameter("robot.opening", value=0.07)]
+    node = rclpy.create_node("some_node", context=ros, parameter_overrides=given)
+    try:
+        config = RobotConfig(**robot_parameters(node))
+        for key in ("move_group", "home", "acceleration", "jerk", "closing_axis"):
+            assert getattr(config, key) == pytest.approx(getattr(PRESETS[name].config, key)), key
+        assert (config.preset, config.opening) == (name, 0.07)
+        assert settings.read(node, name).trajectory_action == PRESETS[name].trajectory_action
+    finally:
+        node.destroy_node()
+
+
+@pytest.fixture
+def ros():
+    context = Context()
+    rclpy.init(context=context)
+    yield context
+    context.try_shutdown()
 
 
 def test_every_node_that_knows_the_robot_gets_it_after_its_own_file():

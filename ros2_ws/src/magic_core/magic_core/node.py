@@ -24,11 +24,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from magic_core import presence
+from magic_core import presence, presets
 from magic_core.diagnostics import Diagnostics, status
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
-from magic_core.robot import RobotConfig
 
 #: What a node is given to wind down while messages still flow, and then its callbacks to end, s.
 WINDING_DOWN, ENDING = 5.0, 2.0
@@ -44,7 +43,7 @@ ROBOT_PARAMETERS = frozenset(
     "robot." + name
     for name in (
         *("urdf", "srdf", "package_root", "move_group", "closing_axis", "opening", "home", "base_frame"),
-        *("acceleration", "velocity_scale", "acceleration_scale"),
+        *("acceleration", "jerk", "velocity_scale", "acceleration_scale", "jerk_scale", "preset"),
     )
 )
 
@@ -200,8 +199,12 @@ def refuse_unknown_parameters(node: Node) -> None:
 
 def robot_parameters(node: Node) -> dict[str, Any]:
     """Declare the parameters ``robot.*`` that every node with an arm has; the arguments of :class:`magic_core.robot.RobotConfig`."""
-    default = RobotConfig()
+    preset = parameter(
+        node, "robot.preset", "", "Arm whose values are the defaults here and whose published limits hold.", choices=("", *presets.PRESETS)
+    )
+    default = presets.config_of(preset)
     return {
+        "preset": preset,
         "urdf": parameter(node, "robot.urdf", default.urdf, "URDF of arm and gripper; empty: the Panda of example-robot-data."),
         "srdf": parameter(node, "robot.srdf", default.srdf, "SRDF with the pairs of links that may touch."),
         "package_root": parameter(
@@ -219,6 +222,7 @@ def robot_parameters(node: Node) -> dict[str, Any]:
         "acceleration": tuple(
             parameter(node, "robot.acceleration", list(default.acceleration), "Acceleration limits, rad/s^2, one a joint or one for all.")
         ),
+        "jerk": tuple(parameter(node, "robot.jerk", list(default.jerk), "Jerk limits, rad/s^3, one a joint or one for all.")),
     }
 
 

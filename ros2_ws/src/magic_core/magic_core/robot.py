@@ -23,11 +23,12 @@ from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.joint_limits import PUBLISHED, Braking, JointLimits
 
 #: Franka's ready pose.
 PANDA_HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
-#: Franka's joint acceleration limits, rad/s^2 (Franka Control Interface documentation); a URDF has none.
-PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+#: A URDF has none of these.
+PANDA_ACCELERATION, PANDA_JERK = PUBLISHED["panda"].acceleration, PUBLISHED["panda"].jerk
 #: Kinds of joints that move.
 TURNING, SLIDING = ("revolute", "continuous"), "prismatic"
 #: How far the fingers' way may deviate from the closing axis: cosine of about 8 degrees.
@@ -42,8 +43,9 @@ class RobotConfig:
     ``package://`` in the URDF stands for; empty: the folder above the URDF in which a mesh is found, else
     the share folder of the ROS package.  move_group: the link between the fingertips, z out of the hand.
     closing_axis: along which axis of that link the fingers close.  opening: metres between the open fingers.
-    home: joint positions.  acceleration: limits in rad/s^2, one for each joint or one for all.  scales: share
-    of the limits used.  base_frame: the name that objects, trajectories and TF have for the frame of the URDF's root
+    home: joint positions.  acceleration, jerk: limits in rad/s^2 and rad/s^3, one for each joint or one for all.  scales: share
+    of the limits used.  preset: whose published limits hold besides the URDF's (:mod:`magic_core.joint_limits`); empty: the Panda's
+    where there is no URDF either, else nobody's.  base_frame: the name that objects, trajectories and TF have for the frame of the URDF's root
     link; empty: that link's own name.
     """
 
@@ -55,16 +57,21 @@ class RobotConfig:
     opening: float = 0.08
     home: tuple[float, ...] = PANDA_HOME
     acceleration: tuple[float, ...] = PANDA_ACCELERATION
+    jerk: tuple[float, ...] = PANDA_JERK
     velocity_scale: float = 0.3
     acceleration_scale: float = 0.2
+    jerk_scale: float = 0.03
     base_frame: str = ""
+    preset: str = ""
 
     def __post_init__(self) -> None:
         if self.closing_axis not in ("x", "y"):
             raise MagicError(Code.BAD_REQUEST, "closing axis", self.closing_axis, ("x", "y"))
         if not 0.005 <= self.opening <= 1.0:
             raise MagicError(Code.BAD_REQUEST, "gripper opening", self.opening, "0.005 to 1 m")
-        for name in ("velocity_scale", "acceleration_scale"):
+        if self.preset and self.preset not in PUBLISHED:
+            raise MagicError(Code.BAD_REQUEST, "robot.preset", self.preset, (*PUBLISHED, "empty"))
+        for name in ("velocity_scale", "acceleration_scale", "jerk_scale"):
             if not 0 < getattr(self, name) <= 1:
                 raise MagicError(Code.BAD_REQUEST, name, getattr(self, name), "above 0, up to 1")
 
@@ -172,8 +179,11 @@ class Description:
                 f"the URDF's root link {self.base}, or another name for the same frame; this is another link of {self.urdf}",
             )
         self.arm = self._chain()
+        self.published = self._published()
         if len(config.home) != len(self.arm):
             raise MagicError(Code.BAD_REQUEST, "home configuration", list(config.home), f"{len(self.arm)} joint positions")
+        if self.published is not None:
+            self.arm = tuple(_narrowed(joint, self.published, index) for index, joint in enumerate(self.arm))
         self.arm = tuple(_within_a_turn(joint, float(home)) for joint, home in zip(self.arm, config.home, strict=True))
         self.fingers = self._fingers()
         self.moving = frozenset((*self.names, *(joint.name for joint in self.fingers)))
@@ -280,18 +290,46 @@ class Description:
             poses = poses @ moved
         return poses
 
+    def _published(self) -> JointLimits | None:
+        """What the arm's maker publishes, where it is known which that is."""
+        name = self.config.preset or ("" if self.config.urdf else "panda")
+        if not name:
+            return None
+        if len(PUBLISHED[name].lower) != len(self.arm):
+            raise MagicError(
+                Code.BAD_REQUEST, f"joints of {self.urdf}", len(self.arm), f"{len(PUBLISHED[name].lower)}, as the robot.preset {name} has"
+            )
+        return PUBLISHED[name]
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """(J,): limits of the joints' velocities in rad/s (m/s)."""
+        return np.array([joint.velocity for joint in self.arm])
+
     @property
     def acceleration(self) -> NDArray[np.float64]:
         """(J,): limits of the joints' accelerations in rad/s^2 (m/s^2); raises BAD_REQUEST where there are more or fewer than joints.
 
         A URDF has none: where nothing was set for an arm of another number of joints than the Panda's, the least of the Panda's.
         """
-        found = np.asarray(self.config.acceleration, dtype=float)
-        if self.config.acceleration == PANDA_ACCELERATION and len(self.arm) != len(PANDA_ACCELERATION):
-            found = np.array([min(PANDA_ACCELERATION)])
+        return self._limits("acceleration", PANDA_ACCELERATION)
+
+    @property
+    def jerk(self) -> NDArray[np.float64]:
+        """(J,): limits of the joints' jerks in rad/s^3 (m/s^3), as :attr:`acceleration`."""
+        return self._limits("jerk", PANDA_JERK)
+
+    def _limits(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
+        given = getattr(self.config, name)
+        found = np.asarray([min(default)] if given == default and len(self.arm) != len(default) else given, dtype=float)
         if found.size not in (1, len(self.arm)) or not np.all(found > 0):
-            raise MagicError(Code.BAD_REQUEST, "acceleration limits", found.tolist(), f"1 or {len(self.arm)} numbers above 0")
+            raise MagicError(Code.BAD_REQUEST, f"{name} limits", found.tolist(), f"1 or {len(self.arm)} numbers above 0")
         return np.broadcast_to(found, (len(self.arm),)).copy()
+
+    @property
+    def braking(self) -> Braking | None:
+        """How much slower the arm's joints have to be near the ends of their ranges, where its maker says so."""
+        return self.published.braking if self.published is not None else None
 
     def finger_positions(self, width: float) -> NDArray[np.float64]:
         """(2,): where the fingers are when they are ``width`` metres apart, as far as they can be."""
@@ -377,6 +415,8 @@ class Description:
                 limit = element.find("limit")
                 limit = limit if limit is not None else ET.SubElement(element, "limit")
                 limit.attrib.update(lower=repr(joint.lower), upper=repr(joint.upper))
+                if math.isfinite(joint.velocity):
+                    limit.set("velocity", repr(joint.velocity))
                 element.set("type", joint.kind)
             for mesh in element.iterfind("collision/geometry/mesh"):
                 path = self._mesh_file(mesh.get("filename", ""))
@@ -407,6 +447,17 @@ def _origin(element: ET.Element | None) -> NDArray[np.float64]:
     if element is None:
         return np.eye(4)
     return transforms.from_rpy(*_numbers(element.get("rpy"), "0 0 0"), translation=_numbers(element.get("xyz"), "0 0 0"))
+
+
+def _narrowed(joint: Joint, published: JointLimits, index: int) -> Joint:
+    """A joint of the arm within its own limits and the published ones."""
+    lower, upper = published.lower[index], published.upper[index]
+    if joint.kind != "continuous":
+        lower, upper = max(lower, joint.lower), min(upper, joint.upper)
+    velocity = min(joint.velocity, published.velocity[index])
+    if (lower, upper, velocity) == (joint.lower, joint.upper, joint.velocity):
+        return joint
+    return replace(joint, kind="revolute", lower=lower, upper=upper, velocity=velocity)
 
 
 def _within_a_turn(joint: Joint, home: float) -> Joint:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from magic_core.errors import Code, MagicError
+from magic_core.joint_limits import PUBLISHED
+from magic_core.presets import PRESETS
 from magic_core.robot import Description, RobotConfig, panda_folder
 from magic_core.testing import six_axis
 
@@ -37,6 +39,34 @@ def test_the_panda_is_the_default():
     assert robot.finger_links == {"panda_leftfinger", "panda_rightfinger"}
     np.testing.assert_allclose([robot.closed, robot.opened], [[0, 0], [0.04, 0.04]])
     assert [joint.effort for joint in robot.arm] == [87, 87, 87, 87, 12, 12, 12]
+
+
+def test_published_limits_hold_besides_those_of_the_urdf():
+    panda, files = Description(), {"urdf": str(panda_folder() / "urdf/panda.urdf"), "srdf": str(panda_folder() / "srdf/panda.srdf")}
+    for name in ("lower", "upper", "velocity"):  # the file has Franka's own numbers
+        assert [getattr(joint, name) for joint in panda.arm] == list(getattr(PUBLISHED["panda"], name))
+    fr3 = Description(replace(PRESETS["fr3"].config, move_group="panda_hand_tcp", **files))
+    for index, joint in enumerate(fr3.arm):
+        assert joint.lower == max(PUBLISHED["panda"].lower[index], PUBLISHED["fr3"].lower[index])
+        assert joint.upper == min(PUBLISHED["panda"].upper[index], PUBLISHED["fr3"].upper[index])
+        assert joint.velocity == PUBLISHED["panda"].velocity[index]  # the slower of the two
+        element = fr3.tree().find(f"joint[@name='{joint.name}']/limit")
+        assert (float(element.get("lower")), float(element.get("velocity"))) == (joint.lower, joint.velocity)
+    assert panda.braking is None and fr3.braking is not None
+    assert list(fr3.jerk) == [5000.0] * 7
+    # A URDF of one's own without a preset has nobody's limits but its own.
+    assert Description(RobotConfig(**files)).published is None
+    with pytest.raises(MagicError, match="as the robot.preset ur5e has"):
+        Description(replace(PRESETS["ur5e"].config, move_group="panda_hand_tcp", **files))
+    with pytest.raises(MagicError, match=r"robot\.preset: 'fr4'"):
+        RobotConfig(preset="fr4")
+
+
+def test_the_end_of_a_joint_is_come_to_slowly():
+    """Franka's formula for the FR3, with numbers worked out by hand: joint 1, 0.1 rad before 2.7501 rad, and beyond it."""
+    low, high = PUBLISHED["fr3"].braking.velocities(np.array([[2.6501, 0, 0, -1.5, 0, 2.0, 0], [2.8, 0, 0, -1.5, 0, 2.0, 0]]))
+    assert high[:, 0] == pytest.approx([np.sqrt(1.2) - 0.3, 0.0])
+    assert low[0, 0] == pytest.approx(-(np.sqrt(12 * 5.4002) - 0.3))
 
 
 def test_the_base_frame_is_the_root_link_or_another_name_for_it(config):
