@@ -177,6 +177,10 @@ class Articulation:
         """(J + 2,): the arm's joints in rad (m), then the fingers in m."""
         return np.asarray(self.body.qpos, dtype=float).ravel()[[*self._arm, *self._fingers]]
 
+    def speeds(self) -> NDArray[np.float64]:
+        """(J + 2,): velocities of the arm's joints in rad/s (m/s), then of the fingers in m/s."""
+        return np.asarray(self.body.qvel, dtype=float).ravel()[[*self._arm, *self._fingers]]
+
     def _opened_by(self) -> NDArray[np.float32]:
         """(2,): how far each finger is from closed, divided by its share of the way, m."""
         return (np.asarray(self.body.qpos).ravel()[self._fingers] - self._closed) / self._outward
@@ -210,9 +214,10 @@ class Articulation:
                 target(velocity)
         self.body.set_qf(self.body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
 
-    def open_fingers(self) -> None:
-        """Drive the fingers to where they are open."""
-        for target, position in zip(self._finger_targets, self._opened.tolist(), strict=True):
+    def open_fingers(self, width: float | None = None) -> None:
+        """Drive the fingers to where they are open, or ``width`` metres apart."""
+        wanted = self._opened if width is None else self._robot.finger_positions(width)
+        for target, position in zip(self._finger_targets, wanted.tolist(), strict=True):
             target(position)
 
     def close_fingers(self) -> None:
@@ -241,12 +246,16 @@ class Articulation:
 
     # ------------------------------------------------------------ grip
 
-    def grips(self, tool: Any, patch: Patch, friction: float) -> Grip:
-        """Hold a tool (the engine's body) where it is between the pads, which leave it to the joint until :meth:`lets_go`."""
+    def grips(self, tool: Any, patch: Patch, friction: float, force: float | None = None) -> Grip:
+        """Hold a tool (the engine's body) where it is between the pads, which leave it to the joint until :meth:`lets_go`.
+
+        force: N of each finger; ``None``: that of the options.
+        """
         hand_from_tcp = transforms.inverse(from_pose(self.hand.entity_pose)) @ self.tcp()
         self._ignore(tool, True)
         hand_from_patch = hand_from_tcp @ patch.tcp_from_patch
-        return Grip(self.hand, hand_from_patch, tool, patch, self._options.grip_force, friction, self._world.timestep)
+        force = self._options.grip_force if force is None else force
+        return Grip(self.hand, hand_from_patch, tool, patch, force, friction, self._world.timestep)
 
     def lets_go(self, tool: Any) -> None:
         """Hand and tool collide again."""

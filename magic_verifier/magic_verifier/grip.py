@@ -132,6 +132,11 @@ class Grip:
             self._joint.pose_in_parent = self._anchor
         return share
 
+    def slip(self, moved: Array) -> None:
+        """Hold the tool elsewhere, moved (4, 4) in the patch's frame, as if it had slipped so far."""
+        self._anchor = self._anchor * to_pose(moved)
+        self._joint.pose_in_parent = self._anchor
+
     def open(self) -> None:
         """The pads let go."""
         for drive in self._drives():

@@ -24,6 +24,8 @@ from magic_interfaces.msg import MotionPlan
 PATIENCE, MARGIN = 1.5, 5.0
 #: What the fingers are given to open or close, s.
 FINGER_TIME = 10.0
+#: A simulated clock may be so many times slower than the wall's, by which answers are waited for.
+SLOW = 10.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Arm:
 
     def __init__(self, node: Node, trajectory_action: str, gripper_action: str, settings: ArmSettings, group: CallbackGroup) -> None:
         self.settings = settings
+        self._patience = SLOW if node.get_parameter("use_sim_time").value else 1.0
         self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group, Code.EXECUTION_FAILED)
         self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group, Code.EXECUTION_FAILED)
 
@@ -118,7 +121,7 @@ class Arm:
         goal.goal_tolerance = [JointTolerance(name=name, position=self.settings.goal_tolerance) for name in names]
         goal.goal_time_tolerance = duration_to_msg(self.settings.goal_time)
         seconds = (times[move.last] - times[move.first]) / speed
-        response = self._mover.respond(goal, PATIENCE * seconds + MARGIN, token, self.settings.presence)
+        response = self._mover.respond(goal, self._patience * (PATIENCE * seconds + MARGIN), token, self.settings.presence)
         result = response.result
         if response.status != GoalStatus.STATUS_SUCCEEDED or result.error_code != FollowJointTrajectory.Result.SUCCESSFUL:
             raise execution.controller_error(result.error_code, response.status, result.error_string)
@@ -129,7 +132,7 @@ class Arm:
         opening = max(0.0, fingers.opening - settings.squeeze) if fingers.close else fingers.opening
         goal.command.position = opening * settings.finger_scale
         goal.command.max_effort = settings.effort
-        response = self._gripper.respond(goal, FINGER_TIME, token, settings.presence)
+        response = self._gripper.respond(goal, self._patience * FINGER_TIME, token, settings.presence)
         result = response.result
         found = result.position / settings.finger_scale
         if fingers.close:

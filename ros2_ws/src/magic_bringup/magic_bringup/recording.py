@@ -110,16 +110,8 @@ class Recording:
 
     def frame(self, frame: RgbdFrame) -> None:
         """Colour, depth and their camera_info of one frame, at its stamp."""
-        head = convert.header(f"{frame.camera}_color_optical_frame", frame.stamp)
-        base = f"/camera/{frame.camera}"
-        millimetres = np.where(np.isfinite(frame.depth), np.round(np.nan_to_num(frame.depth) * 1000), 0).clip(0, 65535).astype(np.uint16)
-        info = convert.intrinsics_to_msg(frame.intrinsics, head)
-        for topic, image in (
-            ("color", convert.image_to_msg(frame.color, "rgb8", head)),
-            ("aligned_depth_to_color", convert.image_to_msg(millimetres, "16UC1", head)),
-        ):
-            self.write(f"{base}/{topic}/camera_info", info, frame.stamp)
-            self.write(f"{base}/{topic}/image_raw", image, frame.stamp)
+        for topic, message in convert.frame_to_msgs(frame).items():
+            self.write(f"/camera/{frame.camera}/{topic}", message, frame.stamp)
 
     def joints(self, stamp: float, positions: Sequence[float] = READY) -> None:
         """The arm's joint positions (9,), rad and m."""

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -198,16 +197,12 @@ def camera_messages(meshes: list[Any], names: tuple[str, ...] = ("left", "right"
     for index, name in enumerate(names):
         pose = sensor.looking_at([0.1, 0.45 if index == 0 else -0.45, 0.65], [0.5, 0.0, 0.0])
         frame = sensor.capture(meshes, sensor.D435, pose, (seed, index), camera=name, raycaster=caster)
-        head = conversions.header(f"{name}_color_optical_frame")
-        base = f"/camera/{name}"
-        depth = np.nan_to_num(frame.depth * 1000.0).round().astype(np.uint16)
-        messages[f"{base}/color/image_raw"] = conversions.image_to_msg(frame.color, "rgb8", head)
-        messages[f"{base}/color/camera_info"] = conversions.intrinsics_to_msg(frame.intrinsics, head)
-        messages[f"{base}/aligned_depth_to_color/image_raw"] = conversions.image_to_msg(depth, "16UC1", head)
-        messages[f"{base}/aligned_depth_to_color/camera_info"] = conversions.intrinsics_to_msg(frame.intrinsics, head)
+        messages.update({f"/camera/{name}/{topic}": message for topic, message in conversions.frame_to_msgs(frame).items()})
         static.transforms.append(
             TransformStamped(
-                header=conversions.header("panda_link0"), child_frame_id=head.frame_id, transform=conversions.transform_to_msg(pose)
+                header=conversions.header("panda_link0"),
+                child_frame_id=f"{name}_color_optical_frame",
+                transform=conversions.transform_to_msg(pose),
             )
         )
     return {"/tf_static": static, **messages}

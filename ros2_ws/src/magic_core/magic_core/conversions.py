@@ -29,7 +29,7 @@ from trajectory_msgs.msg import (
 
 from magic_core import depth as depths
 from magic_core import transforms
-from magic_core.camera import Intrinsics
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.contact import Contact, ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
@@ -307,6 +307,22 @@ def cloud_from_msg(msg: PointCloud2) -> tuple[NDArray[np.float64], NDArray[np.ui
     rgb = raw["rgb"]
     points = np.column_stack([raw["x"], raw["y"], raw["z"]]).astype(float)
     return points, np.column_stack([rgb >> 16 & 255, rgb >> 8 & 255, rgb & 255]).astype(np.uint8)
+
+
+def frame_to_msgs(frame: RgbdFrame) -> dict[str, Image | CameraInfo]:
+    """One frame as the RealSense driver publishes it with ``align_depth``: the topics below the camera's name, each with its message.
+
+    The frame is CAMERA_color_optical_frame, depth 16UC1 in millimetres, 0 where there is none.
+    """
+    head = header(f"{frame.camera}_color_optical_frame", frame.stamp)
+    millimetres = np.where(np.isfinite(frame.depth), np.round(np.nan_to_num(frame.depth) * 1000), 0).clip(0, 65535).astype(np.uint16)
+    info = intrinsics_to_msg(frame.intrinsics, head)
+    return {
+        "color/camera_info": info,
+        "color/image_raw": image_to_msg(frame.color, "rgb8", head),
+        "aligned_depth_to_color/camera_info": info,
+        "aligned_depth_to_color/image_raw": image_to_msg(millimetres, "16UC1", head),
+    }
 
 
 # ---------------------------------------------------------------- scene

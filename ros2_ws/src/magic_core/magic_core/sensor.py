@@ -88,6 +88,10 @@ class DepthModel:
 SMEARED = DepthModel(window=9, filled=6)
 
 
+#: The light: a direction towards it (world), the share that comes from everywhere, and what is seen where nothing is (RGB).
+LIGHT, AMBIENT, BACKGROUND = (-0.3, 0.4, 1.0), 0.5, (70, 72, 76)
+
+
 def table_mesh(
     low: tuple[float, float] = (-0.6, -1.0), high: tuple[float, float] = (1.4, 1.0), color: tuple[int, int, int] = (186, 152, 112)
 ) -> Mesh:
@@ -112,28 +116,63 @@ STATION = {
 }
 
 
+@dataclass(frozen=True)
+class Noise:
+    """What chance does to one frame, for every pixel, so that what one pixel gets does not depend on the others.
+
+    smooth (H, W): error of the disparity in standard deviations; lottery, loss (H, W): from 0 to 1, what decides at grazing angles and
+    at edges; shift (2, H, W): -1 to 1, which neighbour's depth a pixel at an edge takes; color (H, W, 3): of 255.
+    """
+
+    smooth: NDArray[np.float64]
+    lottery: NDArray[np.float64]
+    loss: NDArray[np.float64]
+    shift: NDArray[np.int64]
+    color: NDArray[np.float64]
+
+    @classmethod
+    def draw(cls, shape: tuple[int, int], seed: int | Sequence[int], model: DepthModel | None = None) -> Noise:
+        """For frames of a shape (H, W)."""
+        model = model or DepthModel()
+        keys = [int(k) for k in np.atleast_1d(seed)]
+        random = np.random.default_rng([*keys, 0])
+        smooth = cv2.GaussianBlur(random.standard_normal(shape), (0, 0), model.correlation)
+        # White noise smoothed with a Gaussian of s pixels keeps 1 / (4 pi s^2) of its variance.
+        smooth *= np.sqrt(4 * np.pi) * model.correlation
+        lottery, loss = random.random(shape), random.random(shape)
+        shift = random.integers(-1, 2, (2, *shape))
+        return cls(smooth, lottery, loss, shift, np.random.default_rng([*keys, 1]).normal(0, 1.2, (*shape, 3)))
+
+    def light(self) -> Noise:
+        """The same in fewer bytes, which are quicker to work with."""
+        single = [x.astype(np.float32) for x in (self.smooth, self.lottery, self.loss)]
+        return Noise(*single, self.shift.astype(np.int16), self.color.astype(np.float32))
+
+    def rolled(self, down: int, right: int) -> Noise:
+        """The same noise elsewhere in the picture: another frame's, at a fraction of the cost of drawing it."""
+        by = (down, right)
+        flat = [np.roll(x, by, (0, 1)) for x in (self.smooth, self.lottery, self.loss)]
+        return Noise(*flat, np.roll(self.shift, by, (1, 2)), np.roll(self.color, by, (0, 1)))
+
+
 def degrade(
     depth: NDArray[np.float32],
     cosine: NDArray[np.float32],
     intrinsics: Intrinsics,
     seed: int | Sequence[int],
     model: DepthModel | None = None,
+    noise: Noise | None = None,
 ) -> NDArray[np.float32]:
     """What the sensor makes of true depth.
 
     depth (H, W) metres, NaN where nothing is; cosine (H, W) of the angle between ray and
-    surface normal.  Returns (H, W) float32 metres in whole millimetres, NaN where there is none.
+    surface normal; noise: drawn by the seed where none is given.  Returns (H, W) float32 metres in whole millimetres, NaN where
+    there is none.
     """
     model = model or DepthModel()
-    random = np.random.default_rng(seed)
     height, width = depth.shape
-    # Every draw is made for every pixel, so that what one pixel gets does not depend on the others.
-    smooth = cv2.GaussianBlur(random.standard_normal((height, width)), (0, 0), model.correlation)
-    # White noise smoothed with a Gaussian of s pixels keeps 1 / (4 pi s^2) of its variance.
-    smooth *= np.sqrt(4 * np.pi) * model.correlation
-    lottery = random.random((height, width))
-    loss = random.random((height, width))
-    shift = random.integers(-1, 2, (2, height, width))
+    noise = noise or Noise.draw((height, width), seed, model)
+    smooth, lottery, loss, shift = noise.smooth, noise.lottery, noise.loss, noise.shift
 
     if model.window or model.filled:
         depth = smeared(depth, intrinsics, seed, model)
@@ -205,7 +244,7 @@ def _shadow(depth: NDArray[np.float32], intrinsics: Intrinsics, model: DepthMode
     return hidden
 
 
-def _wood(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def wood(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Brightness factors (...,) of a mild grain along world x at points (..., 3) of the table."""
     x, y = points[..., 0], points[..., 1]
     bend = 0.012 * np.sin(3 * x + 2 * y) + 0.004 * np.sin(11 * x)
@@ -236,17 +275,34 @@ def capture(
     rays = intrinsics.unproject(np.ones((intrinsics.height, intrinsics.width)))
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ world_from_camera[:3, :3].T
     cosine = np.abs(np.einsum("hwi,hwi->hw", rays, cast.normals))
-    keys = [int(k) for k in np.atleast_1d(seed)]
-    depth = degrade(true, cosine, intrinsics, [*keys, 0], model)
-
-    image = shade(cast, light=(-0.3, 0.4, 1.0), ambient=0.5, background=(70, 72, 76)).astype(float)
+    image = shade(cast, light=LIGHT, ambient=AMBIENT, background=BACKGROUND).astype(float)
     on_table = cast.ids == 0
     points = rays * np.where(np.isfinite(cast.distance), cast.distance, 0.0)[..., None] + world_from_camera[:3, 3]
-    image *= np.where(on_table, _wood(points), 1.0)[..., None]
+    image *= np.where(on_table, wood(points), 1.0)[..., None]
+    return expose(image, true, cosine, intrinsics, world_from_camera, seed, model=model, camera=camera, stamp=stamp)
+
+
+def expose(
+    image: NDArray[np.floating],
+    depth: NDArray[np.float32],
+    cosine: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    world_from_camera: NDArray[np.float64],
+    seed: int | Sequence[int],
+    *,
+    model: DepthModel | None = None,
+    camera: str = "camera",
+    stamp: float = 0.0,
+    noise: Noise | None = None,
+) -> RgbdFrame:
+    """What the sensor makes of what is there: a lit image (H, W, 3), true depth (H, W) in metres (NaN: nothing), and the cosine (H, W)
+    of the angle between ray and surface normal."""
+    noise = noise or Noise.draw(depth.shape, seed, model)
+    measured = degrade(depth, cosine, intrinsics, [*np.atleast_1d(seed), 0], model, noise)
     image = cv2.GaussianBlur(image, (0, 0), 0.6)
-    random = np.random.default_rng([*keys, 1])
-    image += random.normal(0, 1.2, image.shape)
-    return RgbdFrame(np.clip(image, 0, 255).astype(np.uint8), depth, intrinsics, np.asarray(world_from_camera, dtype=float), camera, stamp)
+    image += noise.color
+    color = np.clip(image, 0, 255).astype(np.uint8)
+    return RgbdFrame(color, measured, intrinsics, np.asarray(world_from_camera, dtype=float), camera, stamp)
 
 
 def scene_raycaster(meshes: Sequence[Mesh], table: Mesh | None = None) -> Raycaster:

@@ -1,0 +1,1 @@
+"""A laboratory in simulation behind the topics and actions of a real one."""

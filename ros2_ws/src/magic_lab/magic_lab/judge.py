@@ -1,0 +1,165 @@
+"""What truly came of a trial: the strategy's goal test on where everything was.  No ROS here.
+
+The goal tests of :mod:`magic_verifier.goals` watch a run of the verifier.  Here they watch the truth: tool, target and all else are put
+where they were, moment by moment, in a world of the true things, and what a test asks beyond that (a nudge, a turned pull)
+begins where the truth ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.motion import Phase
+from magic_lab.scenarios import Scene
+from magic_lab.world import PLANE, SETTINGS, Thing
+from magic_verifier.floating import TARGET, TOOL, Body, Setup, fill_world
+from magic_verifier.goals import Judgement, goal_test
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, usable_pieces
+
+Array = NDArray[np.float64]
+
+#: A thing has moved when it is farther than this (m) from where it was, or faster than this (m/s).
+MOVED, MOVING = 0.01, 0.02
+#: The tool has left the hand when it is farther (m) from where it was in it than this.
+LEFT = 0.03
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where everything truly was: times (T,) s, poses[name] (T, 4, 4) world_from_object, tcp (T, 4, 4) of the hand."""
+
+    times: Array
+    poses: Mapping[str, Array]
+    tcp: Array
+
+    @classmethod
+    def of(cls, samples: Sequence[tuple[float, Mapping[str, Array]]], hand: str) -> Track:
+        """Of (time, poses by name) with the hand among them; raises NO_FRAMES where there is none."""
+        if len(samples) < 2:
+            raise MagicError(Code.NO_FRAMES, "samples of the truth", len(samples), "at least 2")
+        names = set.intersection(*(set(poses) for _, poses in samples)) - {hand}
+        stacks = {name: np.stack([poses[name] for _, poses in samples]) for name in sorted(names)}
+        return cls(np.array([time for time, _ in samples]), stacks, np.stack([poses[hand] for _, poses in samples]))
+
+    def moved(self, name: str) -> Array:
+        """(T,): how far a thing is from where it began, m."""
+        places = self.poses[name][:, :3, 3]
+        return np.linalg.norm(places - places[0], axis=1)
+
+    def let_go(self, tool: str) -> int | None:
+        """The sample at which the tool, once taken up, has left the hand; ``None``: it was never taken, or is held."""
+        carried = np.flatnonzero(self.moved(tool) > MOVED)
+        if len(carried) == 0:
+            return None
+        in_hand = (np.linalg.inv(self.tcp) @ self.poses[tool])[:, :3, 3]
+        away = np.flatnonzero(np.linalg.norm(in_hand[carried[0] :] - in_hand[carried[0]], axis=1) > LEFT)
+        return int(carried[0] + away[0]) if len(away) else None
+
+
+class Replay:
+    """The truth as a run that a goal test can watch; :meth:`advance` goes on by one sample."""
+
+    variant = "arm"
+
+    def __init__(self, scene: Scene, tool: str, track: Track) -> None:
+        self._track, self._tool, self._target = track, tool, scene.target
+        things = {thing.name: thing for thing in scene.things if thing.name in track.poses}
+
+        def body(thing: Thing, name: str) -> Body:
+            return Body(name, tuple(usable_pieces(name, thing.item.pieces)), track.poses[thing.name][0])
+
+        others = [
+            replace(body(t, t.name), world_from_object=track.poses[t.name][-1]) for n, t in things.items() if n not in (tool, scene.target)
+        ]
+        true = things[scene.target]
+        physics = replace(
+            scene.strategy.physics, friction=things[tool].friction, tool_density=things[tool].density, target_density=true.density
+        )
+        self.setup = Setup(body(things[tool], TOOL), body(true, TARGET), tuple(others), PLANE, physics, true.kind, SETTINGS)
+        self._index = 0
+        self._gone = track.let_go(tool)
+        self.duration = float(track.times[-1] - track.times[0])
+        self.release_time = None if self._gone is None else float(track.times[self._gone] - track.times[0])
+        self.world = fill_world(self.setup, KINEMATIC if self._gone is None else DYNAMIC)
+        self.phases = (Phase("goal", *self._pull()),)
+
+    def _pull(self) -> tuple[float, float]:
+        """From when to when the target moved, s; of one that never did: all the time."""
+        times, places = self._track.times, self._track.poses[self._target][:, :3, 3]
+        speed = np.linalg.norm(np.gradient(places, times, axis=0), axis=1)
+        moving = np.flatnonzero(speed > MOVING)
+        first, last = (moving[0], moving[-1]) if len(moving) else (0, len(times) - 1)
+        return float(times[first] - times[0]), float(times[last] - times[0])
+
+    @property
+    def time(self) -> float:
+        """Seconds since the first sample."""
+        return float(self._track.times[self._index] - self._track.times[0])
+
+    @property
+    def phase(self) -> str:
+        """The name of the present phase."""
+        phase = self.phases[0]
+        return phase.name if phase.start <= self.time < phase.end else ""
+
+    @property
+    def released(self) -> bool:
+        """Whether the tool has left the hand."""
+        return self._gone is not None and self._index >= self._gone
+
+    def hand_has_left(self) -> float:
+        """By how many metres the hand has gone away from where it let the tool go."""
+        if self._gone is None:
+            return 0.0
+        # It is noticed once the tool is LEFT away.
+        return LEFT + float(np.linalg.norm(self._track.tcp[self._index][:3, 3] - self._track.tcp[self._gone][:3, 3]))
+
+    def advance(self) -> bool:
+        """Put tool and target where they were at the next sample; false where there is none."""
+        if self._index + 1 >= len(self._track.times):
+            return False
+        self._index += 1
+        for name, thing, kind in ((TOOL, self._tool, DYNAMIC), (TARGET, self._target, self.setup.target_kind)):
+            if kind == STATIC:
+                continue
+            before, after = self._track.poses[thing][self._index - 1 : self._index + 1]
+            self.world.place(name, after)
+            if not self.world.component(name).kinematic:
+                dt = self._track.times[self._index] - self._track.times[self._index - 1]
+                self.world.set_velocity(name, (after - before)[:3, 3] / max(dt, 1e-3))
+        self.world.step()
+        return True
+
+    def go_on(self, seconds: float) -> None:
+        """Let physics go on from there."""
+        for _ in range(round(seconds * SETTINGS.frequency)):
+            self.world.step()
+
+
+def judge(scene: Scene, tool: str, track: Track) -> Judgement:
+    """What the strategy's goal test says of the truth; never raises for what may have happened to things."""
+    try:
+        run = Replay(scene, tool, track)
+        # Every 1/240 s a rollout's target is kicked; nobody kicked here.
+        test = goal_test(scene.strategy, run, np.random.default_rng(0))
+        while run.advance():
+            test.observe(run)
+        return test.judge(run, run.go_on)
+    except MagicError as error:
+        return Judgement(error.code, error.message)
+
+
+def nearest(names: Mapping[str, Array], place: Array) -> str:
+    """Of things by name and place (3,) that which is nearest to a place, level."""
+    return min(names, key=lambda name: float(np.linalg.norm((names[name] - place)[:2])))
+
+
+def middle(thing: Thing, pose: Array) -> Array:
+    """(3,): where the middle of a thing's box is in the world."""
+    return transforms.apply(pose, thing.item.mesh.bounds.mean(axis=0))
