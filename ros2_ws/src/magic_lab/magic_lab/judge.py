@@ -19,7 +19,7 @@ from magic_core.motion import Phase
 from magic_lab.scenarios import Scene
 from magic_lab.world import PLANE, SETTINGS, Thing
 from magic_verifier.floating import TARGET, TOOL, Body, Setup, fill_world
-from magic_verifier.goals import Judgement, goal_test
+from magic_verifier.goals import OBSERVE_EVERY, Judgement, goal_test
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, usable_pieces
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class Replay:
             scene.strategy.physics, friction=things[tool].friction, tool_density=things[tool].density, target_density=true.density
         )
         self.setup = Setup(body(things[tool], TOOL), body(true, TARGET), tuple(others), PLANE, physics, true.kind, SETTINGS)
-        self._index = 0
+        self._index = self._beyond = 0
         self._gone = track.let_go(tool)
         self.duration = float(track.times[-1] - track.times[0])
         self.release_time = None if self._gone is None else float(track.times[self._gone] - track.times[0])
@@ -100,7 +100,7 @@ class Replay:
     @property
     def time(self) -> float:
         """Seconds since the first sample."""
-        return float(self._track.times[self._index] - self._track.times[0])
+        return float(self._track.times[self._index] - self._track.times[0]) + self._beyond / SETTINGS.frequency
 
     @property
     def phase(self) -> str:
@@ -120,10 +120,12 @@ class Replay:
         # It is noticed once the tool is LEFT away.
         return LEFT + float(np.linalg.norm(self._track.tcp[self._index][:3, 3] - self._track.tcp[self._gone][:3, 3]))
 
-    def advance(self) -> bool:
-        """Put tool and target where they were at the next sample; false where there is none."""
+    def advance(self) -> None:
+        """Put tool and target where they were at the next sample; where there is none let physics go on."""
         if self._index + 1 >= len(self._track.times):
-            return False
+            self.world.step()
+            self._beyond += 1
+            return
         self._index += 1
         for name, thing, kind in ((TOOL, self._tool, DYNAMIC), (TARGET, self._target, self.setup.target_kind)):
             if kind == STATIC:
@@ -133,8 +135,8 @@ class Replay:
             if not self.world.component(name).kinematic:
                 dt = self._track.times[self._index] - self._track.times[self._index - 1]
                 self.world.set_velocity(name, (after - before)[:3, 3] / max(dt, 1e-3))
-        self.world.step()
-        return True
+        for _ in range(OBSERVE_EVERY):  # a goal looks so often
+            self.world.step()
 
     def go_on(self, seconds: float) -> None:
         """Let physics go on from there."""
@@ -146,11 +148,11 @@ def judge(scene: Scene, tool: str, track: Track) -> Judgement:
     """What the strategy's goal test says of the truth; never raises for what may have happened to things."""
     try:
         run = Replay(scene, tool, track)
-        # Every 1/240 s a rollout's target is kicked; nobody kicked here.
-        test = goal_test(scene.strategy, run, np.random.default_rng(0))
-        while run.advance():
-            test.observe(run)
-        return test.judge(run, run.go_on)
+        test = goal_test(scene.strategy, run, np.random.default_rng(0))  # nobody kicks the target: it is not asked to disturb
+        while run.time < max(run.duration, test.until()):
+            run.advance()
+            test.observe()
+        return test.judge(run.go_on)
     except MagicError as error:
         return Judgement(error.code, error.message)
 

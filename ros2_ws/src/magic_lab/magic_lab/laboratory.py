@@ -25,6 +25,8 @@ TICK = 0.01
 STEPS = round(TICK * SETTINGS.frequency)
 #: N of each finger where a goal names no effort.
 EFFORT = 60.0
+#: The fingers' speed is that of the last so many seconds.
+TREMBLE = 0.05
 #: How far before the hand what blocks it is put, m, from middle to middle.
 AHEAD = 0.16
 
@@ -56,6 +58,7 @@ class Lab:
         self._move_began = 0.0
         self._hand_came = -math.inf
         self._ticks = 0
+        self._fingers: list[float] = []  # positions, tick by tick
         self.arm = TrajectoryController(robot.names, self.world.arm.joints()[: len(robot.names)])
         self.gripper = GripperController(allow_stalling=allow_stalling)
         self.joints = self.world.joints()
@@ -104,7 +107,10 @@ class Lab:
             self.world.step(*self.arm.update(self.time + step * TICK / STEPS, q[:count], qd[:count]))
             self.joints = self.world.joints()
         self._ticks += 1
-        self.gripper.update(self.time, float(self.joints[0][-1]), float(self.joints[1][-1]))
+        finger = float(self.joints[0][-1])
+        self._fingers = [*self._fingers[-round(TREMBLE / TICK) :], finger]
+        # A stiff contact makes them tremble.
+        self.gripper.update(self.time, finger, (finger - self._fingers[0]) / TREMBLE)
         if self._ticks % 10 == 0:
             self.world.check()
 

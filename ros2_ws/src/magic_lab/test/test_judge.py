@@ -1,0 +1,86 @@
+"""The truth is judged as the strategy's goal says: on tracks whose end is known."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from magic_core import transforms
+from magic_core.contact import OPPOSED
+from magic_core.errors import Code
+from magic_core.shapes import mug_of_set
+from magic_lab.judge import Track, judge, nearest
+from magic_lab.scenarios import SCENARIOS, draw
+
+
+@lru_cache
+def scene(name):
+    return draw(SCENARIOS[name], SCENARIOS[name].cases[0], 0)
+
+
+def track(scene, moves, tcp, rate=20.0):
+    """A track of (seconds, {name: pose}) way points, the hand at ``tcp(time)``."""
+    times = np.arange(0, moves[-1][0] + 1e-9, 1 / rate)
+    start = {thing.name: thing.item.world_from_object for thing in scene.things}
+    at = np.array([time for time, _ in moves])
+    poses = {n: transforms.interpolate(at, np.stack([m.get(n, start[n]) for _, m in moves]), times) for n in start}
+    return Track(times, poses, np.stack([tcp(time, {n: p[k] for n, p in poses.items()}) for k, time in enumerate(times)]))
+
+
+def shifted(pose, x):
+    return transforms.make(translation=[x, 0, 0]) @ pose
+
+
+@pytest.mark.parametrize("way, code", [(-0.22, Code.DRIFT), (-0.12, Code.LOST_CONTACT), (0.0, Code.LOST_CONTACT)])
+def test_a_target_that_no_tool_holds_is_not_hooked_however_far_it_went(way, code):
+    s = scene("hooking")
+    target = s.thing("target").item.world_from_object
+    tool = s.thing("tool_1").item.world_from_object
+    moved = track(
+        s, [(0, {}), (1, {"tool_1": shifted(tool, 0.05)}), (3, {"target": shifted(target, way), "tool_1": tool})], lambda _t, p: p["tool_1"]
+    )
+    assert judge(s, "tool_1", moved).code == code
+
+
+def test_a_cup_on_the_rod_hangs_and_one_on_the_table_does_not():
+    s = scene("hanging")
+    cup = s.thing("tool_1").item.world_from_object
+    lifted = transforms.make(translation=[0, 0, 0.3]) @ cup
+
+    def hand(time, poses):
+        # It leaves after two seconds.
+        return transforms.make(translation=[-0.2 * max(0.0, time - 2.0), 0, 0]) @ poses["tool_1"]
+
+    back = judge(s, "tool_1", track(s, [(0, {}), (1, {"tool_1": lifted}), (2, {}), (3.5, {})], hand))
+    assert back.code in (Code.GOAL_NOT_REACHED, Code.LOST_CONTACT) and "fell" in back.message
+    held = judge(s, "tool_1", track(s, [(0, {}), (1, {"tool_1": lifted}), (3.5, {"tool_1": lifted})], lambda _t, p: p["tool_1"]))
+    assert held.code == Code.GOAL_NOT_REACHED and "never let go" in held.message
+    floating = judge(s, "tool_1", track(s, [(0, {}), (1, {"tool_1": lifted}), (3.5, {"tool_1": lifted})], hand))
+    assert floating.code != Code.OK, "nothing holds it up there"
+
+
+def test_a_cup_hung_by_its_handle_passes():
+    s = scene("hanging")
+    region = s.strategy.target_contact
+    rod = s.thing("target").item.world_from_object
+    shape = mug_of_set(int(s.case.tools[0].partition(":")[2]))
+    inside = shape.contact(next(iter(shape.regions)), shape.view(s.strategy.view), towards=(0, 0, -1))
+    up = transforms.make(translation=[0, 0, 0.002])
+    hung = up @ rod @ region.object_from_contact @ OPPOSED @ transforms.inverse(inside.object_from_contact)
+
+    def hand(time, poses):
+        return transforms.make(translation=[-0.2 * max(0.0, time - 2.0), 0, 0]) @ poses["tool_1"]
+
+    found = judge(s, "tool_1", track(s, [(0, {}), (1, {"tool_1": hung}), (3.5, {"tool_1": hung})], hand))
+    assert found.code == Code.OK, found.message
+
+
+def test_the_hand_and_what_it_holds():
+    s = scene("hooking")
+    tool = s.thing("tool_1").item.world_from_object
+    way = [(0, {}), (1, {"tool_1": shifted(tool, 0.1)}), (2, {"tool_1": shifted(tool, 0.1)})]
+    assert track(s, way, lambda _t, p: p["tool_1"]).let_go("tool_1") is None
+    left = track(s, way, lambda t, p: transforms.make(translation=[0, 0, max(0.0, t - 1.0)]) @ p["tool_1"])
+    assert left.times[left.let_go("tool_1")] == pytest.approx(1.05, abs=0.06)
+    assert left.let_go("target") is None
+    assert nearest({"a": np.array([0, 0, 9.0]), "b": np.array([1.0, 0, 0])}, np.array([0.2, 0, 0])) == "a"
