@@ -62,7 +62,7 @@ def test_what_is_imported_is_named(package):
         if name == package or name in sys.stdlib_module_names:
             continue
         key = KEYS.get(
-            name, name if name.startswith("magic_") or name.endswith(("_msgs", "_interfaces")) or name == "rosgraph_msgs" else None
+            name, name if name.startswith("magic_") or name.endswith(("_msgs", "_srvs", "_interfaces")) or name == "rosgraph_msgs" else None
         )
         if key is not None and key not in dependencies:
             missing[key] = file
@@ -74,7 +74,7 @@ def test_what_is_named_is_imported(package):
     """Nothing is dragged in that is not used: the messages and packages of ROS and of this project."""
     folder = PACKAGES[package]
     used = set(imported(folder / package))
-    ros = {d for d in named(folder / "package.xml") if d.startswith("magic_") or d.endswith("_msgs") or d == "rclpy"}
+    ros = {d for d in named(folder / "package.xml") if d.startswith("magic_") or d.endswith(("_msgs", "_srvs")) or d == "rclpy"}
     unused = ros - used - {"magic_ros2cli"}
     # Launch files start other packages' nodes.
     text = "".join(p.read_text() for p in folder.rglob("*.xml") if "launch" in p.name)
@@ -103,7 +103,7 @@ def test_pip_is_asked_for_what_is_imported(package, monkeypatch):
     plain, extra = asked_of_pip(package, monkeypatch)
     folder = PACKAGES[package]
     for name, file in imported(folder / package).items():
-        if name == package or name in sys.stdlib_module_names or name in OF_ROS or name.endswith("_msgs"):
+        if name == package or name in sys.stdlib_module_names or name in OF_ROS or name.endswith(("_msgs", "_srvs")):
             continue
         assert WHEELS.get(name, name) in plain | extra, f"{package}/setup.py does not ask for {name}, which {file} imports"
     pinned = {line.partition("==")[0] for line in (ROOT / "ros2_ws/requirements.txt").read_text().splitlines() if "==" in line}

@@ -61,6 +61,7 @@ setup(
             "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
             "bag_player = magic_bringup.programs:bag_player",
             "bag_recorder = magic_bringup.programs:bag_recorder",
+            "trials = magic_bringup.programs:trials",
         ],
     },
 )
