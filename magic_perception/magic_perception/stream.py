@@ -28,7 +28,7 @@ class Problem:
 
 @dataclass
 class Pair:
-    """A colour and a depth image that belong together."""
+    """A colour and a depth image that belong together; ``arrived`` is when the first pair of this stamp was complete."""
 
     color: NDArray[np.uint8]
     depth: NDArray[np.float32]
@@ -137,9 +137,11 @@ class Stream:
             del self._depths[: j + 1]
             self.clear("pairing")
             self.last["pair"] = now
-            # Of a bag that is played again what comes later in it is dropped: it comes again, too.
+            # Of a bag that is played again what comes later in it is dropped: it comes again, too.  The frame itself came when it came
+            # first: one that is played again and again would be young for ever, and what is waited for with it as well.
+            first = next((p.arrived for p in self.pairs if p.stamp == stamp), now)
             self.pairs = [p for p in self.pairs if p.stamp < stamp][-self.keep + 1 :]
-            self.pairs.append(Pair(color, depth, frame_id, depth_frame_id, stamp, now))
+            self.pairs.append(Pair(color, depth, frame_id, depth_frame_id, stamp, first))
 
 
 def next_scene(

@@ -448,6 +448,23 @@ def test_a_bag_with_fewer_frames_than_are_averaged_is_not_waited_for_without_end
         bench.until(lambda: bench.objects, "objects", tick=lambda: bench.send(later(frames[0], next(clock))))
 
 
+def test_a_frame_that_is_played_again_and_again_waits_once_for_joint_states(frames):
+    """A bag of one frame whose only joint state is a little older."""
+    with Bench(cameras=["left"], camera_timeout=0.5, average=3) as bench:
+        bench.transforms()
+        joints = bench.tester.create_publisher(JointState, "joint_states", 10)
+        names = [*(f"panda_joint{i}" for i in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2"]
+        state = JointState(name=names, position=[0.0, -0.78, 0.0, -2.36, 0.0, 1.57, 0.78, 0.04, 0.04])
+        state.header.stamp = cv.time_to_msg(9.9)
+
+        def seen():  # asked every 0.05 s: more often than joint states are waited for
+            joints.publish(state)
+            bench.send(later(frames[0], 10.0))
+            return bench.objects
+
+        bench.until(seen, "objects")
+
+
 def test_static_transforms_of_volatile_publishers_are_heard_and_bad_rotations_named(frames):
     from rclpy.qos import QoSProfile
 
