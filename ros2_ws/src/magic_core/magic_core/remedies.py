@@ -119,6 +119,10 @@ REMEDIES: dict[Code, Remedy] = {
         "The tool is seen in part: the picture's border, the region's, the arm or a thing in front cuts it off.",
         "Move it, or what hides it.",
     ),
+    Code.AMBIGUOUS_OBJECT: Remedy(
+        "The words for tool or target fit several objects, or none.",
+        "Say more of it (colour, size, place), or give its id: the message lists what there is.",
+    ),
     Code.BAD_MOTION: Remedy(
         "A pose, frame or table in the request is no rigid transform or plane.",
         "An error of who sends it: quaternions of length 1, finite numbers.",
