@@ -18,8 +18,8 @@ A process grows where its memory, its children's with it, has a slope over the c
 flat below: the median of the slopes between any two cases, which single outliers do not move.  A step that stays does, where it comes
 in the middle.
 
-What is done is kept in ``--out`` after every case; the same command goes on where it was interrupted.  It ends with a table, and with
-status 1 where something did not hold.  ``--quick``: a twentieth of each part.
+What is done is kept in ``--out`` after every case; the same command goes on where it was interrupted.  It ends with a table of what is
+done so far, also where it is interrupted (SIGINT, SIGTERM; status 130), and with status 1 where something did not hold.  ``--quick``: a twentieth of each part.
 """
 
 from __future__ import annotations
@@ -687,10 +687,13 @@ def main() -> int:
     # A shell that starts this in the background has it ignore SIGINT, and what is started here would inherit that.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     parts = [Part(n, max(1, s // 20) if given.quick else s, given.seed, given.out) for n, s in SIZES.items() if n in (given.parts or SIZES)]
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    failed = False
+    failed = interrupted = False
     for part in parts:
+        if interrupted:
+            break
         say(f"{part.name}: {len(part.cases)} of {part.size} are done")
         part.begin()
         try:
@@ -698,6 +701,9 @@ def main() -> int:
         except (AssertionError, MagicError) as error:  # the next part is run all the same; this one goes on with the next call
             say(f"{part.name} ended: {error}")
             failed = True
+        except KeyboardInterrupt:
+            say(f"{part.name} interrupted at {len(part.cases)} of {part.size}; the same command goes on from here")
+            interrupted = True
         finally:
             part.save()
     text = table(parts)
@@ -705,6 +711,8 @@ def main() -> int:
     print(text)
     grown = [line for p in parts for line in p.grown]
     print("\n".join(grown))
+    if interrupted:
+        return 130
     return int(failed or bool(grown) or any(any(p.cases) for p in parts))
 
 

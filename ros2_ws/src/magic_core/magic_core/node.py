@@ -305,6 +305,14 @@ class OneGoalServer:
         return [status(self._node, "goals", level, message, values)]
 
     def _execute(self, handle: Any) -> Any:
+        try:
+            return self._answered_goal(handle)
+        finally:
+            # rclpy keeps the handle for RESULT_TIMEOUT beyond the end, and with it the request: a scene of some MB as messages, so
+            # that what a server held depended on how many goals came in that time.
+            handle._goal_request = None
+
+    def _answered_goal(self, handle: Any) -> Any:
         started = time.monotonic()
         result = self._action.Result()
         if not self._busy.acquire(blocking=False):

@@ -115,6 +115,16 @@ def test_results_are_forgotten_also_those_of_goals_refused(bench):
     bench.until(lambda: not bench.server._server._goal_handles and not bench.server._server._result_futures)
 
 
+def test_requests_are_not_kept_as_long_as_results(bench):
+    first = bench.send()
+    assert bench.at_work.wait(DEADLINE)
+    assert bench.result(bench.send()).result.code == Code.BUSY
+    bench.go_on.set()
+    assert bench.result(first).result.message == "done"
+    kept = list(bench.server._server._goal_handles.values())
+    assert kept and [handle.request for handle in kept] == [None] * len(kept)
+
+
 def test_a_goal_whose_client_was_killed_is_given_up(bench):
     environment = {**os.environ, "ROS_DOMAIN_ID": str(bench.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with subprocess.Popen([sys.executable, "-c", CLIENT, bench.name], env=environment) as process:
