@@ -27,10 +27,16 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
     ],
     install_requires=["numpy<2", "scipy", "mplib", "toppra", beside("magic_core")],
+    extras_require={"xacro": ["xacro"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",
     description="From a matched contact to the motion of the tool and of the arm that holds it.",
     license="Apache-2.0",
-    entry_points={"console_scripts": [f"planner = {PACKAGE}.programs:planner"]},
+    entry_points={
+        "console_scripts": [
+            f"planner = {PACKAGE}.programs:planner",
+            f"describe_robot = {PACKAGE}.programs:describe_robot",
+        ]
+    },
 )

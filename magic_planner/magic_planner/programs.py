@@ -3,3 +3,4 @@
 from magic_core.entry import program
 
 planner = program("magic_planner.node")
+describe_robot = program("magic_planner.describe_robot")
