@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magic_bringup import execution
+from magic_bringup import execution, reference
+from magic_bringup.graph import NODES
 from magic_bringup.testing import ONCE, Bench, started, until
 from magic_core import conversions
 from magic_core.errors import Code
@@ -70,6 +71,22 @@ def test_floating_gripper(replay):
     assert len(result.heatmap.data)
     check_trajectory(result, bench, "fg")
     assert {line.split(":")[0] for line in bench.lines} >= {"perceive", "match", "plan", "verify"}
+
+
+def test_the_reference_says_what_the_nodes_say(replay):
+    """Parameters and endpoints in docs/reference.md are those of the running nodes."""
+    strategy, bench = replay
+    if strategy != "hooking":
+        pytest.skip("the nodes are the same for every strategy")
+    page = (BAGS.parent / "docs/reference.md").read_text()
+    for name in NODES:
+        rows = reference.parameters_page({name: reference.ask_parameters(bench.watcher.node, name)}).splitlines()
+        rows += reference.endpoints_page({name: reference.ask_endpoints(bench.watcher.node, name)}).splitlines()
+        for row in rows:
+            # This graph is told that it sees a recording.
+            assert row in page or row.startswith("| `recorded` |"), (
+                f"not in docs/reference.md (ros2 run magic_bringup reference): {name}: {row}"
+            )
 
 
 def test_same_seed_same_trajectory(replay):

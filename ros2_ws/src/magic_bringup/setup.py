@@ -58,6 +58,7 @@ setup(
             "magic = magic_bringup.programs:magic",
             "report = magic_bringup.programs:report",
             "calibrate_cameras = magic_bringup.programs:calibrate_cameras",
+            "reference = magic_bringup.programs:reference",
             "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
             "bag_player = magic_bringup.programs:bag_player",
             "bag_recorder = magic_bringup.programs:bag_recorder",

@@ -350,12 +350,8 @@ def _message_findings(name: str, message: Any, kind: str, is_depth: bool, seen: 
 def _stamp_findings(name: str, stamp: Any, seen: Seen) -> Iterator[Finding]:
     age = seen.now - (stamp.sec + 1e-9 * stamp.nanosec)
     simulated = any(p.get("use_sim_time") for p in seen.parameters.values())
-    if abs(age) <= CLOCKS or simulated:
-        return
-    where = f"{abs(age):.0f} s in the {'past' if age > 0 else 'future'}"
-    if seen.playing:
-        yield Finding("note", f"{name}: stamps lie {where}: a bag is being played")
-    else:
+    if abs(age) > CLOCKS and not simulated and not seen.playing:
+        where = f"{abs(age):.0f} s in the {'past' if age > 0 else 'future'}"
         mend = "set the clocks of the machines by one server (chronyc tracking), or the driver's to the system's time"
         yield Finding("FAIL", f"{name}: stamps lie {where}", mend)
 
@@ -384,7 +380,8 @@ def clock_findings(seen: Seen) -> list[Finding]:
         return [Finding("FAIL", f"use_sim_time is set for {', '.join(by)} and not for the others", mend)]
     if by and not seen.topic("/clock").publishers:
         return [Finding("FAIL", "use_sim_time is set, but nobody publishes /clock", "play the bag with --clock, or unset use_sim_time")]
-    return [Finding("ok", "clock: " + ("simulated, by /clock" if by else "the system's"))]
+    replayed = "; a bag is being played: its stamps are not compared with it" if seen.playing else ""
+    return [Finding("ok", "clock: " + ("simulated, by /clock" if by else "the system's") + replayed)]
 
 
 def fixture_findings(seen: Seen) -> list[Finding]:
