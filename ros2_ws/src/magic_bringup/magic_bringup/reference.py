@@ -181,12 +181,18 @@ def endpoints_page(endpoints: dict[str, dict[str, list[tuple[str, str]]]]) -> st
     return _table(("node", "", "name", "type"), rows)
 
 
-def launch_page() -> str:
-    """The arguments of the launch files."""
+def _folder(package: str) -> Path:
+    """Where a package's files are: beside this source, which may be newer than what is installed, else installed."""
     from ament_index_python.packages import get_package_share_directory
 
+    source = Path(__file__).resolve().parents[2] / package
+    return source if (source / "package.xml").is_file() else Path(get_package_share_directory(package))
+
+
+def launch_page() -> str:
+    """The arguments of the launch files."""
     parts = []
-    for path in sorted((Path(get_package_share_directory("magic_bringup")) / "launch").glob("*.launch.xml")):
+    for path in sorted((_folder("magic_bringup") / "launch").glob("*.launch.xml")):
         rows = []
         for argument in ET.parse(path).getroot().findall("arg"):
             choices = ", ".join(c.get("value") or '""' for c in argument.findall("choice"))
@@ -216,9 +222,7 @@ def codes_page() -> str:
 
 def interfaces_page() -> str:
     """The text of every message, service and action."""
-    from ament_index_python.packages import get_package_share_directory
-
-    share = Path(get_package_share_directory("magic_interfaces"))
+    share = _folder("magic_interfaces")
     parts = []
     for kind in ("action", "srv", "msg"):
         for path in sorted((share / kind).glob(f"*.{kind}")):
