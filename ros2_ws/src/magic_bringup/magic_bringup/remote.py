@@ -17,6 +17,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 
 from magic_bringup.permission import Exchange, check_single
 from magic_core import presence
@@ -25,6 +26,8 @@ from magic_core.errors import Code, MagicError
 
 #: Between looks at whether a server is still there, s; discovery gives no event for it in rclpy.
 PRESENCE_PERIOD = 0.1
+#: After this many seconds without an answer it is asked for again.
+AGAIN = 10.0
 #: The service of an action that takes its goals, after the action's name.
 SEND_GOAL = "/_action/send_goal"
 
@@ -192,6 +195,23 @@ class _Remote:
                 if not self.ready() or time.monotonic() > deadline:
                     raise
 
+    def _answer(self, ask: Callable[[], Future], token: Token, deadline: float, alive: Callable[[], None]) -> Future | None:
+        """The first future of ``ask()`` that is done, ``None`` where none is at the deadline.
+
+        It is asked again after AGAIN seconds, and after twice as long each time: of what is under way nothing is kept for a participant
+        that was out of sight, as one is on a machine that has held it up for longer than its lease, and an answer may be lost.
+        """
+        asked: list[Future] = []
+        patience = AGAIN
+        while True:
+            asked.append(ask())
+            asked[-1].add_done_callback(token.poke)
+            if token.wait(lambda: any(f.done() for f in asked), min(deadline, time.monotonic() + patience), alive=alive):
+                return next(f for f in asked if f.done())
+            if time.monotonic() >= deadline:
+                return None
+            patience *= 2
+
     def _late(self, what: str, timeout: float) -> MagicError:
         return MagicError(Code.SERVER_TIMEOUT, f"the {self.server} ({self.name}) {what} within {timeout:.1f} s")
 
@@ -215,16 +235,22 @@ class RemoteService(_Remote):
         self.require(min(presence, timeout), token)
         exchange = Exchange(self.name, self.servers())
         still_there = self.watch(exchange)
-        future = self._client.call_async(request)
-        future.add_done_callback(token.poke)
+        asked: list[Future] = []
+
+        def ask() -> Future:
+            asked.append(self._client.call_async(request))
+            return asked[-1]
+
         try:
-            if not token.wait(future.done, deadline, alive=still_there):
+            future = self._answer(ask, token, deadline, still_there)
+            if future is None:
                 raise self._late("did not answer", timeout)
             exchange.end(self.servers())
             return future.result()
         finally:
-            if not future.done():
-                self._client.remove_pending_request(future)
+            for future in asked:
+                if not future.done():
+                    self._client.remove_pending_request(future)
 
 
 class RemoteAction(_Remote):
@@ -285,9 +311,8 @@ class RemoteAction(_Remote):
             handle = accepting.result()
             if not handle.accepted:
                 raise MagicError(self._refusal, f"the {self.server} ({self.name}) refused the goal")
-            future = handle.get_result_async()
-            future.add_done_callback(token.poke)
-            if not token.wait(future.done, deadline, alive=still_there):
+            future = self._answer(handle.get_result_async, token, deadline, still_there)
+            if future is None:
                 raise self._late("did not finish", timeout)
             server = exchange.end(self.servers())
         except MagicError as error:

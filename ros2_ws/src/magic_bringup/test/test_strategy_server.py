@@ -11,11 +11,13 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.action.client import ClientGoalHandle
 from rclpy.node import Node
+from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from magic_bringup import fakes, pipeline
+from magic_bringup import fakes, pipeline, remote
 from magic_bringup.domain import free_domain
 from magic_bringup.graph import Process, executable
 from magic_bringup.permission import ARM_UNKNOWN
@@ -651,6 +653,31 @@ def test_the_matchers_reason_is_passed_on(bench):
     bench.fakes.on_match = lambda request: MatchContact.Response(code=int(Code.NO_MATCH), message="nothing like a hook")
     result, _ = bench.run()
     assert (result.code, result.message) == (Code.NO_MATCH, "nothing like a hook")
+
+
+def test_an_answer_that_is_lost_is_asked_for_again(bench, monkeypatch):
+    """Of the matcher, and of an action's result: the first answer to each never comes."""
+    monkeypatch.setattr(remote, "AGAIN", 0.2)
+    client, handles = bench.server.matcher._client, ClientGoalHandle.get_result_async
+    call, lost = client.call_async, []
+
+    def deaf(what, ask):
+        if what in lost:
+            return ask()
+        lost.append(what)
+        ask()
+        return Future()
+
+    monkeypatch.setattr(client, "call_async", lambda request: deaf("match", lambda: call(request)))
+    # The bench asks for its own goal's result in the same way: the server's is the one of the planner.
+    planning = bench.server.planner._client
+    monkeypatch.setattr(
+        ClientGoalHandle,
+        "get_result_async",
+        lambda handle: deaf("plan", lambda: handles(handle)) if handle._action_client is planning else handles(handle),
+    )
+    result, _ = bench.run()
+    assert result.verified and lost == ["match", "plan"], result.message
 
 
 def test_objects_may_reach_the_matcher_later(bench):
