@@ -17,14 +17,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier.posing import PoseEntry, posed, read_poses
+from magic_verifier.toolsets import Evaluation, evaluation_of
 
-TASKS = ("scooping", "hanging", "hooking", "hammering", "pushing")
-#: Those of Table V: no strategy folders, and the floating gripper alone.
-STRIKING = ("hammering", "pushing")
-#: Table V's: hammers (T, L and X of two blocks, and real-looking ones) and things that are none, with seeds from ``STRIKING_SEEDS`` up.
-HAMMERS = ("mallet:{},form=T", "mallet:{},form=L", "mallet:{},form=X", "hammer:{}")
-NON_HAMMERS = ("caliper:{}", "scissors:{}", "j_hook:{}", "plain_bar:{}", "plain_bottle:{}", "plain_driver:{}")
-STRIKING_SEEDS, STRIKING_COUNT = 70_000, 24
 VARIANTS = ("fg", "arm", "fg_no_selection")
 #: ``magic``: all of it.  The paper's baselines: ``pca`` and ``fpfh_icp`` align the whole shape, ``dino`` takes the best places of the
 #: features, neither refined nor ranked by curvature, ``curvature`` draws contact points at random and ranks them by curvature alone.  The
@@ -33,32 +27,13 @@ VARIANTS = ("fg", "arm", "fg_no_selection")
 #: only judges it).  All but the last get as many candidates as ``magic``, and the same planner and verifier.
 BASELINES = ("pca", "fpfh_icp", "curvature")
 METHODS = ("magic", *BASELINES, "dino", "no_feature_pca_patch", "no_two_step_curvature", "no_simulation_verification")
-#: Tools of each task: family and seeds; none of them is the tool of a demonstration.
-SPOONS = (("spoon", 11), ("spoon", 12), ("ladle", 11), ("ladle", 12), ("measuring_cup", 11), ("measuring_cup", 12))
-HOOKS = (("scissors", 1), ("hanger", 1), ("caliper", 1), ("watch", 1))
-BALLS = (0.015, 0.035, 0.045)
-CYLINDERS = (0.015, 0.020, 0.025, 0.030, 0.035)
-MUGS = 134
-#: Families that the unseen tools of a task are drawn from, in turn, with seeds from ``UNSEEN_SEEDS`` up: nothing was ever set by them.
-UNSEEN = {
-    "scooping": ("spoon", "ladle", "measuring_cup"),
-    "hanging": ("mug", "mug", "mug", "hanger", "s_hook", "j_hook"),
-    "hooking": ("caliper", "hanger", "scissors", "hammer", "j_hook", "s_hook"),
-}
-UNSEEN_SEEDS = 50_000
-#: Unseen cases that there are for a seed of the evaluation.
-UNSEEN_COUNT = 60
 #: What the tools of an evaluation are taken for: ``meshes`` as they are, ``images`` as two cameras see them (:mod:`magic_verifier.captured`).
 SOURCES = ("meshes", "images")
-SETS = ("own", "unseen", "alphabet", "controls", "hammers", "non_hammers")
-#: Negative controls, which no method can do: plain things of the matcher's own control families (bars, discs, blades, bottles, ...), and
-#: near misses.  Of these the first :data:`CONTROL_COUNT` that geometry forbids (:mod:`magic_verifier.feasibility`) are taken.
+#: Sets that there are for every strategy, beside those of its own: the capital letters, and negative controls, which no method can do:
+#: the strategy's near misses, and plain things of the matcher's own control families (bars, discs, blades, bottles, ...).  Of these the first
+#: :data:`CONTROL_COUNT` that geometry forbids (:mod:`magic_verifier.feasibility`) are taken.
+SETS = ("alphabet", "controls")
 PLAIN = ("bar", "disc", "rod", "torch", "blade", "polygon", "bottle", "driver", "segment", "bent")
-NEAR_MISSES = {
-    "scooping": ("hammer:60001", "letter:60002,glyph=I", "mallet:60003"),
-    "hanging": ("mug:60001,handle_reach=0.0105,profile=straight", "letter:60002,glyph=I", "mug:60003,handle_reach=0.011,profile=straight"),
-    "hooking": ("letter:60001,glyph=I", "cylinder:0.04", "sphere:0.04"),
-}
 CONTROL_COUNT, CONTROL_SEEDS = 12, 60_000
 #: How thick (m) a control that has only an outline is.
 PLAIN_THICKNESS = 0.016
@@ -81,7 +56,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Options:
-    """What an evaluation is run with; see the command's ``--help``."""
+    """What an evaluation is run with; see the command's ``--help``.  ``task``: the name of a strategy's folder, or its path."""
 
     task: str
     variant: str = "fg"
@@ -106,17 +81,9 @@ def tool_names(options: Options) -> list[str]:
     """Names of the tools: ``family:seed``, or the paths of meshes under ``objects``; parameters of a family may follow its seed."""
     if options.objects:
         return _meshes(options.objects, options.scale)
-    if options.task in STRIKING:
-        families = {"hammers": HAMMERS, "non_hammers": NON_HAMMERS}.get(options.set, (*HAMMERS, *NON_HAMMERS))
-        first = STRIKING_SEEDS + STRIKING_COUNT * options.seed
-        return [families[k % len(families)].format(first + k) for k in range(STRIKING_COUNT)]
     if options.set == "alphabet":
         return [f"capital:{letter}" for letter in ascii_uppercase]
-    if options.task == "scooping":
-        return [f"{family}:{seed}" for family, seed in SPOONS]
-    if options.task == "hanging":
-        return [f"mug:{index}" for index in range(MUGS)]
-    return [f"{family}:{seed}" for family, seed in HOOKS]
+    return evaluated(options).sets[options.set].names(options.seed)
 
 
 def target_names(options: Options) -> list[str]:
@@ -125,11 +92,7 @@ def target_names(options: Options) -> list[str]:
         return [f"{options.targets}:{seed}" for seed in TARGET_SETS[options.targets]]
     if options.targets:
         return _meshes(options.targets)
-    if options.task == "scooping":
-        return [f"sphere:{radius:g}" for radius in BALLS]
-    if options.task == "hooking":
-        return [f"cylinder:{radius:g}" for radius in CYLINDERS]
-    return ["demonstration"]
+    return list(evaluated(options).targets)
 
 
 def _meshes(folder: str, scale: float = 1.0) -> list[str]:
@@ -148,28 +111,37 @@ def _meshes(folder: str, scale: float = 1.0) -> list[str]:
 
 
 def check(options: Options) -> None:
-    """Raise ``BAD_REQUEST`` for a set that a task does not have, or a variant that it is not made for."""
-    striking = options.task in STRIKING
-    sets = ("own", "hammers", "non_hammers") if striking else ("own", "unseen", "controls", "alphabet")
-    if options.set not in sets:
-        raise MagicError(Code.BAD_REQUEST, f"set of {options.task}", options.set, sets)
-    if striking and (options.variant != "fg" or options.source != "meshes"):
-        raise MagicError(
-            Code.BAD_REQUEST,
-            f"{options.task} as",
-            f"{options.variant} from {options.source}",
-            "fg from meshes: an arm holds no tool loosely",
+    """Raise ``BAD_REQUEST`` for a set that a strategy does not have, or a variant that it is not made for."""
+    strategy = strategy_for(options)
+    sets = (*evaluated(options).sets, *SETS)
+    if options.set not in sets and not (options.set == "own" and options.objects):
+        raise MagicError(Code.BAD_REQUEST, f"set of {strategy.name}", options.set, [*sets, "own with --objects DIR"])
+    flies = any(waypoint.phase == "strike" for waypoint in strategy.waypoints)
+    beside = "row" in strategy.goal.resolved().trial
+    if (flies or beside) and (options.variant != "fg" or options.source != "meshes"):
+        why = (
+            "an arm holds no tool loosely"
+            if flies
+            else "what the goal's trial puts beside the target is in no picture and no planner's scene"
         )
+        raise MagicError(Code.BAD_REQUEST, f"{strategy.name} as", f"{options.variant} from {options.source}", f"fg from meshes: {why}")
+
+
+@lru_cache(maxsize=8)
+def _found(options: Options) -> tuple[Strategy, Evaluation]:
+    strategy = strategies.find(options.task, options.strategies or None)
+    evaluation = evaluation_of(strategy)
+    return (shown_by(strategy, options.demonstration) if options.demonstration else strategy), evaluation
 
 
 def strategy_for(options: Options) -> Strategy:
-    """The strategy of a task, as it is demonstrated; raises ``UNKNOWN_STRATEGY``."""
-    if options.task in STRIKING:
-        from magic_verifier.striking import STRATEGIES
+    """The strategy that is evaluated, as it is demonstrated; raises ``UNKNOWN_STRATEGY``."""
+    return _found(options)[0]
 
-        return STRATEGIES[options.task]()
-    strategy = strategies.find(options.task, options.strategies or None)
-    return shown_by(strategy, options.demonstration) if options.demonstration else strategy
+
+def evaluated(options: Options) -> Evaluation:
+    """The sets that its folder names; raises ``UNKNOWN_STRATEGY``, ``BAD_STRATEGY``."""
+    return _found(options)[1]
 
 
 def all_cases(options: Options) -> list[Case]:
@@ -181,31 +153,22 @@ def all_cases(options: Options) -> list[Case]:
 
 
 def _cases(options: Options) -> list[Case]:
-    if options.set == "unseen" and not options.objects:
-        return unseen_cases(options)
     if options.set == "controls" and not options.objects:
         return control_cases(options)
     tools, targets = tool_names(options), target_names(options)
-    if options.task == "hooking" and options.variant == "fg":
+    chosen = evaluated(options)
+    if not options.objects and options.set in chosen.sets and chosen.sets[options.set].paired:
+        count = len(chosen.sets[options.set].each)
+        # So that a family meets all targets, however many there are of both.
+        pairs = [(tool, targets[(number + number // count) % len(targets)]) for number, tool in enumerate(tools)]
+        return [Case(f"{tool} {short_name(target)}", (tool,), target) for tool, target in pairs]
+    if chosen.choose and options.variant == "fg":
         return [Case(short_name(target), tuple(tools), target) for target in targets]
     return [
         Case(short_name(tool) + ("" if len(targets) == 1 else " " + short_name(target)), (tool,), target)
         for tool in tools
         for target in targets
     ]
-
-
-def unseen_cases(options: Options) -> list[Case]:
-    """One tool and one target each: the families in turn, every object met once, the targets in turn."""
-    families, targets = UNSEEN[options.task], target_names(options)
-    first = UNSEEN_SEEDS + UNSEEN_COUNT * options.seed
-    cases = []
-    for number in range(UNSEEN_COUNT):
-        tool = f"{families[number % len(families)]}:{first + number}"
-        # So that a family meets all targets, however many there are of both.
-        target = targets[(number + number // len(families)) % len(targets)]
-        cases.append(Case(f"{tool} {short_name(target)}", (tool,), target))
-    return cases
 
 
 def control_cases(options: Options) -> list[Case]:
@@ -217,7 +180,7 @@ def control_cases(options: Options) -> list[Case]:
     first = CONTROL_SEEDS + 1000 * options.seed
     plain = [f"plain_{family}:{first + number}" for number in range(10) for family in PLAIN]
     cases: list[Case] = []
-    for number, tool in enumerate((*NEAR_MISSES[options.task], *plain)):
+    for number, tool in enumerate((*evaluated(options).near_misses, *plain)):
         target = targets[number % len(targets)]
         case = Case(f"{tool} {short_name(target)}", (tool,), target)
         if impossible(strategy, case):
@@ -279,9 +242,15 @@ def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneOb
     environment = strategy.environment
     pose = demonstrated_pose(environment)
     meeting = None
-    if name == "demonstration":
-        entry = environment["target"]
+    entry = environment.get("target")
+    if name == "demonstration" and entry:
         target = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("target", pose)
+    elif name == "demonstration":  # one that cameras saw
+        from magic_core.views import find_view
+        from magic_verifier.decomposition import convex_pieces
+
+        pieces = convex_pieces(strategy.target_mesh)
+        target = SceneObject("target", strategy.target_mesh, pieces, pose, find_view(strategy.target_mesh, pieces, "top"), source="known")
     else:
         mesh, pieces, shape, meeting = load_object(name, None)
         pose = transforms.make(translation=[*pose[:2, 3], -float(mesh.bounds[0][2])])

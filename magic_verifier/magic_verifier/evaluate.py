@@ -1,4 +1,4 @@
-"""Success rates of a task over a set of objects: ``ros2 run magic_verifier evaluate``.
+"""Success rates of a strategy over a set of objects: ``ros2 run magic_verifier evaluate``.
 
 A case is one tool with one target (with tool selection: one target with all tools).
 It is matched, planned and verified as the graph does it, candidate by candidate,
@@ -34,15 +34,14 @@ from magic_verifier import captured, placing, reliability
 from magic_verifier.cases import (
     BASELINES,
     METHODS,
-    SETS,
     SOURCES,
     TARGET_SETS,
-    TASKS,
     VARIANTS,
     Case,
     Meeting,
     Options,
     all_cases,
+    evaluated,
     met_at,
     scene_for,
     short_name,
@@ -53,10 +52,6 @@ from magic_verifier.feasibility import impossible
 from magic_verifier.floating import settled
 from magic_verifier.verification import Limits, Verdict, wilson
 
-#: Sideways velocity noise of hooking in target radii, the released code's own test.
-HOOK_NOISE = 1.0
-#: The released code asks a shorter pull of a watch (m).
-WATCH_DISTANCE = 0.1
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 #: How long planning for the arm may take (s of this process's processor: what else the machine does changes no result) and how many
 #: grasps are tried.
@@ -66,19 +61,18 @@ ARM_ATTEMPTS = 3
 
 @lru_cache(maxsize=16)
 def _strategy(options: Options, tool: str = "") -> Strategy:
-    """The strategy with the goal test that it is evaluated by (see :func:`tested`)."""
+    """The strategy with the goal that it is evaluated by (see :func:`tested`)."""
     strategy = strategy_for(options)
-    values = {**strategy.goal.values, **tested(options, tool)}
-    return replace(strategy, goal=replace(strategy.goal, values=values))
+    return replace(strategy, goal=strategy.goal.with_values(tested(options, tool)))
 
 
 def tested(options: Options, tool: str = "") -> dict[str, float]:
-    """The goal values that the evaluation sets itself for a tool: the released code's test of hooking."""
-    if options.task != "hooking":
-        return {}
-    values = {"noise": HOOK_NOISE if options.noise is None else options.noise}
-    if "watch" in tool.rpartition("//")[2]:
-        values["distance"] = WATCH_DISTANCE
+    """The goal's numbers that the evaluation sets for a tool: those of the strategy's folder, and the noise that was asked for."""
+    values = evaluated(options).numbers(tool.rpartition("//")[2])
+    if options.noise is not None:
+        if "noise" not in strategy_for(options).goal.values:
+            raise MagicError(Code.BAD_REQUEST, f"noise for {options.task}", options.noise, "none: its goal names no such number")
+        values["noise"] = options.noise
     return values
 
 
@@ -429,13 +423,9 @@ def truths(done: list[dict[str, Any]]) -> dict[str, Any]:
 def _test_sentence(options: Options) -> str:
     """What success means here, in words and numbers."""
     strategy = _strategy(options)
-    own = ""
-    if options.task == "hooking":
-        noise = strategy.goal.values["noise"]
-        kicks = f"the target's sideways velocity is kicked by N(0, {noise:g} r) at every step" if noise > 0 else "no velocity noise"
-        same = " as in the released code" if noise == HOOK_NOISE else ", unlike the released code's test"
-        own = f"; {kicks}{same}; a watch must pull {WATCH_DISTANCE:g} m"
-    return "; ".join(line.strip() for line in words(strategy.goal)) + own
+    text = "; ".join(line.strip() for line in words(strategy.goal))
+    others = [f"{part}: {key} {value:g}" for part, values in evaluated(options).values_of.items() for key, value in values.items()]
+    return text + (f"; of others {', '.join(others)}" if others else "")
 
 
 def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path: Path, columns: int = 4, most: int = 80) -> None:
@@ -575,8 +565,10 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of ``ros2 run magic_verifier evaluate``."""
-    parser = argparse.ArgumentParser(prog="evaluate", description="Success rate of a task over a set of objects, in simulation.")
-    parser.add_argument("--task", required=True, choices=TASKS)
+    parser = argparse.ArgumentParser(prog="evaluate", description="Success rate of a strategy over a set of objects, in simulation.")
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("--strategy", dest="task", metavar="DIR", help="folder of the strategy: its path, or its name among --strategies")
+    which.add_argument("--task", metavar="NAME", help="the same, by its name")
     parser.add_argument("--variant", default="fg", choices=VARIANTS)
     parser.add_argument("--method", default="magic", choices=METHODS, help="magic, or an ablation of it")
     parser.add_argument(
@@ -584,8 +576,8 @@ def main(args: list[str] | None = None) -> None:
         help="what tools and target are taken for: their meshes, or what perception makes of two cameras' images (then judged on the meshes)",
     )  # fmt: skip
     parser.add_argument(
-        "--set", default="own", choices=SETS,
-        help="the paper's set sizes, unseen tools drawn by the seed, the capital letters, or negative controls, which nothing can do",
+        "--set", default="own",
+        help="one of the sets that the strategy's folder names (own, unseen, ...), alphabet: the capital letters, or controls: what nothing can do",
     )  # fmt: skip
     parser.add_argument("--turns", type=int, default=1, help="turns, drawn by the seed, in which each tool lies")
     parser.add_argument("--features", default="embedded", help="feature backend: auto, embedded, dinov2, dift or sd_dino")
@@ -605,9 +597,7 @@ def main(args: list[str] | None = None) -> None:
         help="lower end of the success rate's interval that a motion must have",
     )
     parser.add_argument("--top-k", type=int, default=3, help="candidates tried for a case")
-    parser.add_argument(
-        "--noise", type=float, default=None, help=f"hooking: sideways velocity noise in target radii; {HOOK_NOISE:g} by default"
-    )
+    parser.add_argument("--noise", type=float, default=None, help="the goal's number of that name: sideways velocity noise in target radii")
     parser.add_argument("--strategies", default="", help="folder of strategies; by default the installed ones")
     parser.add_argument("--demonstration", default="", help="tool that the strategy is demonstrated with instead, such as mug:1000")
     parser.add_argument("--no-films", action="store_true", help="draw no contact sheets")

@@ -252,6 +252,8 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
         return f"a ball of {1000 * radius:.0f} mm lies {1000 * depth:.1f} mm deep in it (needed: {1000 * SCOOP_RISE:.1f} mm)"
     if not hangs_on and not any(node.kind == "encloses" for node in asked):
         return ""
+    if strategy.target_outline != "outer":  # what is met in its hole encloses the tool, whatever its shape
+        return ""
     if shape is not None:
         view = shape.view(strategy.view)
     else:

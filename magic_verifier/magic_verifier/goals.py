@@ -150,7 +150,7 @@ class _Tree:
 
     def _told(self, node: Node) -> Told:
         found = told(self.asked, node)
-        if node.ever is not None or node.always is not None:
+        if found.truth is not None and (node.ever is not None or node.always is not None):
             found = self.windowed(node, found)
         metrics = list(found.metrics.items())
         if node.metric and metrics:
@@ -257,7 +257,7 @@ class Watch(_Tree):
         self._answers: dict[int, _Answer] = {}
         self._late: list[tuple[float, Node]] = []
         self._windows: list[tuple[Node, float, float, float]] = []  # leaf, whole window from and to, what counts of it from
-        self._looks: dict[int, list[tuple[float, bool]]] = {}
+        self._looks: dict[int, list[tuple[float, bool | None]]] = {}
         self._pressed = [node for node in self.tree.nodes() if node.kind == "pressed"]
         self._plan()
         self._kick, self._slowing = self._disturbances()
@@ -366,7 +366,7 @@ class Watch(_Tree):
         if self.run.world.steps % OBSERVE_EVERY == 0:
             for node, first, last, _ in self._windows:
                 if first <= time <= last:
-                    self._looks[id(node)].append((time, bool(told(self.asked, node).truth)))
+                    self._looks[id(node)].append((time, told(self.asked, node).truth))
         if self._late:
             for late in [late for late in self._late if time >= late[0]]:
                 if late in self._late:
@@ -379,12 +379,14 @@ class Watch(_Tree):
         _, first, _, counts = next(w for w in self._windows if w[0] is node)
         looks = self._looks[id(node)]
         yes = [truth for time, truth in looks if time > counts or (counts == first and time == first)]
-        truth = any(yes) if node.ever is not None else bool(yes) and all(yes)
+        if None in yes and (True not in yes if node.ever is not None else False not in yes):
+            return Told(None, wanted=leaf_words(node))
+        truth = True in yes if node.ever is not None else bool(yes) and False not in yes
         if node.kind != "touching":
             return Told(truth, now.measured, now.wanted, now.metrics)
         metrics = {"touching": float(truth)} if not (node.ever or node.always)["phase"] else {}  # type: ignore[index]
         if not metrics:
-            metrics = {"contact_share": float(np.mean([t for _, t in looks])) if looks else 0.0}
+            metrics = {"contact_share": float(np.mean([bool(t) for _, t in looks])) if looks else 0.0}
         said = f"{node.args['what']} {'touching' if truth else 'not touching'} the {node.args['whom']}"
         return Told(truth, said, now.wanted, metrics)
 
@@ -400,6 +402,9 @@ class Watch(_Tree):
         metrics = {name: value for name, value in self.metrics.items() if np.isfinite(value)}
         if found.truth:
             return Judgement(Code.OK, f"the goal is reached: {found.state}", metrics)
+        if found.truth is None:
+            told_of = "contacts of a tool that is led, or of a fixed target, with what is fixed"
+            return Judgement(Code.NOT_VERIFIABLE, f"the goal cannot be told in simulation, {told_of}: {'; '.join(found.untold)}", metrics)
         return Judgement(found.code, found.failure(), metrics)
 
     def before(self, node: Node) -> str:

@@ -31,6 +31,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.scene import VIEW_KINDS, Scene, SceneObject
+from magic_core.shapes.fixtures import pose_data
 from magic_core.strategy import MODES, Goal, Physics, Strategy, load, save
 from magic_verifier import track
 from magic_verifier.track import Track
@@ -298,7 +299,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--bag", type=Path, required=True, help="the recorded demonstration")
     parser.add_argument("--out", type=Path, required=True, help="the new strategy's folder; its name is the strategy's")
     parser.add_argument(
-        "--goal", required=True, help="name of a goal tree that ships (hook, hang, scoop, ...), or 'none': simulation cannot judge it"
+        "--goal",
+        default="",
+        help=f"name of a goal that ships ({', '.join(goals.names())}), or 'none': simulation cannot judge it; by default found from what the "
+        "demonstration changes",
     )
     parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal")
     parser.add_argument("--tool-pose", help=f"topic with the poses of a frame fixed to the tool (default {TOOL_POSE})")
@@ -324,8 +328,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
 
 
-def goal_of(given: argparse.Namespace) -> Goal:
-    """The goal, its name and numbers checked; raises UNKNOWN_GOAL or BAD_REQUEST."""
+def goal_of(given: argparse.Namespace) -> tuple[Goal | None, dict[str, float]]:
+    """The goal, ``None`` where it is to be found, and its numbers, as far as they can be checked; raises UNKNOWN_GOAL or BAD_REQUEST."""
     values: dict[str, float] = {}
     for text in given.value:
         name, equals, number = text.partition("=")
@@ -339,18 +343,20 @@ def goal_of(given: argparse.Namespace) -> Goal:
     if given.goal == "none":
         if values:
             raise MagicError(Code.BAD_REQUEST, "--value", ", ".join(values), "no numbers with --goal none: nothing is judged")
-        return Goal("none")
-    if given.goal not in goals.names():
+        return Goal("none"), {}
+    if given.goal and given.goal not in goals.names():
         raise MagicError(Code.UNKNOWN_GOAL, "goal test", given.goal, [*goals.names(), "none"])
-    known = goals.named(given.goal).values
+    known = goals.named(given.goal).values if given.goal else {}
     for name, value in values.items():
-        if name not in known:
+        if known and name not in known:
             raise MagicError(Code.BAD_REQUEST, f"--value of goal {given.goal}", name, list(known))
         if not 0 <= value <= LARGEST or (value == 0 and name in ABOVE_ZERO):
             least = "above 0" if name in ABOVE_ZERO else "from 0"
             raise MagicError(Code.BAD_REQUEST, f"--value {name}", value, f"{least} to {LARGEST:g}")
     # The kicks of the released code's test belong to its set of standing cylinders, not to whatever was demonstrated.
-    return goals.shipped(given.goal, **({"noise": 0.0, **values} if "noise" in known else values))
+    if not given.goal:
+        return None, values
+    return goals.shipped(given.goal, **({"noise": 0.0, **values} if "noise" in known else values)), values
 
 
 def check_given(given: argparse.Namespace) -> None:
@@ -397,7 +403,7 @@ def _learn(given: argparse.Namespace) -> int:
     from magic_perception.pipeline import perceive
     from magic_verifier.learning import Demonstration, Task, advice, learn
 
-    goal = goal_of(given)
+    goal, values = goal_of(given)
     check_given(given)
     topic = TOOL_POSE if given.tool_pose is None else "/" + given.tool_pose.lstrip("/")
     bag = Recorded(given.bag)
@@ -453,9 +459,19 @@ def _learn(given: argparse.Namespace) -> int:
         given.mode,
         given.description,
         simulatable=given.goal != "none",
+        values=values if goal is None else {},
     )
     learned = learn(demonstration, task)
-    strategy = replace(learned.strategy, environment={})
+    # Where its target stood, so that it can be evaluated; fixtures are known to the scene, not to the strategy.
+    alone = not demonstration.obstacles
+    strategy = replace(learned.strategy, environment={"world_from_target": pose_data(target.world_from_object)} if alone else {})
+    if learned.changed is not None:
+        print("what the demonstration changes, replayed:")
+        print("\n".join(f"  {line}" for line in learned.changed.words()))
+        for line in learned.rejected:
+            print(f"not the goal: {line}")
+        print(f"the goal, as it was found{' (the tool is let go)' if strategy.releases else ''}:")
+        print("\n".join(f"  {line}" for line in goals.words(strategy.goal)))
     print(
         f"mode {strategy.mode}, matched in the view {strategy.view}, the target met at the {strategy.target_outline} outline; contacts of the "
         f"replay: {1000 * learned.tool_gap:.1f} mm from the strategy's on the tool, {1000 * learned.target_gap:.1f} mm on the target"

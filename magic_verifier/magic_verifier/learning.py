@@ -7,6 +7,8 @@
    inside the silhouette, as a bowl's is.  The target may be met outside, in a hole or notch, or inside its cut.
 3. The part of the motion that belongs to the contact is kept, with its phases: approach, contact, goal, retreat.  Where the tool keeps
    its attitude it becomes waypoints (mode ``plan``), else it is carried over as it is (``retarget``).
+4. Where no goal is given it is found (:mod:`magic_verifier.inference`): of those that what was changed suggests, the strictest that the
+   strategy passes with the demonstrated objects and with what is drawn around them.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ from magic_matcher import curvature
 from magic_matcher.matching import target_contact, target_view, to_contact
 from magic_verifier import goals
 from magic_verifier.demonstration import Replay, replay
+from magic_verifier.floating import TARGET
+from magic_verifier.inference import Changed, changed, proposals
 from magic_verifier.posing import box_axes
 from magic_verifier.verification import Verdict, verify
 
@@ -66,16 +70,18 @@ RESTS = (0.002, np.deg2rad(2.0))
 
 @dataclass(frozen=True)
 class Task:
-    """What the demonstration was for.  view and mode: one of VIEW_KINDS and MODES, or empty to have them found."""
+    """What the demonstration was for.  goal: ``None`` to have it, and whether the tool is let go, found; view and mode: one of
+    VIEW_KINDS and MODES, or empty to have them found; values: numbers of the goal that are given all the same."""
 
     name: str
-    goal: Goal
+    goal: Goal | None
     physics: Physics = field(default_factory=Physics)
     releases: bool = False
     view: str = ""
     mode: str = ""
     description: str = ""
     simulatable: bool = True
+    values: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -95,13 +101,16 @@ class Demonstration:
 class Learned:
     """The strategy; how far (m) the contacts that the replay read are from the outlines' points that stand for them; the verdict on
     the strategy carried out with the demonstrated objects by a floating gripper, and that on the demonstrated motion itself (None where
-    simulation cannot judge the goal)."""
+    simulation cannot judge the goal); where the goal was found, what the demonstration changed, and why other goals that this suggested
+    are not it."""
 
     strategy: Strategy
     tool_gap: float
     target_gap: float
     verdict: Verdict | None
     shown: Verdict | None
+    changed: Changed | None = None
+    rejected: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -128,12 +137,43 @@ def learn(demonstration: Demonstration, task: Task) -> Learned:
     for what, value, allowed in (("view", task.view, VIEW_KINDS), ("mode", task.mode, MODES)):
         if value and value not in allowed:
             raise MagicError(Code.BAD_REQUEST, what, value, allowed)
+    seen = None
+    if task.goal is None:
+        seen = _changed(demonstration, task)
+        task = replace(task, releases=task.releases or TARGET in seen.tool_on)
     motion = _motion(demonstration, task)
     found, made, parted = _contacts(demonstration, task, motion)
     draft, tool_gap, target_gap = _drafted(demonstration, task, motion, found, made)
     strategy = _with_motion(draft, motion, made, parted, task.mode)
-    shown = _shown(demonstration, strategy, motion, made, parted)
-    return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown)
+    if seen is None:
+        shown = _shown(demonstration, strategy, motion, made, parted)
+        return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown)
+    found_goals = []
+    for goal in proposals(seen):
+        strategy = replace(strategy, goal=_with_numbers(goal, task.values))
+        verdict, shown = _tried(demonstration, strategy), _shown(demonstration, strategy, motion, made, parted)
+        found_goals.append(Learned(strategy, tool_gap, target_gap, verdict, shown, seen))
+        if verdict is None or verdict.success:
+            break
+    # Where none passes surely, the one that the demonstrated motion itself passes.
+    chosen = next((one for one in found_goals[::-1] if one.verdict is None or one.verdict.success), None)
+    chosen = chosen or next((one for one in found_goals if one.shown is not None and one.shown.success), found_goals[0])
+    others = [one for one in found_goals if one is not chosen and one.verdict is not None]
+    return replace(chosen, rejected=tuple(f"{one.strategy.goal.title}: {one.verdict.message}" for one in others if one.verdict))
+
+
+def _with_numbers(goal: Goal, values: dict[str, float]) -> Goal:
+    unknown = sorted(set(values) - set(goal.values))
+    if unknown:
+        raise MagicError(Code.BAD_REQUEST, f"numbers of the goal that was found ({goal.title})", ", ".join(unknown), list(goal.values))
+    return goal.with_values(values)
+
+
+def _changed(demonstration: Demonstration, task: Task) -> Changed:
+    """What the whole motion changes, the tool held to its end and let go there."""
+    motion = _motion(demonstration, replace(task, releases=False))
+    scene = demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table
+    return changed(*scene, task.physics, motion.times, demonstration.target.world_from_object @ motion.target_from_tool)
 
 
 def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float) -> tuple[Strategy, float, float]:
@@ -169,7 +209,7 @@ def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: R
                 tool_mesh=tool.mesh,
                 target_mesh=target.mesh,
                 waypoints=(),
-                goal=task.goal,
+                goal=task.goal or Goal("none"),
                 physics=task.physics,
                 releases=task.releases,
                 simulatable=task.simulatable,
@@ -439,10 +479,12 @@ def _remedy(shown: Verdict, strategy: Strategy) -> str:
     """What to record or to give otherwise where a demonstration does not pass its goal."""
     metrics, physics = shown.metrics, strategy.physics
     if shown.code == Code.GOAL_NOT_REACHED:
-        for name, value in (("pulled_distance", "distance"), ("target_height", "height"), ("tool_height", "height")):
-            reached = np.floor(100 * 0.95 * metrics.get(name, 0.0)) / 100
-            if reached > 0:
-                return f"--value {value}={reached:g} (m) asks for no more than was shown; or record it farther than the goal asks for"
+        for node in strategy.goal.written.nodes():
+            number, measured = {"moved": ("by", "moved"), "above": ("height", "height")}.get(node.kind, ("", ""))
+            name = node.args.get(number)
+            reached = np.floor(100 * 0.95 * metrics.get(node.metric or f"{node.args.get('what')}_{measured}", 0.0)) / 100
+            if isinstance(name, str) and reached > 0:
+                return f"--value {name}={reached:g} (m) asks for no more than was shown; or record it farther than the goal asks for"
         return "the goal, or record a demonstration that reaches it"
     if shown.code == Code.DRIFT and metrics.get("holds") == 0.0:
         return "--value hold=0 where the target is only to be pushed; or a tool whose contact encloses the target"

@@ -20,10 +20,13 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier.enclosing import STRONGER, enclosure
 from magic_verifier.floating import TARGET, TOOL, phase_start
+from magic_verifier.simulation import DYNAMIC
 
 Array = NDArray[np.float64]
 #: Contact is sought this far apart (m): bodies that press on each other rest at up to the solver's slop.
 TOUCH = 0.001
+#: The robot's parts, as contacts name them.
+ARM, FINGERS = "arm", "fingers"
 #: What a trial has put beside the target begins with this.
 BESIDE = "swept_"
 
@@ -70,6 +73,9 @@ class State(Protocol):
     def touched_by(self, name: str) -> tuple[str, ...]:
         """What it touches."""
 
+    def feels(self, name: str, other: str = "") -> bool:
+        """Whether it can tell if a body touches another one, or any."""
+
 
 class Simulated:
     """The state of a run: a floating or an arm run (``world``, ``time``, ``phases``, ``setup``, ``released``, ``hand_has_left``)."""
@@ -109,6 +115,17 @@ class Simulated:
 
     def touched_by(self, name: str) -> tuple[str, ...]:
         return self.run.world.touched_by(name, TOUCH)
+
+    def feels(self, name: str, other: str = "") -> bool:
+        """PhysX tells of no contact between two bodies that it does not move: a tool that is led, a fixed target, table and fixtures."""
+        return self._moved_by_physics(name) or (bool(other) and self._moved_by_physics(other))
+
+    def _moved_by_physics(self, name: str) -> bool:
+        if name == TOOL:
+            return not self.run.world.component(TOOL).kinematic
+        if name in self._row:
+            return self.run.setup.target_kind == DYNAMIC
+        return name in (ARM, FINGERS)
 
 
 class Sighted:
@@ -157,6 +174,9 @@ class Sighted:
 
     def touched_by(self, name: str) -> tuple[str, ...]:
         raise NotImplementedError("cameras tell of no contacts")
+
+    def feels(self, name: str, other: str = "") -> bool:
+        return False
 
 
 class Asked:
@@ -452,8 +472,12 @@ DECIDED: dict[str, Callable[..., Told]] = {
 
 def told(asked: Asked, node: Node) -> Told:
     """What a predicate says now; of what the state cannot tell, nothing."""
-    missing = set(PREDICATES[node.kind].needs) - asked.state.has
-    unseen = isinstance(asked.state, Sighted) and not all(asked.state.sees(n) for n in asked.bodies(node.args.get("what", TARGET)))
-    if missing or unseen:
+    state, bodies = asked.state, asked.bodies(node.args.get("what", TARGET))
+    missing = set(PREDICATES[node.kind].needs) - state.has
+    unseen = isinstance(state, Sighted) and not all(state.sees(name) for name in bodies)
+    # Whether it touches one other body may be told by that one; whether it touches nothing else, by itself alone.
+    other = node.args.get("whom", "") if node.kind == "touching" else ""
+    unfelt = "whom" in node.args and not missing and not all(state.feels(name, other) for name in bodies)
+    if missing or unseen or unfelt:
         return Told(None, wanted=leaf_words(node))
     return DECIDED[node.kind](asked, **node.args)

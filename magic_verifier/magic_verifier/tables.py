@@ -79,7 +79,7 @@ ROWS_5 = {"KETO": "", "MAGIC": "magic", "MAGIC, highest score without simulation
 COLUMNS_5 = (
     ("Hammering, hammers to hammers", "hammering", "hammers"),
     ("Hammering, hammers to non-hammers", "hammering", "non_hammers"),
-    ("Pushing", "pushing", "own"),
+    ("Pushing", "sweeping", "own"),
 )
 PAPER_5 = {"KETO": (66.4, 46.3, 71.7), "MAGIC": (75.6, 53.7, 76.3)}
 TASKS_FG = (("Scooping", "scooping"), ("Hanging", "hanging"), ("Hooking", "hooking"))

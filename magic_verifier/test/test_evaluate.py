@@ -1,6 +1,7 @@
 """The evaluation counts right, goes on where it stopped, and takes any mesh."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ pytest.importorskip("magic_matcher.matching")
 pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import shapes, transforms
+from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
@@ -22,6 +24,7 @@ from magic_verifier import posing
 from magic_verifier.cases import METHODS, Options, all_cases, load_object, tool_names, tool_object
 from magic_verifier.decomposition import convex_pieces
 from magic_verifier.simulation import sphere_of, usable_pieces
+from magic_verifier.toolsets import evaluation_of
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
 OPTIONS = Options("scooping", strategies=STRATEGIES)
@@ -121,8 +124,48 @@ def test_hooking_is_judged_by_the_released_codes_own_test():
     assert ev._strategy(hooking, "caliper:1").goal.values["distance"] == 0.2
     assert ev._strategy(hooking, "watch:1").goal.values["distance"] == 0.1
     assert ev._strategy(replace(hooking, noise=0.0)).goal.values["noise"] == 0.0
-    assert "as in the released code" in ev.summarise(hooking, [])["test"]
-    assert "unlike" in ev.summarise(replace(hooking, noise=0.5), [])["test"]
+    said = ev.summarise(hooking, [])["test"]
+    assert "kicked sideways, by 1 of its radius" in said and "watch: distance 0.1" in said
+    assert "by 0.5 of its radius" in ev.summarise(replace(hooking, noise=0.5), [])["test"]
+    with pytest.raises(MagicError, match="its goal names no such number"):
+        ev.tested(replace(OPTIONS, noise=1.0))
+
+
+def test_a_strategy_is_evaluated_by_its_folder_and_no_task_is_known_by_name(tmp_path):
+    folder = tmp_path / "mine"
+    shutil.copytree(Path(STRATEGIES) / "pushing", folder)
+    options = Options(str(folder), set="own")
+    cases = all_cases(options)
+    assert len(cases) == 36 and {case.target for case in cases} == {"block:1", "block:2", "block:3"}
+    answer = ev.run_case(options, cases[0])
+    assert answer["success"], answer
+    source = "".join(Path(ev.__file__).with_name(name).read_text() for name in ("evaluate.py", "cases.py", "toolsets.py"))
+    assert not [name for name in ("hooking", "hanging", "scooping", "pushing", "hammering") if f'"{name}"' in source]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"targets": "cylinder:1"}, "environment.evaluation.targets: 'cylinder:1' (allowed: a list of names)"),
+        ({"tools": []}, "environment.evaluation: key: 'tools'"),
+        ({"sets": {"own": {"tool": []}}}, "environment.evaluation.sets.own: key: 'tool'"),
+        ({"sets": {"own": {"each": ["mug:{}"]}}}, "tools, or each with a count above 0"),
+        ({"values": {"distanse": 1.0}}, "goal.values of the tree: 'distanse'"),
+    ],
+)
+def test_what_is_wrong_with_the_sets_of_a_strategy_is_said(change, says):
+    strategy = strategies.find("pushing", STRATEGIES)
+    wrong = replace(strategy, environment={**strategy.environment, "evaluation": change})
+    with pytest.raises(MagicError) as error:
+        evaluation_of(wrong)
+    assert error.value.code == Code.BAD_STRATEGY and says in error.value.message
+
+
+def test_sets_that_a_strategy_does_not_have_are_refused():
+    with pytest.raises(MagicError, match="set of scooping: 'hammers'"):
+        all_cases(replace(OPTIONS, set="hammers"))
+    names = tool_names(replace(OPTIONS, task="hooking", set="unseen", seed=2))
+    assert len(names) == 60 and names[0] == "caliper:50120"
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "no_feature_pca_patch"])

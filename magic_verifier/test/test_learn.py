@@ -1,5 +1,7 @@
 """``learn``: from a recorded bag to a strategy folder that serves other tools."""
 
+import contextlib
+import io
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -34,13 +36,18 @@ from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import verify
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
+STRATEGIES = BAGS.with_name("ros2_ws") / "src/magic_bringup/strategies"
 
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
-    """The folder of a strategy learned from the recorded images and poses of the hooking demonstration, by the README's own command."""
+    """The folder of a strategy learned from the recorded images and poses of the hooking demonstration, by the README's own command: the
+    goal is found, and told in words."""
     folder = tmp_path_factory.mktemp("strategies") / "new" / "pulling"
-    assert main(["--bag", str(BAGS / "hooking_demonstration"), "--goal", "hook", "--out", str(folder)]) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["--bag", str(BAGS / "hooking_demonstration"), "--out", str(folder)]) == 0
+    for words in ("the target moved 2", "the tool encloses it", "the goal, as it was found:", "200 mm along the pull or more"):
+        assert words in said.getvalue()
     assert [p.name for p in folder.parent.iterdir()] == ["pulling"], "nothing is left beside it"
     return folder
 
@@ -48,7 +55,7 @@ def learned(tmp_path_factory):
 def test_a_recorded_demonstration_becomes_a_strategy(learned):
     strategy = load(learned)
     assert (strategy.name, strategy.view, strategy.mode) == ("pulling", "top", "plan")
-    assert strategy.goal.values["noise"] == 0.0 and strategy.goal.test.has("encloses") and strategy.target_outline == "outer"
+    assert strategy.goal == load(STRATEGIES / "hooking").goal and strategy.target_outline == "outer"
     np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.05)
     assert strategy.tool_contact.concave
     assert (learned / "contacts.png").stat().st_size > 1000

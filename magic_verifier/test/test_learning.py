@@ -11,8 +11,10 @@ pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.goal import shipped as shipped_goal
 from magic_core.strategy import Goal, Physics, load, save
 from magic_matcher.matching import target_contact, target_view
+from magic_verifier.inference import Changed, asked, proposals
 from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, learn, levelled, smoothed
 
 
@@ -209,3 +211,61 @@ def test_corners_keep_a_path_and_leave_out_what_is_straight():
 )
 def test_what_is_nearly_upright_or_level_is(given, expected):
     np.testing.assert_allclose(levelled(transforms.unit(given)), expected, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ what it was for
+
+
+@pytest.mark.parametrize("name", ["hooking", "hanging", "scooping"])
+def test_the_goals_of_the_shipped_strategies_are_found_from_their_demonstrations(name):
+    seen, task, annotated = shipped(name)
+    learned = learn(seen, replace(task, goal=None, releases=False))
+    assert learned.strategy.goal == annotated.goal
+    assert learned.strategy.releases == annotated.releases
+    assert learned.verdict.success and learned.rejected == (), learned.verdict.message
+
+
+def test_a_push_is_told_from_a_hook_by_what_is_drawn_around_it():
+    learned = learn(pushing(), Task("pushing", None, Physics(0.3), values={"distance": 0.15}))
+    assert learned.strategy.goal.title == "moved, drift, upright, at_rest" and learned.verdict.success, learned.verdict.message
+    assert learned.strategy.goal.values["distance"] == 0.15
+    (why,) = learned.rejected
+    assert why.startswith("moved, touching, drift, at_rest, encloses: passes in the scene as given")
+    with pytest.raises(MagicError, match="'height'"):
+        learn(pushing(), Task("pushing", None, Physics(0.3), values={"height": 0.15}))
+
+
+def changed_by(**facts):
+    nothing = Changed(np.zeros(3), 0.025, 0.0, 0.0, ("table",), True, False, (), float("nan"))
+    return replace(nothing, **facts)
+
+
+@pytest.mark.parametrize(
+    ("facts", "titles"),
+    [
+        ({"tool_on": ("target",), "tool_height": 0.31, "on": ()}, ["hang"]),
+        ({"tool_on": ("shelf",), "tool_height": 0.31}, ["reach"]),
+        ({"on": ("tool",), "height": 0.29, "rise": 0.25}, ["scoop"]),
+        ({"on": ("table", "tool"), "height": 0.29, "rise": 0.25}, ["reach"]),
+        ({"tilt": 90.0, "rise": -0.03, "way": np.array([0.1, 0, 0])}, ["tip"]),
+        ({"tilt": 90.0, "rise": 0.0, "way": np.array([0.1, 0, 0])}, ["push"]),
+        ({"way": np.array([0.28, 0, 0]), "encloses": True}, ["hook", "push"]),
+        ({"way": np.array([0.28, 0, 0])}, ["push"]),
+        ({}, ["reach"]),
+    ],
+)
+def test_what_was_changed_suggests_goals_the_strictest_first(facts, titles):
+    seen = changed_by(**facts)
+    assert [goal.title for goal in proposals(seen)] == [shipped_goal(name).title for name in titles]
+    assert seen.words()
+
+
+def test_what_changes_nothing_suggests_nothing():
+    with pytest.raises(MagicError, match="the target stayed where it was; in the end it touches table") as error:
+        proposals(changed_by(touched=False))
+    assert error.value.code == Code.GOAL_NOT_REACHED
+
+
+@pytest.mark.parametrize(("shown", "wanted"), [(0.28, 0.2), (0.31, 0.2), (0.4, 0.3), (0.1, 0.08), (0.024, 0.019), (0.0625, 0.05)])
+def test_less_is_asked_for_than_was_shown(shown, wanted):
+    assert asked(shown) == pytest.approx(wanted)

@@ -194,6 +194,27 @@ def test_a_resistance_is_pressed_against():
 
 
 @pytest.mark.parametrize(
+    ("test", "tellable"),
+    [
+        ({"touching": {"what": "target", "whom": "tool"}, "ever": {"phase": "goal"}}, True),
+        ({"touching": {"what": "tool", "whom": "target"}, "ever": {"phase": "goal"}}, True),
+        ({"touching": {"what": "target", "whom": "table"}}, True),
+        ({"touching": {"what": "tool", "whom": "table"}}, False),
+        ({"touching": {"what": "tool", "whom": "table"}, "ever": {"phase": "goal"}}, False),
+        ({"not": {"touching": {"what": "tool", "whom": "table"}, "ever": {"phase": "goal"}}}, False),
+        ({"not": {"touching": {"what": "tool", "whom": "table"}}}, False),
+        ({"touching_only": {"what": "tool", "whom": "target"}}, False),
+        ({"any": [{"touching_only": {"what": "tool", "whom": "target"}}, moved(0.1)]}, True),
+    ],
+)
+def test_contacts_that_physics_does_not_tell_of_pass_nothing(test, tellable):
+    verdict = pulled({"all": [test]})
+    assert (verdict.code == Code.OK) == tellable, verdict.message
+    if not tellable:
+        assert verdict.code == Code.NOT_VERIFIABLE and "the tool touches" in verdict.message
+
+
+@pytest.mark.parametrize(
     ("test", "says"),
     [
         (

@@ -294,6 +294,13 @@ class Goal:
             return self.test
         return ", ".join(dict.fromkeys(node.kind for node in self.test.nodes() if node.kind in PREDICATES))
 
+    @property
+    def written(self) -> Node:
+        """The tree as it is written, with the names of its numbers; raises ``UNKNOWN_GOAL``."""
+        written = named(self.test).test if isinstance(self.test, str) else self.test
+        assert isinstance(written, Node)
+        return written
+
     def with_values(self, values: dict[str, float]) -> Goal:
         """The goal with other numbers; names that it does not know are refused by :meth:`resolved`."""
         return replace(self, values={**self.values, **values})
@@ -396,8 +403,9 @@ def _plain(value: Any, path: str) -> float:
     return float(value)
 
 
-def _node(data: Any, path: str, values: dict[str, float], tries: bool) -> Node:
-    """``tries``: whether what is below may try things out, which changes the scene for all that comes after."""
+def _node(data: Any, path: str, values: dict[str, float], tries: bool, plain: bool = True, timed: str = "") -> Node:
+    """``tries``: whether what is below may try things out, which changes the scene for all that comes after; ``plain``: whether there is
+    no 'any' or 'not' above; ``timed``: what the node is in is asked after, ``""`` where that is not said."""
     kinds = (*GROUPS, *PREDICATES)
     if not isinstance(data, dict):
         raise _bad(path, data, f"one of {', '.join(kinds)}, with what belongs to it")
@@ -415,9 +423,13 @@ def _node(data: Any, path: str, values: dict[str, float], tries: bool) -> Node:
             after.kind,
             "phase or settle here: a try changes the scene, and stands in the outermost 'all' or one of its own",
         )
+    if after is not None and after.kind not in TRIES and timed:
+        raise _bad(f"{path}.after", after.kind, f"nothing here: it is asked when what it is in is, after {timed}")
     windows = {key: _window(data[key], f"{path}.{key}", values) for key in ("ever", "always") if data.get(key) is not None}
     if windows and (kind in GROUPS or len(windows) > 1):
         raise _bad(path, " and ".join(windows), "one of ever and always, beside a predicate")
+    if windows and (timed in TRIES or (after is not None and after.kind in TRIES)):
+        raise _bad(path, f"{next(iter(windows))} after a try", "what is looked at over a time of the motion")
     if windows and set(PREDICATES[kind].needs) & {"trying", "history", "hand"}:
         raise _bad(path, f"{next(iter(windows))} beside {kind}", "a predicate that is looked at again and again")
     code = data.get("code", "")
@@ -429,17 +441,22 @@ def _node(data: Any, path: str, values: dict[str, float], tries: bool) -> Node:
         if not isinstance(value, wanted):
             raise _bad(f"{path}.{key}", value, "a text" if wanted is str else "true or false")
         beside[key] = value
+    if beside["as_given"] and not plain:
+        raise _bad(f"{path}.as_given", True, "only in 'all': what is not asked must not decide an 'any' or a 'not'")
+    if beside["throughout"] and timed != "push":
+        raise _bad(f"{path}.throughout", True, "only in a group after a push")
     if ":" in beside["say"]:
         raise _bad(f"{path}.say", beside["say"], "a sentence without a colon: what was measured follows it")
     if kind not in GROUPS:
         return Node(kind, _args(PREDICATES[kind].args, data[kind], inner, values), **beside)
     # Below a phase's end, a 'not' or an 'any' nothing is tried: it would be asked at another time, or of a changed scene.
     tries = tries and kind == "all" and (after is None or after.kind in ("settle", *TRIES))
+    plain, timed = plain and kind == "all", timed if after is None else after.kind
     if kind == "not":
-        return Node(kind, of=(_node(data[kind], inner, values, False),), **beside)
+        return Node(kind, of=(_node(data[kind], inner, values, False, False, timed),), **beside)
     if not isinstance(data[kind], list) or not data[kind]:
         raise _bad(inner, data[kind], "a list of nodes")
-    return Node(kind, of=tuple(_node(item, f"{inner}[{k}]", values, tries) for k, item in enumerate(data[kind])), **beside)
+    return Node(kind, of=tuple(_node(item, f"{inner}[{k}]", values, tries, plain, timed) for k, item in enumerate(data[kind])), **beside)
 
 
 def _moment(data: Any, path: str, values: dict[str, float]) -> Moment:

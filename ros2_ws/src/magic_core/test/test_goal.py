@@ -86,16 +86,25 @@ ITEM = ("test", "all")
         ((*ITEM, 0, "after"), {"lunch": 1}, r"goal.test.all\[0\].after: key: 'lunch' \(allowed: phase, settle, rest, push\)"),
         ((*ITEM, 1, "any", 1, "not", "touching", "whom"), "", r"goal.test.all\[1\].any\[1\].not.touching.whom: '' \(allowed: the id of a body\)"),
         ((*ITEM, 1, "any", 0, "after"), {"push": {"what": "target", "speed": 1}}, r"goal.test.all\[1\].any\[0\].after: 'push' \(allowed: phase or settle here"),
+        ((*ITEM, 1, "as_given"), True, None),
+        ((*ITEM, 1, "any", 0, "as_given"), True, r"goal.test.all\[1\].any\[0\].as_given: True \(allowed: only in 'all'"),
+        ((*ITEM, 0, "throughout"), True, r"goal.test.all\[0\].throughout: True \(allowed: only in a group after a push"),
+        ((*ITEM, 2, "ever"), {"seconds": 0.1}, r"goal.test.all\[2\]: 'ever after a try'"),
+        ((*ITEM, 1), {"after": {"settle": 1.0}, "all": [{"above": {"what": "tool", "height": 0}, "after": {"phase": "goal"}}]},
+         r"goal.test.all\[1\].all\[0\].after: 'phase' \(allowed: nothing here: it is asked when what it is in is, after settle"),
         ((*ITEM, 2, "code"), "SAD", r"goal.test.all\[2\].code: 'SAD' \(allowed: PRE_CONTACT_COLLISION"),
         ((*ITEM, 2, "say"), "it rolls: on", r"goal.test.all\[2\].say: .* without a colon"),
         ((*ITEM, 2, "as_given"), "yes", r"goal.test.all\[2\].as_given: 'yes' \(allowed: true or false\)"),
-        ((*ITEM, 2, "ever"), {"last": 0.2}, r"goal.test.all\[2\].ever: .* a phase, with the last share of it, or seconds above 0"),
+        ((*ITEM, 0, "ever"), {"last": 0.2}, r"goal.test.all\[0\].ever: .* a phase, with the last share of it, or seconds above 0"),
         ((*ITEM, 2, "colour"), "red", r"goal.test.all\[2\]: key: 'colour'"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_with_its_path(path, value, says):
     data = copy.deepcopy(TREE)
     change(path, value)(data)
+    if says is None:
+        from_data(data)
+        return
     with pytest.raises(MagicError, match=says) as error:
         from_data(data)
     assert error.value.code == Code.BAD_STRATEGY
@@ -125,7 +134,7 @@ ARGS = {
 def leaves(draw):
     kind = draw(st.sampled_from(sorted(PREDICATES)))
     args = {name: draw(ARGS[arg.kind] if arg.kind != "word" else st.sampled_from(arg.words)) for name, arg in PREDICATES[kind].args.items()}
-    beside = draw(st.sampled_from([{}, {"code": "DRIFT"}, {"say": "no"}, {"after": {"phase": "goal"}}, {"as_given": True}]))
+    beside = draw(st.sampled_from([{}, {"code": "DRIFT"}, {"say": "no"}, {"after": {"phase": "goal"}}, {"metric": "it"}]))
     return {kind: args, **beside}
 
 

@@ -74,6 +74,37 @@ def peg(seed: int = 0, **given: float | str) -> Shape:
     return assemble("peg", seed, d.parameters, [part], {"head": region}, "top", DOWN, (1.0, 0.0, 0.0))
 
 
+def block(seed: int = 0, **given: float | str) -> Shape:
+    """A box that stands as it is, ``length`` along x; region ``side``: its face at -x, seen from above."""
+    d = Draw("block", seed, given)
+    length, breadth, height = d.real("length", 0.05, 0.08), d.real("breadth", 0.06, 0.10), d.real("height", 0.04, 0.06)
+    color = d.wood()
+    d.done()
+    part = plate(shapely.box(-length / 2, -breadth / 2, length / 2, breadth / 2), -height / 2, height / 2, color)
+    region = Region(
+        np.column_stack([np.full(9, -length / 2), np.linspace(0.4, -0.4, 9) * breadth, np.zeros(9)]),
+        np.tile([-1.0, 0.0, 0.0], (9, 1)),
+        float("inf"),
+        False,
+    )
+    return assemble("block", seed, d.parameters, [part], {"side": region}, "top", DOWN, (1.0, 0.0, 0.0))
+
+
+def ring(seed: int = 0, **given: float | str) -> Shape:
+    """A flat ring that lies on the table; region ``inside``: its inner outline."""
+    d = Draw("ring", seed, given)
+    radius, width, height = d.real("radius", 0.04, 0.055), d.real("width", 0.010, 0.016), d.real("height", 0.016, 0.026)
+    color = d.metal()
+    d.done()
+    area = (
+        shapely.Point(0, 0).buffer(radius + width / 2, quad_segs=8).difference(shapely.Point(0, 0).buffer(radius - width / 2, quad_segs=8))
+    )
+    angles = np.linspace(0.0, 2 * np.pi, 41)
+    inwards = -np.column_stack([np.cos(angles), np.sin(angles), np.zeros(41)])
+    inside = Region(-(radius - width / 2) * inwards, inwards, radius - width / 2, True)
+    return assemble("ring", seed, d.parameters, [plate(area, -height / 2, height / 2, color)], {"inside": inside}, "top", DOWN, UP)
+
+
 def slot(seed: int = 0, **given: float | str) -> Shape:
     """A block on the table with a straight channel along x, closed above: a peg slides in it from -x; no regions."""
     d = Draw("slot", seed, given)
@@ -119,4 +150,4 @@ def capital(seed: int = 0, **given: float | str) -> Shape:
     return assemble("capital", seed, d.parameters, [plate(area, -thickness / 2, thickness / 2, color)], {}, "top", DOWN, UP)
 
 
-STRUCK = {f.__name__: recipe(f) for f in (mallet, peg, slot, capital)}
+STRUCK = {f.__name__: recipe(f) for f in (mallet, peg, block, ring, slot, capital)}

@@ -1,9 +1,9 @@
-"""The two tasks of the paper's Table V (KETO's): hammering and pushing, as strategies made from one demonstration each.
+"""The two tasks of the paper's Table V (KETO's): hammering, and pushing, here sweeping.
 
 hammering  a peg lies in a slot and resists.  A mallet is swung in the plane of the table, about a hand and forearm's length behind its
            handle, and strikes the peg's end with its face.  The hand holds it loosely: from just before the blow the tool flies by
            its own momentum (phase ``strike``), so that what drives the peg is the tool's mass, where it is and how it hits.  Goal ``drive``.
-pushing    several cylinders stand side by side; the mallet's handle, lying, sweeps them away from the robot.  Goal ``sweep``.
+sweeping   several cylinders stand side by side; the mallet's handle, lying, sweeps them away from the robot.  Goal ``sweep``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_bringup.make_strategies import demonstrated, target_contact, target_view, through
+from magic_bringup.demonstrating import demonstrated, made_of, target_contact, target_view, through
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact
 from magic_core.goal import shipped
@@ -21,6 +21,13 @@ from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import pose_data
 from magic_core.strategy import Physics, Strategy, Waypoint
 
+#: Table V's: hammers (T, L and X of two blocks, and real-looking ones) and things that are none.
+HAMMERS = ["mallet:{},form=T", "mallet:{},form=L", "mallet:{},form=X", "hammer:{}"]
+NON_HAMMERS = ["caliper:{}", "scissors:{}", "j_hook:{}", "plain_bar:{}", "plain_bottle:{}", "plain_driver:{}"]
+SETS = {
+    name: {"each": each, "first": 70_000, "count": 24}
+    for name, each in (("own", [*HAMMERS, *NON_HAMMERS]), ("hammers", HAMMERS), ("non_hammers", NON_HAMMERS))
+}
 DOWN = np.array([0.0, 0.0, -1.0])
 #: The demonstrated tool: a T of a wooden handle and a block.
 REFERENCE = {
@@ -94,9 +101,10 @@ def hammering() -> Strategy:
         goal=shipped("drive"),
         physics=Physics(friction=0.3, tool_density=1500.0, target_density=2700.0),
         environment={
+            "evaluation": {"sets": SETS},
             "world_from_target": pose_data(transforms.make(translation=[0.62, 0.0, PEG["side"] / 2])),
-            "tool": {"family": "mallet", "seed": 0, "parameters": dict(tool.parameters)},
-            "target": {"family": "peg", "seed": 0, "parameters": dict(peg.parameters)},
+            "tool": made_of(tool),
+            "target": made_of(peg),
             "fixtures": [
                 {"id": "slot", "family": "slot", "seed": 0, "parameters": dict(slot.parameters), "from_target": pose_data(from_target)}
             ],
@@ -104,7 +112,7 @@ def hammering() -> Strategy:
     )
 
 
-def pushing() -> Strategy:
+def sweeping() -> Strategy:
     """A row of cylinders is swept away from the robot by a mallet's handle."""
     tool, view, contact = _tool("side")
     target = make("cylinder", 0, radius=SWEPT, half_height=SWEPT)
@@ -121,7 +129,7 @@ def pushing() -> Strategy:
     )
     times, contacts = through(waypoints)
     return Strategy(
-        name="pushing",
+        name="sweeping",
         description="The handle of a mallet that lies on the table sweeps a row of cylinders away.",
         view="top",
         mode="plan",
@@ -130,11 +138,12 @@ def pushing() -> Strategy:
         goal=shipped("sweep"),
         physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
         environment={
+            "evaluation": {"sets": SETS},
             "world_from_target": pose_data(transforms.make(translation=[0.45, 0.0, SWEPT])),
-            "tool": {"family": "mallet", "seed": 0, "parameters": dict(tool.parameters)},
-            "target": {"family": "cylinder", "seed": 0, "parameters": {"radius": SWEPT, "half_height": SWEPT}},
+            "tool": made_of(tool),
+            "target": made_of(target),
         },
     )
 
 
-STRATEGIES = {"hammering": hammering, "pushing": pushing}
+STRATEGIES = {"hammering": hammering, "sweeping": sweeping}
