@@ -264,6 +264,12 @@ def _parameters(config: RobotConfig, source: Path) -> str:
       opening: {config.opening}
       home: [{home}]
       acceleration: [{ACCELERATION}]   # rad/s^2, one a joint or one for all: set the maker's limits
+/**/perception:
+  ros__parameters: {{frame: {Description(config).base_frame}}}
+/**/verifier:
+  ros__parameters: {{arm: {{stiffness: [3000.0], damping: [100.0]}}}}   # of the simulated drives, Nm/rad and Nms/rad
+/**/strategy_server:
+  ros__parameters: {{opening: {config.opening}}}   # trajectory_action, gripper_action: the controllers' names
 """
 
 

@@ -138,6 +138,10 @@ def test_pairs_that_cannot_meet_are_found_and_those_that_can_are_kept(tmp_path):
         }
     )
     description = Description(config)
+    assert (
+        yaml.safe_load((tmp_path / "out" / "robot.param.yaml").read_text())["/**/perception"]["ros__parameters"]["frame"]
+        == description.base_frame
+    )
     unchecked = {frozenset(p) for group in (pairs.adjacent, pairs.always, pairs.home, pairs.never) for p in group}
     assert description.disabled == unchecked and config.opening == pytest.approx(0.1) and config.closing_axis == "x"
 
