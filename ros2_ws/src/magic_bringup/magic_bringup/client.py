@@ -38,6 +38,7 @@ from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
 from magic_core.motion import VARIANTS
+from magic_core.remedies import REMEDIES
 from magic_interfaces.action import RunStrategy
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
@@ -196,6 +197,8 @@ def run_lines(result: Any) -> list[str]:
     """What a RunStrategy result says, in lines for a terminal."""
     verdict = "VERIFIED" if result.verified else "not verified"
     lines = [f"{verdict}: {Code(result.code).name} ({result.code}): {split_metrics(result.message)[0]}"]
+    if result.code != Code.OK:
+        lines.append(f"  to do      {REMEDIES[Code(result.code)].mend}")
     if result.rollouts:
         lines.append(
             f"  success    {100 * result.success_rate:.0f} % of {result.rollouts} rollouts, "
@@ -246,6 +249,8 @@ def match(client: Client, given: argparse.Namespace) -> int:
     request = MatchContact.Request(strategy=_strategy_name(given.strategy), tool_ids=given.tool, target_id=given.target, top_k=given.top_k)
     response = client.service(MatchContact, "match_contact", "matcher").call(request, given.timeout, client.token)
     say(f"{Code(response.code).name} ({response.code}): {response.message}")
+    if response.code != Code.OK:
+        say(f"  to do      {REMEDIES[Code(response.code)].mend}")
     if response.candidates:
         say(f"  target {response.target_id}, {response.features} features, {response.seconds:.2f} s")
         say(f"  {'tool':<12} {'score':>6} {'global':>7} {'local':>6} {'turn':>6}  {'x, y, z in mm':<22} radius")
@@ -368,6 +373,8 @@ def main(arguments: list[str] | None = None) -> int:
                 signal.signal(signal.SIGINT, before)
     except MagicError as error:
         say(f"{error.code.name} ({int(error.code)}): {error.message}")
+        if error.code != Code.CANCELED:
+            say(f"  to do      {REMEDIES[error.code].mend}")
         return 130 if error.code == Code.CANCELED else 1
 
 

@@ -13,6 +13,7 @@ from magic_bringup import client, fakes, report
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
 from magic_core.errors import Code
+from magic_core.remedies import REMEDIES
 from magic_interfaces.action import VerifyMotion
 from magic_interfaces.msg import SceneObjectArray
 
@@ -97,6 +98,7 @@ def test_a_refused_run_says_why(magic, bench):
         bench.fakes.on_verify = before
     assert status == 1
     assert any(line.startswith("not verified: ") for line in lines)
+    assert f"  to do      {REMEDIES[Code.NO_CANDIDATE_SUCCEEDED].mend}" in lines
     assert any(line.startswith("  dropped    0: object_") and "DRIFT: it slid off" in line for line in lines)
     assert magic("run", "none_such")[0] == 1
 
