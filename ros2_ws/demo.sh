@@ -13,9 +13,10 @@
 # --topics    /RECORDED:=/PLAYED ...: topics of the bag under other names
 # --perception-params, --matcher-params, --planner-params, --verifier-params, --server-params, --robot-params FILE: parameters files
 # --launch    FILE [NAME:=VALUE ...]: a launch file of your own starts the nodes instead
+# --live      no bag: one trial in the simulated laboratory (--scenario, --object, --seed, --out), carried out by its arm and judged on the truth
 # --tool, --target, --seed, --timeout: see python -m magic_bringup.demo --help
 #
-# Sets up the workspace first where that is needed. Exit status 0: a verified trajectory was published.
+# Sets up the workspace first where that is needed. Exit status 0: a verified trajectory was published; with --live: the goal was truly reached.
 set -uo pipefail
 WS=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P)
 case " $* " in
@@ -32,7 +33,9 @@ fi
 . "$WS/env.sh" || exit 1
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-2}
 # A signal to this script ends the graph as well: it is passed on, and waited for.
-python -m magic_bringup.demo --root "$WS/.." "$@" &
+module=magic_bringup.demo
+case " $* " in *" --live "*) module=magic_lab.live ;; esac
+python -m $module --root "$WS/.." "$@" &
 child=$!
 trap 'kill -INT $child 2>/dev/null' INT TERM HUP
 status=0

@@ -57,6 +57,15 @@ def check_trajectory(result, bench: Bench, variant: str) -> None:
     assert [type(step) for step in done[:4]] == [execution.Fingers, execution.Move] * 2
 
 
+def test_nobody_is_told_what_only_a_simulated_laboratory_knows(replay):
+    """Of ``lab/truth`` and anything else below ``lab/``; a simulated laboratory's truth is for judging alone."""
+    node = replay[1].watcher.node
+    told = {info.node_name for info in node.get_subscriptions_info_by_topic("/joint_states")}
+    assert {"perception", "strategy_server"} <= told, "subscriptions of the graph are seen"
+    listened = {topic: node.get_subscriptions_info_by_topic(topic) for topic, _ in node.get_topic_names_and_types()}
+    assert not [topic for topic, infos in listened.items() if topic.startswith("/lab/") and infos]
+
+
 def test_floating_gripper(replay):
     strategy, bench = replay
     bench.watcher.trajectory = None

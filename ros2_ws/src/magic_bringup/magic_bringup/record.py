@@ -21,12 +21,13 @@ CAMERA_TOPIC = re.compile(r"^(?P<camera>.*/)(?P<image>color|aligned_depth_to_col
 
 @dataclass
 class Record:
-    """What a run left behind, in messages."""
+    """What a run left behind, in messages; video: an animated WebP of what the cameras saw, where somebody has made one."""
 
     summary: dict[str, Any]
     images: dict[str, Any] = field(default_factory=dict)  # topic -> sensor_msgs/Image
     scene: Any = None  # magic_interfaces/SceneObjectArray
     result: Any = None  # magic_interfaces/action/RunStrategy.Result
+    video: bytes = b""
 
 
 def empty_summary(strategy: str, variant: str, features: str = "", command: str = "") -> dict[str, Any]:

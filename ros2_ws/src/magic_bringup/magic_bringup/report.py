@@ -51,6 +51,8 @@ TERMS = (
     ("peak memory", "The most memory that a process held at any time."),
 )  # fmt: skip
 
+#: What the video of a run is called beside its messages.
+VIDEO = "video.webp"
 
 # ---------------------------------------------------------------- pictures
 
@@ -440,7 +442,11 @@ def render(record: Record, logs: Path | None = None) -> str:
         strategy = strategies.find(summary["strategy"])
     except (MagicError, LookupError) as error:
         problems.append(f"strategy: {error}")
-    sections = [_guard("What the cameras saw", lambda: _cameras(record, scene))]
+    sections = []
+    if record.video:
+        uri = f"data:image/webp;base64,{base64.b64encode(record.video).decode()}"
+        sections.append(Section("The run", ((Picture(uri, "what the cameras saw, twice as fast as it was"),),), "row"))
+    sections.append(_guard("What the cameras saw", lambda: _cameras(record, scene)))
     if strategy is not None:
         sections.append(_guard("From the demonstrated contact to the new one", lambda: _contacts(strategy, scene, result)))
     if scene is not None:
@@ -498,6 +504,8 @@ def save(record: Record, folder: Path) -> None:
     for name, message in (("objects", record.scene), ("result", record.result)):
         if message is not None:
             (messages / f"{name}.cdr").write_bytes(serialize_message(message))
+    if record.video:
+        (messages / VIDEO).write_bytes(record.video)
 
 
 def load(folder: Path) -> Record:
@@ -520,6 +528,8 @@ def load(folder: Path) -> Record:
         path = messages / f"{name}.cdr"
         if path.is_file():
             setattr(record, "scene" if name == "objects" else name, deserialize_message(path.read_bytes(), kind))
+    if (messages / VIDEO).is_file():
+        record.video = (messages / VIDEO).read_bytes()
     return record
 
 

@@ -50,18 +50,28 @@ SERVER = {"execute": True, "effort": 60.0}
 
 @dataclass
 class Seen:
-    """What came in since the reset, stamps by the laboratory's clock: the truth, pictures by camera (JPEG), what was said when."""
+    """What came in since the reset, stamps by the laboratory's clock: the truth, pictures by camera (JPEG), what was said when, and of each
+    camera the first picture as it came."""
 
     truth: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
     pictures: list[tuple[float, str, bytes]] = field(default_factory=list)
     lines: list[tuple[float, str]] = field(default_factory=list)
+    first: dict[str, Any] = field(default_factory=dict)
 
 
 class Session:
     """A graph with a laboratory, and what a trial asks of them; use it in a ``with`` statement."""
 
-    def __init__(self, logs: Path, say: Any = print, server: dict[str, Any] | None = None, lab: dict[str, Any] | None = None) -> None:
-        """server, lab: more parameters of the strategy server and of the laboratory."""
+    def __init__(
+        self,
+        logs: Path,
+        say: Any = lambda _line: None,
+        server: dict[str, Any] | None = None,
+        lab: dict[str, Any] | None = None,
+        pictures: bool = False,
+    ) -> None:
+        """say: what is told as it happens; server, lab: more parameters of the strategy server and of the laboratory; pictures: results
+        are to have the film strip and the heat map."""
         from rclpy.parameter_client import AsyncParameterClient
         from sensor_msgs.msg import Image as ImageMsg
         from std_srvs.srv import Trigger
@@ -70,10 +80,11 @@ class Session:
         from magic_core import qos
         from magic_lab.node import TCP
 
-        self.say = say
+        self.say, self.pictures = say, pictures
         self._hand = TCP
         self.seen = Seen()
         self.now = 0.0
+        self.result: Any = None  # of the last run
         env = isolated()
         self._before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
         os.environ.update({k: env[k] for k in self._before})
@@ -111,6 +122,7 @@ class Session:
     # ------------------------------------------------------------ what comes in
 
     def _on_line(self, line: str) -> None:
+        self.say(line)
         self.seen.lines.append((self.now, line))
 
     def _on_truth(self, message: Any) -> None:
@@ -122,6 +134,7 @@ class Session:
     def _on_picture(self, camera: str, message: Any) -> None:
         from magic_core import conversions as cv
 
+        self.seen.first.setdefault(f"/camera/{camera}/color/image_raw", message)
         small = cv2.resize(cv.color_from_msg(message)[:, :, ::-1], SIZE, interpolation=cv2.INTER_AREA)
         self.seen.pictures.append((cv.time_from_msg(message.header.stamp), camera, cv2.imencode(".jpg", small)[1].tobytes()))
 
@@ -199,10 +212,12 @@ class Session:
 
     def run(self, timeout: float = RUN, **goal: Any) -> Any:
         """The result of one run of a strategy with the arm."""
-        options = Options(**{"variant": "arm", "bag": Path(), "out": Path(), "timeout": timeout, "pictures": False, **goal})
+        self.result = None
+        options = Options(**{"variant": "arm", "bag": Path(), "out": Path(), "timeout": timeout, "pictures": self.pictures, **goal})
         pending = self.watcher.send(options)
         self.wait(lambda: pending.result is not None, timeout + 60.0, "the strategy server answers")
-        return pending.result
+        self.result = pending.result
+        return self.result
 
     def trial(self, scenario: Scenario, case: str, seed: int, out: Path, events: str = "") -> dict[str, Any]:
         """One trial, as plain data; its picture and video lie in ``out``."""
@@ -259,6 +274,8 @@ def _stage(record: dict[str, Any]) -> str:
         return ""
     if record["code"] == Code.OK:
         return "truth"
+    if record["verified"]:
+        return "execute"
     return STAGES.get(record["code"] // 100, "execute")
 
 
@@ -346,7 +363,7 @@ def do(
     missing = [key for key in wanted if key not in records]
     end = time.monotonic() + 60 * minutes if minutes > 0 else np.inf
     if missing:
-        with Session(out / "logs", say) as session:
+        with Session(out / "logs") as session:
             session.ready()
             for case, number in missing:
                 if time.monotonic() > end:
