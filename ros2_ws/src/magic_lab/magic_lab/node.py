@@ -33,7 +33,8 @@ from magic_interfaces.msg import SceneObjectArray
 from magic_lab.cameras import Bodies, Camera
 from magic_lab.controllers import Error, Point, RefusedError
 from magic_lab.laboratory import TICK, Lab
-from magic_lab.scenarios import EVENTS, SCENARIOS, Event, case_of, draw, scenario_of
+from magic_lab.scenarios import EVENTS, SCENARIOS, Event, Scenario, case_of, draw, scenario_of
+from magic_verifier.cases import Case
 
 Array = NDArray[np.float64]
 
@@ -132,20 +133,21 @@ class LabNode(Node):
             False,
             "the gripper succeeds where it stalls elsewhere than it was told to close to, instead of aborting",
         )
-        self._scene_parameters()
         self.add_on_set_parameters_callback(self._on_parameters)
 
-    def _scene_parameters(self, given: dict[str, Any] | None = None) -> tuple[Any, Any, int, tuple[Event, ...]]:
-        """Scenario, case, seed and events as the parameters have them, or those that are about to be set; raises BAD_REQUEST."""
-        value = {name: self.get_parameter(name).value for name in ("scenario", "object", "seed", "events")} | (given or {})
+    def _scene_parameters(self) -> tuple[Scenario, Case, int, tuple[Event, ...]]:
+        """Scenario, case, seed and events as the parameters have them; raises BAD_REQUEST."""
+        value = {name: self.get_parameter(name).value for name in ("scenario", "object", "seed", "events")}
         scenario = scenario_of(value["scenario"])
-        return scenario, case_of(scenario, value["object"], value["seed"]), value["seed"], tuple(map(Event.parse, value["events"].split()))
+        return scenario, case_of(scenario, value["object"], value["seed"]), value["seed"], _events(value["events"])
 
     def _on_parameters(self, given: list[Parameter]) -> SetParametersResult:
+        """Refuse what is none; an object is looked for at the reset: another scenario may be set after it."""
+        checks: dict[str, Callable[[Any], Any]] = {"scenario": scenario_of, "events": _events}
         try:
-            self._scene_parameters({p.name: p.value for p in given if p.name in ("scenario", "seed", "events")})
+            for one in given:
+                checks.get(one.name, lambda _: None)(one.value)
         except Exception as error:
-            # An object that another scenario has may be set before the scenario is.
             return SetParametersResult(successful=False, reason=describe(self, error)[1])
         return SetParametersResult(successful=True)
 
@@ -421,6 +423,10 @@ class LabNode(Node):
             self._arm_server.destroy()
             self._gripper_server.destroy()
         super().destroy_node()
+
+
+def _events(text: str) -> tuple[Event, ...]:
+    return tuple(map(Event.parse, text.split()))
 
 
 def main() -> None:

@@ -281,20 +281,20 @@ def _stage(record: dict[str, Any]) -> str:
 
 def film(seen: Seen, out: Path, name: str) -> dict[str, Any]:
     """Write what the cameras saw as an animated WebP, its last frame as a picture, side by side with what was said; their names."""
-    moments: dict[float, dict[str, bytes]] = {}
-    for stamp, camera, data in seen.pictures:
-        moments.setdefault(round(stamp, 3), {})[camera] = data
+    # A camera that sends nothing is shown as it was last.
+    now = {camera: np.zeros((SIZE[1], SIZE[0], 3), np.uint8) for camera in ("left", "right")}
+    pictures = sorted(seen.pictures, key=lambda picture: picture[0])
     frames: list[Image] = []
     lines = list(seen.lines)
-    for stamp in sorted(moments):
-        pair = moments[stamp]
-        blank = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-        parts = [cv2.imdecode(np.frombuffer(pair[c], np.uint8), 1) if c in pair else blank for c in ("left", "right")]
+    for index, (stamp, camera, data) in enumerate(pictures):
+        now[camera] = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if index + 1 < len(pictures) and pictures[index + 1][0] == stamp:
+            continue
         said = [line for at, line in lines if at <= stamp]
         bar = np.full((24, 2 * SIZE[0], 3), 255, np.uint8)
-        text = f"{stamp - seen.pictures[0][0]:6.1f} s  {said[-1][:95] if said else ''}"
+        text = f"{stamp - pictures[0][0]:6.1f} s  {said[-1][:95] if said else ''}"
         cv2.putText(bar, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (40, 40, 45), 1, cv2.LINE_AA)
-        frames.append(np.concatenate([np.concatenate(parts, axis=1), bar]))
+        frames.append(np.concatenate([np.concatenate(list(now.values()), axis=1), bar]))
     if not frames:
         return {}
     out.mkdir(parents=True, exist_ok=True)

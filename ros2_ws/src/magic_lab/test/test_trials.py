@@ -1,0 +1,55 @@
+"""What trials write: sums, and videos that open."""
+
+import cv2
+import numpy as np
+import pytest
+
+from magic_core.errors import Code
+from magic_lab.trials import Seen, film, main, summary, told
+
+
+def record(name, seed, success=True, **more):
+    seconds = {"perceive": 1.0, "match": 1.0, "plan": 1.0, "verify": 1.0, "execute": 2.0 + seed}
+    base = {"scenario": "hooking", "object": name, "seed": seed, "success": success, "verified": True, "executed": success, "code": 0}
+    return {**base, "reason": "", "stage": "" if success else "truth", "attempts": 1, "seconds": seconds, **more}
+
+
+def test_sums_are_by_object_and_name_each_failure():
+    records = [
+        record("caliper", 0),
+        record("caliper", 1, False, judgement="the tool lost the target"),
+        record("hanger", 0, False, verified=False, code=int(Code.NO_MATCH), stage="match", reason="nothing like it"),
+    ]
+    total = summary(records)
+    assert {n: (r["good"], r["of"]) for n, r in total["objects"].items()} == {"caliper": (1, 2), "hanger": (0, 1)}
+    assert (total["verified_motions"]["good"], total["verified_motions"]["of"]) == (1, 2)
+    assert [(f["stage"], f["code"], f["reason"]) for f in total["failures"]] == [
+        ("truth", "OK", "the tool lost the target"),
+        ("match", "NO_MATCH", "nothing like it"),
+    ]
+    assert total["mean_seconds"]["execute"] == pytest.approx(2.33, abs=0.01)
+    text = told(total)
+    assert "caliper: 1 of 2 succeeded" in text and "match [NO_MATCH]: nothing like it" in text
+    assert told(summary([])).startswith(":")
+
+
+def test_the_video_opens_and_shows_every_moment(tmp_path):
+    seen = Seen()
+    for k in range(5):
+        for camera in ("left", "right")[: 1 if k == 3 else 2]:
+            image = np.full((300, 400, 3), 40 * k, np.uint8)
+            seen.pictures.append((100.0 + 0.2 * k, camera, cv2.imencode(".jpg", image)[1].tobytes()))
+    seen.lines.append((100.3, "plan: candidate 1"))
+    files = film(seen, tmp_path, "trial")
+    opened, animation = cv2.imreadanimation(str(tmp_path / files["video"]))
+    assert opened and len(animation.frames) == 5
+    right = [frame[100:200, 500:700, :3].mean() for frame in animation.frames]
+    assert right == pytest.approx([0, 40, 80, 80, 160], abs=6), "what sends nothing is shown as it was last"
+    assert cv2.imread(str(tmp_path / files["picture"])).shape == (324, 800, 3)
+    assert film(Seen(), tmp_path, "nothing") == {}
+
+
+def test_an_object_that_the_scenario_does_not_have_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--scenario", "hooking", "--objects", "teapot", "--out", str(tmp_path / "out")])
+    assert ended.value.code == 2 and "allowed: caliper" in capsys.readouterr().err
