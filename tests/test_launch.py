@@ -81,6 +81,30 @@ def test_arguments_that_are_given_win_over_parameter_files(own_files):
         assert parameters_of(program, *own_files, *given)["strategies"] == "/given"
 
 
+def test_all_nodes_follow_the_laboratorys_clock_and_an_arm_is_moved_where_that_is_wanted():
+    from magic_lab.scenarios import SCENARIOS
+    from magic_ros2cli import launch_file
+
+    path = launch_file.find("magic_bringup", "lab.launch.xml")
+
+    def given(**arguments):
+        found = {}
+        for process in launch_file.parse(path, arguments).processes:
+            values = found.setdefault(process.label, {})
+            for part in process.parameters:
+                named = {part.name: part.value} if part.name else None
+                values.update(named or yaml.safe_load(part.text or Path(part.file).read_text())["/**"]["ros__parameters"])
+        return found
+
+    plain, other = given(), given(scenario="hanging", object="mug:46", seed="4", execute="false")
+    assert set(plain) == {*NODES, "lab"}
+    assert all(plain[name]["use_sim_time"] is True for name in NODES) and "use_sim_time" not in plain["lab"]
+    assert plain["strategy_server"]["execute"] is True and other["strategy_server"]["execute"] is False
+    assert [other["lab"][name] for name in ("scenario", "object", "seed")] == ["hanging", "mug:46", 4]
+    choices = ElementTree.parse(LAUNCH / "lab.launch.xml").getroot().find("arg[@name='scenario']")
+    assert {choice.get("value") for choice in choices} == set(SCENARIOS)
+
+
 @pytest.mark.parametrize("given, wanted", [([], False), (["respawn:=true"], True)])
 @pytest.mark.parametrize("name, more", [("magic.launch.xml", ()), ("replay.launch.xml", ("bag:=here",))])
 def test_nodes_that_end_are_started_again_where_that_is_asked_for(name, more, given, wanted):

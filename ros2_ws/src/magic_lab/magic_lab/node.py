@@ -208,7 +208,7 @@ class LabNode(Node):
                     return
                 self._trouble = describe(self, error)[1]
                 self.get_logger().error(f"{self._trouble}: the scene begins anew")
-                self._reset()
+                self._begin_anew()
             due += TICK / self._rate
             late = time.monotonic() - due
             if late > BEHIND:
@@ -218,6 +218,15 @@ class LabNode(Node):
             if time.monotonic() - second > 1.0:
                 self._speed = (self._ticks - ticks) * TICK / (time.monotonic() - second)
                 second, ticks = time.monotonic(), self._ticks
+
+    def _begin_anew(self) -> None:
+        """After what must not happen; where that fails as well the laboratory stands still, and its goals end."""
+        try:
+            self._reset()
+        except Exception as error:
+            self._trouble = describe(self, error)[1]
+            self.get_logger().error(f"{self._trouble}: the laboratory stands still")
+            self._stopping = True
 
     def _answer_resets(self) -> None:
         while self._resets:
