@@ -214,7 +214,9 @@ def script_is_right(monkeypatch, words):
     script, *rest = words
     name = Path(script).name
     assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
-    if name in ("demo.sh", "tables.sh"):
+    if name == "demo.sh" and "--live" in rest:
+        parsed(monkeypatch, "magic_lab.live", rest)
+    elif name in ("demo.sh", "tables.sh"):
         parsed(monkeypatch, {"demo.sh": "magic_bringup.demo", "tables.sh": "magic_verifier.tables"}[name], rest)
     elif name == "setup.sh":
         assert set(rest) <= {"--rebuild", "--help"}
