@@ -425,8 +425,8 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument("--features", default="auto", help="feature backend: auto, embedded or dinov2 (default auto)")
     parser.add_argument("--weights", default="", help="weights of the features: a hub name or a local folder (facebook/dinov2-base)")
     parser.add_argument("--out", type=Path, help="folder for summary.json and report.html (default out/<strategy>_<variant>)")
-    parser.add_argument("--tool", default="", help="object id of the tool (default: the matcher chooses)")
-    parser.add_argument("--target", default="", help="object id of the target (default: the matcher chooses)")
+    parser.add_argument("--tool", default="", help="the tool: an id, or a name such as 'the red mug' (default: the matcher chooses)")
+    parser.add_argument("--target", default="", help="the target: an id or a name (default: the matcher chooses)")
     parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
     parser.add_argument("--timeout", type=float, default=300.0, help="s for the run from match to verify (default 300)")
     parser.add_argument(
