@@ -44,6 +44,8 @@ setup(
         "Jinja2",
         "rosbags",
         "PyYAML",
+        "scipy",
+        "trimesh",
         beside("magic_core"),
         beside("magic_perception"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory, GripperCommand
@@ -55,6 +56,25 @@ class ArmSettings:
     presence: float = 5.0
 
 
+class Guard(Protocol):
+    """Who has a say while a plan is carried out; each method raises what speaks against going on."""
+
+    def ask(self, point: int) -> None:
+        """Before anything moves, and before each move: that begins at this point of the trajectory."""
+
+    def watch(self, move: execution.Move, speed: float) -> Callable[[], None]:
+        """The move begins, at that share of the planned speed: what is called again and again until it ends."""
+
+    def look(self, point: int) -> None:
+        """The arm stands at this point with the tool in its hand."""
+
+    def closed(self) -> None:
+        """The fingers have closed on the tool."""
+
+    def opened(self) -> None:
+        """The fingers are about to open."""
+
+
 class Arm:
     """Carries out verified plans, step by step: the next step begins only where the one before has succeeded.
 
@@ -76,34 +96,44 @@ class Arm:
         """Those who serve it, by what they do."""
         return {r.server: r.servers() for r in (self._mover, self._gripper)}
 
-    def execute(self, plan: MotionPlan, token: Token, tell: Callable[[str], None], ask: Callable[[int, int], None]) -> None:
-        """Carry out a plan.
+    def execute(self, plan: MotionPlan, token: Token, tell: Callable[[str], None], guard: Guard, holding: bool, look: bool) -> None:
+        """Carry out a plan; ``holding``: the tool is in the hand already; ``look``: it is looked at after the lift.
 
-        Everything that can be checked is checked before anything moves.  ``ask(point, moved)`` is called there and before each
-        move, with the point of the trajectory at which it begins, and what has been moved on purpose by then (0: nothing, 1: the
-        tool is in the hand, 2: the task has been done with it); it raises what speaks against it.  Raises BAD_MOTION, SERVER_UNAVAILABLE (before the first move), EXECUTION_FAILED, GRASP_FAILED,
-        SERVER_TIMEOUT, CANCELED, and what ``ask`` does.
+        Everything that can be checked is checked before anything moves.  Raises BAD_MOTION, SERVER_UNAVAILABLE (before the first
+        move), EXECUTION_FAILED, GRASP_FAILED, SERVER_TIMEOUT, CANCELED, and what the guard does.
         """
         settings, trajectory = self.settings, plan.arm_trajectory
         times = [time_from_msg(p.time_from_start) for p in trajectory.points]
         actions = execution.steps(
-            times, [p.velocities for p in trajectory.points], plan.grasp_time, plan.release_time, plan.grasp_width, settings.opening
+            times,
+            [p.velocities for p in trajectory.points],
+            plan.grasp_time,
+            plan.release_time,
+            plan.grasp_width,
+            settings.opening,
+            holding=holding,
+            look=look,
         )
         for remote in (self._mover, self._gripper):
             remote.require(settings.presence, token)
-        ask(0, 0)
-        moved = 0
+        guard.ask(0)
         for number, action in enumerate(actions, 1):
             where = f"step {number} of {len(actions)}"
             if isinstance(action, execution.Move):
                 tell(f"{where}: the arm moves for {(times[action.last] - times[action.first]) / settings.speed:.1f} s")
-                ask(action.first, moved)
-                self._move(trajectory, times, action, token)
-                moved = 2 if moved else 0
+                guard.ask(action.first)
+                with token.minding(guard.watch(action, settings.speed)):
+                    self._move(trajectory, times, action, token)
+            elif isinstance(action, execution.Look):
+                tell(f"{where}: the tool in the hand is looked at")
+                guard.look(action.point)
             else:
                 tell(f"{where}: the fingers {'close on the tool' if action.close else 'open'}")
+                if not action.close:
+                    guard.opened()
                 self._fingers(action, token)
-                moved = max(moved, int(action.close))
+                if action.close:
+                    guard.closed()
 
     def _move(self, trajectory: JointTrajectory, times: list[float], move: execution.Move, token: Token) -> None:
         speed = self.settings.speed

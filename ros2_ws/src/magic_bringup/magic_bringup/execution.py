@@ -26,7 +26,14 @@ class Fingers:
     opening: float
 
 
-Step = Move | Fingers
+@dataclass(frozen=True)
+class Look:
+    """The arm stands at point ``point`` with the tool in its hand, which can be looked at."""
+
+    point: int
+
+
+Step = Move | Fingers | Look
 
 #: What the error codes of control_msgs/FollowJointTrajectory say: name, what has happened, what it asks for.
 _ENDINGS = {
@@ -57,12 +64,16 @@ def steps(
     grasp_width: float,
     opening: float,
     standstill: float = 0.01,
+    holding: bool = False,
+    look: bool = False,
 ) -> tuple[Step, ...]:
     """What arm and gripper do in turn: open, go to the tool, close, do the task, and where it ends with a release, open and leave.
 
     times (N,) seconds from 0, rising; velocities (N, J) rad/s; grasp_time and release_time seconds (release_time NaN: never);
     grasp_width and opening (of the open gripper) m.  The arm must stand, within ``standstill`` rad/s, where the fingers move,
-    and at the end.  Raises BAD_MOTION.
+    and at the end.  holding: the tool is in the hand already, and the fingers do not open before the release; such a plan closes
+    them at its start.  look: the tool is looked at where the arm stands for the first time after it has moved it, at the end of
+    the lift.  Raises BAD_MOTION.
     """
     if len(times) < 2 or any(not b > a for a, b in pairwise(times)):
         raise MagicError(Code.BAD_MOTION, "times of the trajectory", f"{len(times)} points", "at least two points, at rising times")
@@ -84,16 +95,30 @@ def steps(
             raise MagicError(
                 Code.BAD_MOTION, f"speed of the arm in rad/s at {times[index]:.3f} s", round(speed, 4), f"at most {standstill:g} there"
             )
-    actions: list[Step] = [Fingers(False, opening)]
+    if holding and cuts[0] != 0:
+        raise MagicError(Code.BAD_MOTION, "grasp_time of a tool that is in the hand", grasp_time, f"{times[0]:g}, the start")
+    actions: list[Step] = [] if holding else [Fingers(False, opening)]
     begin = 0
     for cut, close in zip(cuts, (True, False)):
         if cut > begin:
-            actions.append(Move(begin, cut))
-        actions.append(Fingers(close, grasp_width if close else opening))
+            actions += _moves(begin, cut, velocities, standstill, look=look and not close)
+        if not (close and holding):
+            actions.append(Fingers(close, grasp_width if close else opening))
         begin = cut
     if last > begin:
-        actions.append(Move(begin, last))
+        actions += _moves(begin, last, velocities, standstill, look=look and not releases)
     return tuple(actions)
+
+
+def _moves(first: int, last: int, velocities: Sequence[Sequence[float]], standstill: float, look: bool) -> list[Step]:
+    """The arm's way from one point to another, with a look where it stands for the first time, if that is wanted."""
+    moving = False
+    for index in range(first, last) if look else ():
+        stands = max((abs(v) for v in velocities[index]), default=0.0) <= standstill
+        if moving and stands:
+            return [Move(first, index), Look(index), Move(index, last)]
+        moving = moving or not stands
+    return [Move(first, last)]
 
 
 def check_grasp(wanted: float, found: float, tolerance: float) -> None:

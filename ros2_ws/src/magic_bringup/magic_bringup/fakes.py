@@ -96,19 +96,26 @@ JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 
 
-def plan(variant: str = "fg", release: bool = False) -> MotionPlan:
+def plan(variant: str = "fg", release: bool = False, lift: bool = False, start: float = 0.0, held: bool = False) -> MotionPlan:
     """The tool moves 0.1 m in one second; the arm goes to it in one second, grasps 30 mm, and turns by 0.2 rad at every joint.
 
-    It stands at 0, 1, 1.5, 2.5 and 3 s; with ``release`` the fingers open at 2.5 s.
+    It stands at 0, 1, 1.5, 2.5 and 3 s; with ``release`` the fingers open at 2.5 s, with ``lift`` it stands at 2 s as well.  All joints
+    begin at ``start`` rad.  ``held``: the tool is in the hand from the start, and what comes before is left out.
     """
     times = np.array([0.0, 1.0])
     motion = ToolMotion(times, np.stack([np.eye(4), transforms.make(translation=[0.1, 0.0, 0.0])]), (Phase("goal", 0.0, 1.0),))
     if variant == "fg":
         return MotionPlan(variant, motion)
-    times = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
-    rows = np.outer([0.0, 0.05, 0.1, 0.1, 0.15, 0.2, 0.2], np.ones(7))
-    speeds = np.outer([0.0, 0.1, 0.0, 0.0, 0.1, 0.0, 0.0], np.ones(7))
-    arm = ArmMotion(times, JOINTS, rows, speeds, np.zeros((7, 7)), np.eye(4), 0.03, 1.0, 2.5 if release else None)
+    times = np.array([0.0, 0.5, 1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0])
+    rows = np.array([0.0, 0.05, 0.1, 0.1, 0.125, 0.15, 0.175, 0.2, 0.2])
+    speeds = np.array([0.0, 0.1, 0.0, 0.0, 0.1, 0.0 if lift else 0.1, 0.1, 0.0, 0.0])
+    phases = (Phase("grasp", 0.0, 1.5), Phase("transfer", 1.5, 2.25), Phase("goal", 2.25, 3.0))
+    if held:
+        times, rows, speeds = times[2:] - 1.0, rows[2:] - rows[2], speeds[2:]
+        phases = tuple(Phase(p.name, max(0.0, p.start - 1.0), p.end - 1.0) for p in phases)
+    positions, velocities = (np.outer(column, np.ones(7)) for column in (start + rows, speeds))
+    grasp, end = (0.0, 1.5) if held else (1.0, 2.5)
+    arm = ArmMotion(times, JOINTS, positions, velocities, 0 * positions, np.eye(4), 0.03, grasp, end if release else None, phases)
     return MotionPlan(variant, motion, arm)
 
 
@@ -130,6 +137,8 @@ class FakeServers(Node):
         self.on_verify: Callable[[Any, Callable[[], bool]], Any] = self.verify
         group = ReentrantCallbackGroup()
         self._objects = self.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
+        self._eyes: Callable[[], Scene | None] = lambda: None
+        self.create_timer(0.2, self._see, callback_group=group)
         self._servers: list[Any] = []
         if "match" in services:
             self.create_service(MatchContact, "match_contact", self._match, callback_group=group)
@@ -149,11 +158,21 @@ class FakeServers(Node):
         stamp = self.get_clock().now().nanoseconds * 1e-9
         self._objects.publish(conversions.scene_to_msg(replace(of, stamp=stamp)))
 
+    def see(self, eyes: Callable[[], Scene | None]) -> None:
+        """Publish what ``eyes()`` gives, five times a second from now on; nothing where it gives ``None``."""
+        self._eyes = eyes
+
+    def _see(self) -> None:
+        seen = self._eyes()
+        if seen is not None:
+            self.publish(seen)
+
     def clear(self) -> None:
         """Go back to the answers and lists of the start."""
         self.goals.clear()
         self.canceled_goals.clear()
         self.started.clear()
+        self._eyes = lambda: None
         self.on_match, self.on_plan, self.on_verify = self.match, self.plan, self.verify
 
     @staticmethod

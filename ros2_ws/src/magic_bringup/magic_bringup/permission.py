@@ -43,7 +43,8 @@ class Verdict:
     """What the verifier answered; ``code`` OK means that the goal test passed often enough for the verifier.
 
     success_rate of ``rollouts`` simulations, with its 95 % interval from rate_low to rate_high; failures: why some failed.
-    server: who answered (see :class:`Exchange`); run: for which run that was asked.
+    server: who answered (see :class:`Exchange`); run: for which run that was asked; motion: which motion, by its mark: of a run
+    in which motions are planned anew each has its own verdict.
     """
 
     code: Code
@@ -55,17 +56,19 @@ class Verdict:
     failures: tuple[str, ...] = ()
     server: bytes = b""
     run: str = ""
+    motion: bytes = b""
 
 
 @dataclass(frozen=True)
 class Look:
     """The objects as seen at one moment: hulls (see :mod:`magic_bringup.scene_change`) by id, in ``frame``; ``stamp`` by the clock
-    of the stamps and ``came`` by the monotonic clock of this process, both in seconds."""
+    of the stamps and ``came`` by the monotonic clock of this process, both in seconds.  partly: ids of those of which the robot hides a part."""
 
     objects: Mapping[str, NDArray[np.float64]]
     frame: str
     stamp: float
     came: float
+    partly: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,8 @@ class Claim:
     cannot judge; ``waived`` then says that goal and server both accept that, for the arm alone.
     joints, start: of an arm's trajectory, and their positions, rad, where the next move begins; both empty without an arm.
     state_known: whether the plan began where the arm was heard to be; else it began at home.
-    meant: ids of what the motion itself has moved so far.  motion: the motion itself, which the rule does not look into.
+    meant: ids of what the motion itself has moved so far; carried: hull of the tool where the arm has it in its hand, else None.
+    motion: the motion itself, which the rule does not look into, and mark: what tells it from others, as its verdict has it.
     """
 
     run: str
@@ -88,7 +92,9 @@ class Claim:
     start: tuple[float, ...] = ()
     state_known: bool = True
     meant: frozenset[str] = frozenset()
+    carried: NDArray[np.float64] | None = field(default=None, compare=False)
     motion: Any = field(default=None, compare=False)
+    mark: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -142,7 +148,9 @@ def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tupl
         raise MagicError(Code.BAD_REQUEST, f"no arm moves by a recording: {RECORDED}", allowed="objects that are seen now")
     _frames(claim, world, limits)
     _seen(world, limits)
-    scene_change.check(claim.scene.objects, world.scene.objects, limits.object_tolerance, claim.meant)
+    # Once the arm is among the objects it hides some of what was seen of them from where the motion began.
+    partly = world.scene.partly if claim.meant else frozenset()
+    scene_change.check(claim.scene.objects, world.scene.objects, limits.object_tolerance, claim.meant, partly, claim.carried)
     notes = _arm(claim, world, limits, purpose)
     return (*notes, *((RECORDED,) if world.recorded or world.replaying else ()))
 
@@ -188,6 +196,8 @@ def _judged(claim: Claim, limits: Limits, purpose: Purpose) -> None:
         raise MagicError(verdict.code, f"the verifier's verdict is no: {verdict.message}")
     if verdict.run != claim.run:
         raise MagicError(Code.INTERNAL, "the verdict's run", verdict.run, claim.run)
+    if verdict.motion != claim.mark:
+        raise MagicError(Code.INTERNAL, "the verdict is about another motion", verdict.motion.hex()[:8], claim.mark.hex()[:8])
     if not verdict.rate_low >= limits.required_rate:
         raise MagicError(
             Code.NOT_SURE_ENOUGH,

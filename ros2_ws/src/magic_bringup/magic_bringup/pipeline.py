@@ -14,7 +14,7 @@ import heapq
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from magic_bringup.permission import Verdict
@@ -159,6 +159,18 @@ class Outcome:
     heatmap: Any = None
 
 
+def joined(outcomes: Sequence[Outcome], last: Outcome) -> Outcome:
+    """How a goal ended for which several runs were made: the ``last`` that was carried out, with what all of them tried and took."""
+    names = {name for outcome in outcomes for name in outcome.seconds}
+    return replace(
+        last,
+        reports=tuple(report for outcome in outcomes for report in outcome.reports),
+        simulations=sum(outcome.simulations for outcome in outcomes),
+        seconds={name: sum(outcome.seconds.get(name, 0.0) for outcome in outcomes) for name in names},
+        heatmap=outcomes[0].heatmap,
+    )
+
+
 def with_metrics(message: str, metrics: Sequence[tuple[str, float]]) -> str:
     """A verdict's sentence with what was measured behind it, in brackets: ``sentence [name value, name value]``."""
     return message + (f" [{', '.join(f'{name} {value:.4g}' for name, value in metrics)}]" if metrics else "")
@@ -199,19 +211,25 @@ class Agenda:
     further attempt: among candidates of like score every one gets its first grasp before one
     gets its second, but a far better contact gets another grasp before far worse ones are tried.
     A grasp that slipped is followed by the next grasp of the same contact.  Trials of the same
-    promise are taken in the order of the candidates, and of the reflections.
+    promise are taken in the order of the candidates, and of the reflections.  ``spent(candidate)``
+    says how many grasps of a candidate have failed before: these are left out.
     """
 
-    def __init__(self, candidates: Sequence[Any], reflections: Sequence[str], attempts: int) -> None:
+    def __init__(
+        self, candidates: Sequence[Any], reflections: Sequence[str], attempts: int, spent: Callable[[Any], int] = lambda candidate: 0
+    ) -> None:
         self._attempts = max(1, attempts)
         self._order: dict[tuple[int, str], int] = {}
         self._heap: list[tuple[float, int, int, Trial]] = []
         best = max((float(c.score) for c in candidates), default=0.0)
         for index, candidate in enumerate(candidates):
             share = min(1.0, max(0.0, float(candidate.score) / best)) if best > 0 else 1.0
+            made = spent(candidate)
+            if made >= self._attempts:
+                continue
             for reflection in reflections_of(candidate, reflections):
                 self._order[index, reflection] = len(self._order)
-                self._push(share, Trial(index, candidate, reflection))
+                self._push(share, Trial(index, candidate, reflection, made))
 
     def _push(self, promise: float, trial: Trial) -> None:
         # Order and attempt are unique together, so that trials themselves are never compared.
@@ -266,6 +284,7 @@ class Run:
         canceled: Callable[[], bool] = lambda: False,
         describe: Callable[[BaseException], tuple[int, str]] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        spent: Callable[[Any], int] = lambda candidate: 0,
     ) -> None:
         self._request = request
         self._reflections = reflections
@@ -276,6 +295,7 @@ class Run:
         self._canceled = canceled
         self._describe = describe or (lambda error: (int(Code.INTERNAL), f"{type(error).__name__}: {error}"))
         self._clock = clock
+        self._spent = spent
         self._start = clock()
         self._seconds = dict.fromkeys(STAGES, 0.0)
         self._reports: list[Report] = []
@@ -304,7 +324,7 @@ class Run:
         self._tell("match", 0, matches.message or f"{len(matches.candidates)} candidates")
         if not matches.candidates:
             raise MagicError(Code.NO_MATCH, "the matcher found no contact" + (f": {matches.message}" if matches.message else ""))
-        agenda = Agenda(matches.candidates, self._reflections, self._settings.attempts if request.variant == "arm" else 1)
+        agenda = Agenda(matches.candidates, self._reflections, self._settings.attempts if request.variant == "arm" else 1, self._spent)
         while (entry := agenda.next()) is not None:
             promise, trial = entry
             if self._left() < self._settings.reserve:
@@ -313,7 +333,8 @@ class Run:
             if outcome is not None:
                 return outcome
             agenda.failed(promise, trial, code)
-        return self._outcome(Code.NO_CANDIDATE_SUCCEEDED, "; ".join([self._summary(), *matches.doubts]))
+        summary = self._summary() or f"each of {len(matches.candidates)} candidates has been tried before"
+        return self._outcome(Code.NO_CANDIDATE_SUCCEEDED, "; ".join([summary, *matches.doubts]))
 
     def _try(self, matches: Matches, trial: Trial) -> tuple[Outcome | None, Code]:
         request = self._request

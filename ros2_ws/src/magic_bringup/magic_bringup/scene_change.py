@@ -21,6 +21,8 @@ def _directions(count: int = 200) -> NDArray[np.float64]:
 
 
 DIRECTIONS = _directions()
+#: What is seen of a tool in the hand, with what is left of the hand at its edges, reaches so far beyond the tool at most, m.
+ABOUT = 0.05
 
 
 def hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -41,23 +43,43 @@ def distance(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
     return float(np.abs(before - after).max())
 
 
+class Changed(MagicError):
+    """Target or obstacles are elsewhere: another look at them, and another plan, may help."""
+
+
+def contained(inner: NDArray[np.float64], outer: NDArray[np.float64], margin: float) -> bool:
+    """Whether one :func:`hull` lies within another that is grown by ``margin`` m; never where one is not a number."""
+    return bool((inner <= outer + margin).all())
+
+
+def gap(before: NDArray[np.float64], after: NDArray[np.float64], partly: bool) -> float:
+    """How far an object has moved at least, m.  Of one that is seen in part only by how much it sticks out of where it was."""
+    return max(0.0, float((after - before).max())) if partly else distance(before, after)
+
+
 def check(
     before: Mapping[str, NDArray[np.float64]],
     after: Mapping[str, NDArray[np.float64]],
     tolerance: float,
     meant: Collection[str] = (),
+    partly: Collection[str] = (),
+    carried: NDArray[np.float64] | None = None,
 ) -> None:
-    """Refuse a scene in which an object is gone, has come, or has moved by more than ``tolerance`` m; raises STALE_DATA.
+    """Refuse a scene in which an object is gone, has come, or has moved by more than ``tolerance`` m; raises :class:`Changed`.
 
-    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.
+    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.  partly: ids of what
+    the arm hides a part of now.  carried: hull of the tool in the hand: what has come within :data:`ABOUT` of it is the tool, by
+    whatever id.
     """
     old, new = before.keys() - set(meant), after.keys() - set(meant)
+    if carried is not None:
+        new = {name for name in new if name in old or not contained(after[name], carried, ABOUT)}
     for what, ids in (("gone since the plan", old - new), ("come since the plan", new - old)):
         if ids:
-            raise MagicError(Code.STALE_DATA, f"objects {what}", ", ".join(sorted(ids)), ", ".join(sorted(before)))
+            raise Changed(Code.STALE_DATA, f"objects {what}", ", ".join(sorted(ids)), ", ".join(sorted(before)))
     for name in sorted(old):
-        moved = distance(before[name], after[name])
+        moved = gap(before[name], after[name], name in partly)
         if not moved <= tolerance:
-            raise MagicError(
+            raise Changed(
                 Code.STALE_DATA, f"{name} has moved since the plan, in mm", round(1000 * moved, 1), f"at most {1000 * tolerance:g}"
             )

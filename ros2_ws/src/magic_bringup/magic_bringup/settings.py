@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from rclpy.node import Node
 
 from magic_bringup.arm import ArmSettings
+from magic_core.errors import Code, MagicError
 from magic_core.node import parameter
 from magic_core.presets import PRESETS
 
@@ -42,6 +44,34 @@ class Settings:
     object_tolerance: float
     required_rate: float
     recorded: bool
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What is looked at while a plan is carried out, and what follows.
+
+    look: look at the tool after the lift; watch: look at the scene while the arm moves; judge: look after the task whether the goal
+    is met.  executions, replans: how often the arm begins, and how often a motion is planned anew, at most, of one goal; seconds:
+    after that many nothing is begun again.  look_time: s that a picture of what has just happened is waited for; rest_time: s that
+    the arm is given to come to rest when it is stopped.  tool_shift (m), tool_turn (rad): a tool that is off by no more in the hand is
+    carried on as planned; slip_shift, slip_turn: one that is off by more is given up.  watch_tolerance: m that a thing may move while
+    the arm moves.  accuracy: m to which the middle of a thing is known that is seen twice.
+    """
+
+    look: bool = True
+    watch: bool = True
+    judge: bool = True
+    executions: int = 3
+    replans: int = 5
+    seconds: float = 300.0
+    look_time: float = 10.0
+    rest_time: float = 5.0
+    tool_shift: float = 0.005
+    tool_turn: float = 0.06
+    slip_shift: float = 0.03
+    slip_turn: float = 0.5
+    watch_tolerance: float = 0.03
+    accuracy: float = 0.005
 
 
 def read(node: Node, preset: str = "") -> Settings:
@@ -127,3 +157,32 @@ def read_arm(node: Node, presence: float) -> ArmSettings:
         grasp_tolerance=number("grasp_tolerance", "m that the opening of the closed fingers may be off the planned one", 0.0, 0.1),
         presence=presence,
     )
+
+
+def read_loop(node: Node) -> LoopSettings:
+    """Declare the parameters of the closed loop and read them; raises BAD_REQUEST where a tool is given up sooner than corrected."""
+
+    def of(name: str, parameter_name: str, text: str, low: float | None = None, high: float | None = None) -> Any:
+        return parameter(node, f"loop.{parameter_name}", getattr(LoopSettings, name), text, low=low, high=high, read_only=True)
+
+    found = LoopSettings(
+        look=of("look", "look", "look at the tool in the hand after the lift, and correct its pose"),
+        watch=of("watch", "watch", "watch target and obstacles while the arm moves, and stop it where they move"),
+        judge=of("judge", "judge", "look after the task whether the goal is met"),
+        executions=of("executions", "executions", "how often the arm begins for one goal, at most: with the next candidate", 1, 20),
+        replans=of("replans", "replans", "how often a motion is planned anew for one goal, at most, because something is elsewhere", 0, 50),
+        seconds=of("seconds", "time", "s after the first motion's beginning after which nothing is begun again", 0.0, 36000.0),
+        look_time=of("look_time", "look_time", "s that a picture of what has just happened is waited for", 0.1, 600.0),
+        rest_time=of("rest_time", "rest_time", "s that a stopped arm is given to come to rest", 0.1, 60.0),
+        tool_shift=of("tool_shift", "tool_shift", "m that the tool may be off in the hand without a new plan", 0.0, 0.5),
+        tool_turn=of("tool_turn", "tool_turn", "rad that the tool may be off in the hand without a new plan", 0.0, 3.2),
+        slip_shift=of("slip_shift", "slip_shift", "m beyond which a tool that is off in the hand is given up", 0.0, 0.5),
+        slip_turn=of("slip_turn", "slip_turn", "rad beyond which a tool that is off in the hand is given up", 0.0, 3.2),
+        watch_tolerance=of("watch_tolerance", "watch_tolerance", "m that a thing may move while the arm moves", 0.0, 0.5),
+        accuracy=of("accuracy", "accuracy", "m to which the middle of a thing is known that is seen before and after the task", 0.0, 0.1),
+    )
+    for small, large in (("tool_shift", "slip_shift"), ("tool_turn", "slip_turn")):
+        if getattr(found, small) > getattr(found, large):
+            allowed = f"at most loop.{large}, {getattr(found, large):g}"
+            raise MagicError(Code.BAD_REQUEST, f"parameter loop.{small}", getattr(found, small), allowed)
+    return found

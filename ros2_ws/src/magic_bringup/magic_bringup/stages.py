@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -10,14 +12,16 @@ from typing import Any, Protocol
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point, Quaternion, Vector3
+from numpy.typing import NDArray
 from sensor_msgs.msg import Image, JointState
 
-from magic_bringup import pipeline
+from magic_bringup import pipeline, scene_change
 from magic_bringup.joints import JointStates, check_range
 from magic_bringup.permission import Verdict, check_single
 from magic_bringup.remote import RemoteAction, RemoteService, Token
 from magic_bringup.settings import Settings
-from magic_core import conversions, naming
+from magic_core import conversions, naming, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_interfaces.action import PlanMotion, VerifyMotion
@@ -56,6 +60,8 @@ class Server(Protocol):
 
     def in_base(self, scene: SceneObjectArray) -> SceneObjectArray: ...
 
+    def hand(self) -> NDArray[np.float64]: ...
+
     def servers(self) -> dict[str, frozenset[bytes]]: ...
 
     def objects_watch(self) -> Callable[[], None]: ...
@@ -70,12 +76,13 @@ class Server(Protocol):
 class Stages:
     """The stages of :mod:`magic_bringup.pipeline`, done by the other nodes; messages pass through as they came.
 
-    scene: the objects of this run, in the robot's base frame.  state_known: whether the last plan began where the arm was heard
+    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.  state_known: whether the last plan began where the arm was heard
     to be; else it began at home.
     """
 
-    def __init__(self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool) -> None:
+    def __init__(self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool, since: float = -math.inf) -> None:
         self._server = server
+        self._since = since
         self._run = run
         self._heatmap = heatmap
         self._token = token
@@ -103,12 +110,10 @@ class Stages:
 
         def enough() -> bool:
             scene = server.scene
-            if scene is None:
+            if scene is None or conversions.time_from_msg(scene.header.stamp) < self._since:
                 return False
-            # A wrong id is answered at once; too few objects may still become enough: a tool that was seen, and a target.
-            return bool(self._unknown(scene, request)) or (
-                len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
-            )
+            # A wrong id is answered at once; too few objects may still become enough.
+            return bool(self._unknown(scene, request)) or self._enough(scene, request)
 
         self._minds = {remote.name: remote.mind() for remote in (server.planner, *self._verifier())}
         watches = [server.objects_watch(), *(remote.watch() for remote in needed)]
@@ -141,6 +146,10 @@ class Stages:
         pipeline.check_different(request)
         return request, "; ".join(reading.sentence for reading in readings.values())
 
+    def _enough(self, scene: SceneObjectArray, request: pipeline.Request) -> bool:
+        """Whether there is a tool that was seen, and a target."""
+        return len(scene.objects) >= 2 and (bool(request.tool_id) or any(o.source == SceneObject.CAMERA for o in scene.objects))
+
     def _verifier(self) -> tuple[RemoteAction, ...]:
         """The verifier, where this run needs it."""
         return (self._server.verifier,) if self._needs_verifier else ()
@@ -171,8 +180,7 @@ class Stages:
         while not self._token.wait(carried, time.monotonic() + 0.1):
             pass
 
-    @staticmethod
-    def _unknown(scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
+    def _unknown(self, scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
         ids = [o.id for o in scene.objects]
         for what, value in (("tool_id", request.tool_id), ("target_id", request.target_id)):
             if value and ids and value not in ids and not naming.is_name(value):
@@ -183,7 +191,9 @@ class Stages:
         """Why there is nothing to work on: in perception's own words where it has spoken."""
         server = self._server
         topic = server.objects_topic
-        if scene is not None:
+        if scene is not None and conversions.time_from_msg(scene.header.stamp) < self._since:
+            code, what = Code.STALE_DATA, f"nothing newer than what is to be looked at again came on {topic} within {wait:.1f} s"
+        elif scene is not None:
             ids = [o.id for o in scene.objects]
             seen = sum(o.source == SceneObject.CAMERA for o in scene.objects)
             code, what = (
@@ -268,6 +278,10 @@ class Stages:
     def _find(self, object_id: str) -> SceneObject:
         return next(o for o in self.scene.objects if o.id == object_id)
 
+    def _tool_of(self, trial: pipeline.Trial) -> SceneObject:
+        """The tool of a trial, where it is when the motion begins."""
+        return self._find(trial.candidate.tool_id)
+
     def plan(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> pipeline.Planned:
         """Ask the planner for one trial."""
         server = self._server
@@ -275,7 +289,7 @@ class Stages:
         goal = PlanMotion.Goal(
             strategy=request.strategy,
             variant=request.variant,
-            tool=self._find(trial.candidate.tool_id),
+            tool=self._tool_of(trial),
             target=self._find(matches.target_id),
             obstacles=self._obstacles(trial, matches),
             table=self.scene.table,
@@ -319,7 +333,7 @@ class Stages:
         timeout = min(timeout, server.settings.verify)
         goal = VerifyMotion.Goal(
             strategy=request.strategy,
-            tool=self._find(trial.candidate.tool_id),
+            tool=self._tool_of(trial),
             target=self._find(matches.target_id),
             obstacles=self._obstacles(trial, matches),
             table=self.scene.table,
@@ -347,6 +361,7 @@ class Stages:
             tuple(result.failures),
             answer.server,
             self._run,
+            mark_of(plan),
         )
 
     def film(self, outcome_code: Code) -> Image | None:
@@ -385,6 +400,33 @@ def _stands_in(scene: SceneObjectArray, candidate: ContactCandidate, target_id: 
     world_from_tool = conversions.pose_from_msg(tools[candidate.tool_id].pose)
     contact = conversions.pose_from_msg(candidate.tool.object_from_contact)
     return bool(np.allclose((world_from_tool @ contact)[:3, 3], point, rtol=0.0, atol=SAME_POINT))
+
+
+def hull_of(item: SceneObject) -> NDArray[np.float64]:
+    """The hull of an object (see :mod:`magic_bringup.scene_change`), in the frame of its array."""
+    vertices = np.array([(p.x, p.y, p.z) for p in item.mesh.vertices]).reshape(-1, 3)
+    return scene_change.hull(transforms.apply(conversions.pose_from_msg(item.pose), vertices))
+
+
+def mark_of(plan: MotionPlan) -> bytes:
+    """What tells a motion from every other one: a digest of its numbers (serialised messages have padding in them)."""
+    found = hashlib.sha256(" ".join([plan.variant, *plan.arm_trajectory.joint_names]).encode())
+
+    def take(*numbers: float) -> None:
+        found.update(np.array(numbers, dtype=float).tobytes())
+
+    def pose(at: Vector3 | Point, turned: Quaternion) -> None:
+        take(at.x, at.y, at.z, turned.x, turned.y, turned.z, turned.w)
+
+    take(plan.grasp_width, plan.grasp_time, plan.release_time)
+    pose(plan.tool_from_tcp.position, plan.tool_from_tcp.orientation)
+    for point in plan.arm_trajectory.points:
+        take(point.time_from_start.sec, point.time_from_start.nanosec, *point.positions, *point.velocities, *point.accelerations)
+    for point in plan.tool_trajectory.points:
+        take(point.time_from_start.sec, point.time_from_start.nanosec)
+        for transform in point.transforms:
+            pose(transform.translation, transform.rotation)
+    return found.digest()
 
 
 def code_of(number: int) -> Code:

@@ -5,29 +5,32 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
 from visualization_msgs.msg import MarkerArray
 
-from magic_bringup import markers, pipeline, scene_change
+from magic_bringup import markers, pipeline
 from magic_bringup import settings as parameters
 from magic_bringup.arm import Arm
+from magic_bringup.closed_loop import ClosedLoop, Job
+from magic_bringup.held import HeldStages
 from magic_bringup.joints import JointStates
 from magic_bringup.outlet import Motion, Outlet
-from magic_bringup.permission import RECORDED, Claim, Limits, Look, NotYet, Purpose, Verdict, World, permit
+from magic_bringup.permission import RECORDED, Claim, Limits, Look, NotYet, Verdict, World
 from magic_bringup.publication import Publication
 from magic_bringup.remote import SEND_GOAL, RemoteAction, RemoteService, Token, servers_of
-from magic_bringup.stages import Stages, complaint_code
-from magic_core import conversions, presence, qos, transforms
+from magic_bringup.stages import Stages, complaint_code, hull_of, mark_of
+from magic_core import conversions, presence, qos
 from magic_core import strategy as strategies
 from magic_core.diagnostics import Diagnostics, clock_complaint, status
 from magic_core.errors import Code, MagicError
@@ -35,7 +38,7 @@ from magic_core.node import RESULT_TIMEOUT, describe, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
-from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObjectArray, StageTimes
+from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObject, SceneObjectArray, StageTimes
 from magic_interfaces.srv import MatchContact
 
 #: Whose explanation is looked for when no objects come, besides that of those who publish objects: the node of this name beside this one.
@@ -78,6 +81,7 @@ class StrategyServer(Node):
         robot = robot_parameters(self)
         settings = self.settings = parameters.read(self, robot["preset"])
         arm = parameters.read_arm(self, settings.presence)
+        self._loop = parameters.read_loop(self)
         if settings.execute and settings.recorded:
             raise MagicError(
                 Code.BAD_REQUEST, "parameters execute and recorded", "both true", "one of them: no arm is moved by a recording"
@@ -112,7 +116,7 @@ class StrategyServer(Node):
         self._arm = Arm(self, settings.trajectory_action, settings.gripper_action, arm, group) if settings.execute else None
         self._server_name = self.resolve_service_name("run_strategy")
         self._outlet = Outlet(self, self.robot.base_frame)
-        self.publication = Publication(self._outlet, self._world, self._limits)
+        self.publication = Publication(self._outlet, self.world, self._limits)
         self.objects_topic = self.create_subscription(
             SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=group
         ).topic_name
@@ -209,12 +213,20 @@ class StrategyServer(Node):
             kept = self._look = scene, look_at(self.in_base(scene))
         return replace(kept[1], came=came, stamp=conversions.time_from_msg(scene.header.stamp))
 
+    def hand(self) -> NDArray[np.float64]:
+        """base_from_tcp (4, 4) as the joints were last heard; raises NO_FRAMES where one was not."""
+        joints = self.joints.all()
+        missing = [name for name in self.robot.names if name not in joints]
+        if missing:
+            raise MagicError(Code.NO_FRAMES, f"joint_states: nothing about {', '.join(missing)}")
+        return self.robot.forward(np.array([joints[name].position for name in self.robot.names]))[0]
+
     def servers(self) -> dict[str, frozenset[bytes]]:
         """Those who serve what a run needs, by what they do."""
         found = {r.server: r.servers() for r in (self.matcher, self.planner, self.verifier)}
         return {**found, "strategy server": servers_of(self, self._server_name + SEND_GOAL)}
 
-    def _world(self, claim: Claim) -> World:
+    def world(self, claim: Claim) -> World:
         """What there is at this moment."""
         token = self._token
         return World(
@@ -339,16 +351,24 @@ class StrategyServer(Node):
         request = self._request(goal)
         stages = Stages(self, token, self._run_id, needs_verifier=strategy.simulatable, heatmap=goal.want_pictures)
         notify = self._notifier(handle)
-        outcome = pipeline.Run(
-            request,
-            strategy.reflections,
-            strategy.simulatable,
-            stages,
-            pipeline.Settings(attempts=self.settings.attempts),
-            notify,
-            lambda: token.canceled,
-            lambda error: describe(self, error),
-        ).execute()
+
+        def work(
+            request: pipeline.Request, stages: Stages, reflections: Sequence[str], spent: Callable[[Any], int] = lambda candidate: 0
+        ) -> pipeline.Outcome:
+            return pipeline.Run(
+                request,
+                reflections,
+                strategy.simulatable,
+                stages,
+                # A tool that is in the hand is held as it is held.
+                pipeline.Settings(attempts=1 if isinstance(stages, HeldStages) else self.settings.attempts),
+                notify,
+                lambda: token.canceled,
+                lambda error: describe(self, error),
+                spent=spent,
+            ).execute()
+
+        outcome = work(request, stages, strategy.reflections)
         fill(result, outcome)
         # First what somebody waits for, then the pictures.
         if outcome.code == Code.OK:
@@ -357,7 +377,33 @@ class StrategyServer(Node):
             claim = self._claim(outcome, stages, waived)
             published = outcome.verified and self._publish(claim, token, result)
             if self._arm is not None and (published or (waived and not outcome.verified)) and outcome.plan.variant == MotionPlan.ARM:
-                self._carry_out(self._arm, claim, outcome, stages, token, result, notify)
+                loop = ClosedLoop(
+                    self,
+                    self._arm,
+                    self._loop,
+                    self._limits,
+                    strategy,
+                    request,
+                    token,
+                    Job(outcome, stages, claim),
+                    self._run_id,
+                    work,
+                    lambda outcome, stages: self._claim(outcome, stages, waived),
+                    lambda ask: self._when_allowed(ask, token),
+                    # Nobody else is to begin what is being carried out.
+                    lambda: self.publication.take_back("the strategy server carries it out itself", claim.run),
+                    lambda job, text: notify(
+                        pipeline.Progress(
+                            "execute",
+                            job.outcome.reports[-1].trial.index,
+                            len(job.stages.matches.candidates),
+                            text,
+                            job.outcome.reports,
+                        )
+                    ),
+                )
+                self._carry_out(loop, result)
+                outcome, stages = loop.jobs[-1].outcome, loop.jobs[-1].stages
         self._show(stages, outcome)
         if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()
@@ -413,6 +459,7 @@ class StrategyServer(Node):
             start=tuple(arm.points[0].positions) if arm is not None and arm.points else (),
             state_known=stages.state_known,
             motion=Motion(plan, stages.strategy, outcome.tool_id, outcome.target_id, stages.scene.header.stamp),
+            mark=mark_of(plan),
         )
 
     def _when_allowed(self, ask: Callable[[], Any], token: Token) -> Any:
@@ -453,47 +500,31 @@ class StrategyServer(Node):
         except Exception as error:
             self.get_logger().warning(f"no markers: {describe(self, error)[1]}")
 
-    def _carry_out(
-        self,
-        arm: Arm,
-        claim: Claim,
-        outcome: pipeline.Outcome,
-        stages: Stages,
-        token: Token,
-        result: RunStrategy.Result,
-        notify: Callable[[pipeline.Progress], None],
-    ) -> None:
+    def _carry_out(self, loop: ClosedLoop, result: RunStrategy.Result) -> None:
         """Have arm and gripper do what was planned, and write into the result how that went."""
-
-        def tell(text: str) -> None:
-            index = outcome.reports[-1].trial.index
-            notify(pipeline.Progress("execute", index, len(stages.matches.candidates), text, outcome.reports))
-
-        points = outcome.plan.arm_trajectory.points
-        moved_by = {0: (), 1: (outcome.tool_id,), 2: (outcome.tool_id, outcome.target_id)}
-
-        def ask(point: int, moved: int) -> None:
-            asked = replace(claim, start=tuple(points[point].positions), meant=frozenset(moved_by[moved]))
-
-            def allowed() -> None:
-                world = self._world(asked)
-                permit(asked, replace(world, servers={**world.servers, **arm.servers()}), self._limits, Purpose.MOVE)
-
-            self._when_allowed(allowed, token)
-            # Nobody else is to begin what is being carried out.
-            self.publication.take_back("the strategy server carries it out itself", claim.run)
-
-        sentence, metrics = pipeline.split_metrics(result.message)
+        first = loop.jobs[0].outcome
+        kind = "verified" if first.verified else "UNVERIFIED"
+        self.get_logger().warning(f"the arm is about to move, if it may: carrying out the {kind} plan")
+        notes, error = list(result.notes), None
         try:
-            kind = "verified" if outcome.verified else "UNVERIFIED"
-            self.get_logger().warning(f"the arm is about to move, if it may: carrying out the {kind} plan")
-            arm.execute(outcome.plan, token, tell, ask)
-            result.executed = True
-            sentence += "; carried out by the arm"
-        except Exception as error:
+            seen = loop.execute()
+        except Exception as failure:
+            error = failure
+        last = loop.jobs[-1].outcome
+        fill(result, pipeline.joined(loop.tried, last))
+        result.notes = [*notes, *loop.notes]
+        result.executed = loop.executed
+        sentence, metrics = pipeline.split_metrics(last.message)
+        sentence = "; ".join([sentence, *notes])
+        if error is None:
+            sentence += "; carried out by the arm" + (f", and seen to be met: {seen}" if seen else "")
+        else:
             result.code, message = describe(self, error)
-            sentence = f"{'verified' if outcome.verified else 'planned'} ({sentence}), but not carried out to the end: {message}"
+            how = "carried out" if loop.executed else "not carried out to the end"
+            sentence = f"{'verified' if last.verified else 'planned'} ({sentence}), but {how}: {message}"
             self.get_logger().error(sentence)
+        if len(loop.jobs) > 1:
+            sentence += f"; motions begun: {len(loop.jobs)}"
         result.message = pipeline.with_metrics(sentence, list(metrics.items()))
 
     def wind_down(self) -> bool:
@@ -544,11 +575,9 @@ def tell_rates(message: CandidateReport | RunStrategy.Result, verdict: Verdict) 
 
 def look_at(scene: SceneObjectArray) -> Look:
     """The objects of a message as the rule wants to know them; ``came`` is not filled in."""
-    reaches = {}
-    for item in scene.objects:
-        vertices = np.array([(p.x, p.y, p.z) for p in item.mesh.vertices]).reshape(-1, 3)
-        reaches[item.id] = scene_change.hull(transforms.apply(conversions.pose_from_msg(item.pose), vertices))
-    return Look(reaches, scene.header.frame_id.lstrip("/"), conversions.time_from_msg(scene.header.stamp), -math.inf)
+    reaches = {item.id: hull_of(item) for item in scene.objects}
+    partly = frozenset(item.id for item in scene.objects if SceneObject.ROBOT in item.cut_off)
+    return Look(reaches, scene.header.frame_id.lstrip("/"), conversions.time_from_msg(scene.header.stamp), -math.inf, partly)
 
 
 def fill(result: RunStrategy.Result, outcome: pipeline.Outcome) -> None:

@@ -207,6 +207,28 @@ def test_what_promises_most_comes_next(scores, code, expected):
     assert order == expected
 
 
+def test_what_was_tried_before_is_left_out():
+    tried = {0: 2, 1: 1, 2: 0}
+    candidates = [candidate(1.0), candidate(0.9), candidate(0.8)]
+    agenda = Agenda(candidates, ("keep",), 2, lambda c: tried[candidates.index(c)])
+    order = []
+    while (entry := agenda.next()) is not None:
+        order.append((entry[1].index, entry[1].attempt))
+        agenda.failed(*entry, Code.NO_IK)
+    assert order == [(1, 1), (2, 0), (2, 1)]
+    outcome = execute(Script([candidate()]), spent=lambda c: 9)
+    assert (outcome.code, outcome.message) == (Code.NO_CANDIDATE_SUCCEEDED, "each of 1 candidates has been tried before")
+
+
+def test_runs_of_one_goal_are_told_together():
+    failed = execute(Script([candidate()], verify=lambda t: Code.DRIFT, cost=1.0))
+    passed = execute(Script([candidate()], cost=1.0))
+    both = pipeline.joined([failed, passed], passed)
+    assert (both.code, both.plan, both.simulations) == (Code.OK, passed.plan, 2)
+    assert [r.code for r in both.reports] == [Code.DRIFT, Code.OK]
+    assert both.seconds == {"perceive": 2.0, "match": 2.0, "plan": 2.0, "verify": 2.0, "total": 8.0}
+
+
 def test_agenda_is_empty_in_the_end():
     agenda = Agenda([candidate()], ("keep",), 1)
     turn, trial = agenda.next()

@@ -1,0 +1,267 @@
+"""Whether a strategy's goal is met by what cameras see after the motion.  No ROS here.
+
+The goal is the tree that simulation decides as well (:mod:`magic_core.goal`); here it is asked of where things are before the
+motion and in two looks after it.  An answer is yes, no, or that it cannot be told: where a thing is not seen, where it is
+nearer to a bound than its place is known, and of how it is turned (the frame of a reconstructed thing is another one with each look).
+What touches what is told by how near their surfaces are.  What only a simulation can try (pushes, pulls to the side, other draws), and masses and
+impulses, are not asked: they were when the motion was verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from magic_core import transforms
+from magic_core.errors import Code, MagicError
+from magic_core.goal import PREDICATES, Node, leaf_words
+from magic_core.mesh import Mesh
+from magic_core.strategy import Strategy
+
+Array = NDArray[np.float64]
+
+#: What no camera tells.
+UNASKED = frozenset({"masses", "history", "trying"})
+#: Points that stand for a surface.
+SURFACE = 1000
+#: The gripper, by the names that goals have for it.
+HAND = ("hand", "arm", "fingers")
+
+
+@dataclass(frozen=True)
+class Thing:
+    """An object as it was seen: points (N, 3) on its surface and the middle (3,) of its box, in the world."""
+
+    points: Array
+    middle: Array
+
+    @classmethod
+    def of(cls, mesh: Mesh, world_from_object: Array) -> Thing:
+        """Of a mesh at a pose (4, 4)."""
+        corners = transforms.apply(world_from_object, mesh.vertices)
+        surface = mesh.vertices
+        if len(mesh.faces):
+            surface = np.concatenate([surface, trimesh.sample.sample_surface(mesh.to_trimesh(), SURFACE, seed=0)[0]])
+        return cls(transforms.apply(world_from_object, surface), (corners.min(axis=0) + corners.max(axis=0)) / 2)
+
+    @property
+    def extents(self) -> Array:
+        """(3,): of its box along the world's axes, m."""
+        return np.asarray(np.ptp(self.points, axis=0))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One look: things by id, and when, s."""
+
+    things: Mapping[str, Thing]
+    stamp: float
+
+
+@dataclass(frozen=True)
+class SeenGoal:
+    """met: whether the goal is met, ``None`` where it cannot be told; message: by what."""
+
+    met: bool | None
+    message: str
+
+
+@dataclass(frozen=True)
+class _Told:
+    truth: bool | None
+    text: str
+
+
+def judge(
+    strategy: Strategy, names: Mapping[str, str], before: Sight, first: Sight, second: Sight, table: Array, released: bool, accuracy: float
+) -> SeenGoal:
+    """Ask a strategy's goal of what was seen.
+
+    names: the ids of ``tool`` and ``target``.  first, second: two looks after the motion.  table (4,): plane, unit normal up.
+    released: the fingers have let the tool go.  accuracy: m to which the middle of a thing is known that is seen twice.
+    """
+    asked = _Asked(strategy, names, before, first, second, table, released, accuracy)
+    found = asked.node(strategy.goal.tree)
+    if found is None:
+        return SeenGoal(None, "none of it shows")
+    return SeenGoal(found.truth, found.text)
+
+
+class _Asked:
+    def __init__(
+        self,
+        strategy: Strategy,
+        names: Mapping[str, str],
+        before: Sight,
+        first: Sight,
+        second: Sight,
+        table: Array,
+        released: bool,
+        accuracy: float,
+    ) -> None:
+        self.strategy, self.names, self.table, self.released, self.accuracy = strategy, names, table, released, accuracy
+        self.before, self.first, self.now = before, first, second
+
+    # ------------------------------------------------------------ the tree
+
+    def node(self, node: Node) -> _Told | None:
+        """The answer of a node; ``None`` where it is not to be asked."""
+        if node.after is not None and node.after.kind == "push":
+            return None
+        if node.kind in PREDICATES:
+            if UNASKED & set(PREDICATES[node.kind].needs):
+                return None
+            return self.leaf(node)
+        found = [answer for child in node.of if (answer := self.node(child)) is not None]
+        if not found:
+            return None
+        if node.kind == "not":
+            return _Told(None if found[0].truth is None else not found[0].truth, f"not: {found[0].text}")
+        decisive = node.kind == "any"  # one such answer decides
+        decided = [answer for answer in found if answer.truth is decisive]
+        if decided:
+            return _Told(decisive, "; ".join(answer.text for answer in (decided[:1] if decisive else decided)))
+        untold = [answer for answer in found if answer.truth is None]
+        if untold:
+            return _Told(None, "; ".join(dict.fromkeys(answer.text for answer in untold)))
+        return _Told(not decisive, "; ".join(dict.fromkeys(answer.text for answer in found if answer.text)))
+
+    def leaf(self, node: Node) -> _Told:
+        """The answer of a predicate."""
+        decide = getattr(self, f"_{node.kind}", None)
+        if decide is None or "row" in node.args.values():
+            return _Told(None, f"that {leaf_words(node)}: no camera tells")
+        try:
+            found = decide(**node.args)
+            # What is seen afterwards may have been otherwise meanwhile.
+            if (node.ever is not None and found.truth is False) or (node.always is not None and found.truth):
+                return _Told(None, f"that {leaf_words(node)}: it is not watched all the time")
+            return found
+        except LookupError as error:
+            return _Told(None, f"that {leaf_words(node)}: {error.args[0]} is not seen")
+
+    # ------------------------------------------------------------ what is seen
+
+    def thing(self, name: str, sight: Sight) -> Thing:
+        """Raises LookupError with the id."""
+        name = self.names.get(name, name)
+        if name not in sight.things:
+            raise LookupError(name)
+        return sight.things[name]
+
+    def way(self, name: str) -> tuple[Array, float]:
+        """How far a thing's middle has moved (3,), and how exactly that is known, m: of what is seen in part now, less so."""
+        before, now = self.thing(name, self.before), self.thing(name, self.now)
+        return now.middle - before.middle, self.accuracy + float(np.abs(now.extents - before.extents).max()) / 2
+
+    def height(self, thing: Thing) -> float:
+        """Of its middle above the table, m."""
+        a, b, c, d = (float(v) for v in self.table)
+        x, y, z = (float(v) for v in thing.middle)
+        return z + (a * x + b * y + d) / c
+
+    def direction(self, along: Any) -> Array:
+        """The unit vector (3,) of a direction's name or numbers."""
+        if not isinstance(along, str):
+            return transforms.unit(np.asarray(along, dtype=float))
+        if along in ("up", "down"):
+            return np.array([0.0, 0.0, 1.0 if along == "up" else -1.0])
+        inwards = -np.asarray(self.strategy.target_normal, dtype=float)
+        if along == "press":
+            return transforms.unit(inwards)
+        level = inwards * [1.0, 1.0, 0.0]
+        if np.linalg.norm(level) < 1e-6:
+            raise MagicError(Code.BAD_STRATEGY, f"target_normal of a strategy with the direction {along}", inwards, "along the table")
+        level = transforms.unit(level)
+        return level if along == "pull" else np.cross([0, 0, 1.0], level)
+
+    def at_least(self, value: float, bound: float, exact: float, text: str) -> _Told:
+        """Whether a value is at least a bound, where it is known so exactly."""
+        truth = None if abs(value - bound) < exact else value > bound
+        doubt = f", known to {1000 * exact:.0f} mm" if truth is None else ""
+        return _Told(truth, f"{text}{doubt}")
+
+    # ------------------------------------------------------------ predicates
+
+    def _moved(self, what: str, along: Any, by: float) -> _Told:
+        way, exact = self.way(what)
+        moved = float(way @ self.direction(along))
+        return self.at_least(moved, by, exact, f"the {what} moved {1000 * moved:.0f} mm of {1000 * by:g}")
+
+    def _stayed(self, what: str, within: float) -> _Told:
+        way, exact = self.way(what)
+        moved = float(np.linalg.norm(way))
+        return self.at_least(-moved, -within, exact, f"the {what} moved {1000 * moved:.0f} mm, allowed {1000 * within:g}")
+
+    def _drift(self, what: str, along: Any, below: float, of: str) -> _Told:
+        (way, exact), direction = self.way(what), self.direction(along)
+        side = np.cross([0, 0, 1.0], direction)
+        level = np.linalg.norm(side) > 0.5
+        aside = abs(float(way @ transforms.unit(side))) if level else float(np.linalg.norm(way - (way @ direction) * direction))
+        if of == "radius":
+            across = self.thing("target", self.before).points @ (transforms.unit(side) if level else np.array([1.0, 0.0, 0.0]))
+            below *= float(across.max() - across.min()) / 2
+        return self.at_least(-aside, -below, exact, f"the {what} drifted {1000 * aside:.0f} mm sideways, allowed {1000 * below:.0f}")
+
+    def _above(self, what: str, height: float) -> _Told:
+        now = self.thing(what, self.now)
+        found = self.height(now)
+        text = f"the {what} is {1000 * found:.0f} mm above the table, needed {1000 * height:g}"
+        return self.at_least(found, height, self.accuracy, text)
+
+    def _inside(self, what: str, low: Any, high: Any, of: str) -> _Told:
+        place = self.thing(what, self.now).middle - (self.thing("target", self.before).middle if of == "start" else 0.0)
+        room = float(np.minimum(place - np.asarray(low), np.asarray(high) - place).min())
+        where = f"{1000 * abs(room):.0f} mm {'inside' if room > 0 else 'outside'} of the region"
+        return self.at_least(room, 0.0, self.accuracy, f"the {what} is {where}")
+
+    def _at_rest(self, what: str, below: float, turning: float) -> _Told:
+        way = float(np.linalg.norm(self.thing(what, self.now).middle - self.thing(what, self.first).middle))
+        seconds = max(self.now.stamp - self.first.stamp, 1e-3)
+        text = f"the {what} moved {1000 * way:.0f} mm in {seconds:.1f} s"
+        return _Told(True, text) if way <= self.accuracy else self.at_least(-way, -below * seconds, self.accuracy, text)
+
+    def _released(self) -> _Told:
+        return _Told(self.released, "the tool was let go" if self.released else "the tool is in the hand")
+
+    def _hand_away(self, by: float) -> _Told:
+        return _Told(self.released, "the hand has gone away" if self.released else "the tool is in the hand")
+
+    def gap(self, what: str, whom: str) -> float:
+        """How near the surfaces of two bodies are, m."""
+        thing = self.thing(what, self.now)
+        if whom == "table":
+            return float((thing.points @ self.table[:3] + self.table[3]).min())
+        return float(cKDTree(self.thing(whom, self.now).points).query(thing.points)[0].min())
+
+    def _touching(self, what: str, whom: str) -> _Told:
+        if whom in HAND:
+            held = what == "tool" and not self.released
+            return _Told(True if held else None, "the tool is in the hand" if held else f"whether the hand touches the {what} is not seen")
+        gap = self.gap(what, whom)
+        # Surfaces are known to the accuracy of both, and between their points is room.
+        truth = True if gap <= self.accuracy else (False if gap > 3 * self.accuracy else None)
+        return _Told(truth, f"the {what} is {1000 * max(gap, 0.0):.0f} mm from the {whom}")
+
+    def _touching_only(self, what: str, whom: str) -> _Told:
+        own = {self.names.get(what, what), self.names.get(whom, whom)}
+        others = [name for name in ("table", *self.now.things) if name != whom and name not in own]
+        found = [self._touching(what, other) for other in others]
+        if what == "tool" and not self.released and whom not in HAND:
+            return _Told(False, "the tool is in the hand")
+        near = [answer for answer in found if answer.truth is not False]
+        if near:  # what looks like a touch may be none: nobody knows
+            return _Told(None, "; ".join(answer.text for answer in near))
+        return _Told(True, f"the {what} is away from all but the {whom}")
+
+    def _held_by(self, what: str, whom: str) -> _Told:
+        touching, only = self._touching(what, whom), self._touching_only(what, whom)
+        if False in (touching.truth, only.truth):
+            return _Told(False, touching.text if touching.truth is False else only.text)
+        return _Told(None if None in (touching.truth, only.truth) else True, f"{touching.text}; {only.text}")
