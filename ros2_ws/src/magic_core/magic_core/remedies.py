@@ -232,5 +232,25 @@ REMEDIES: dict[Code, Remedy] = {
         "Two servers of one kind are there: whose answer counts cannot be told.",
         "End all but one (`ros2 node list`); another ROS_DOMAIN_ID for each setup.",
     ),
+    Code.SCENE_CHANGED: Remedy(
+        "Target or obstacles moved while the arm was at work; it was stopped, and no further plan was allowed or found.",
+        "Keep the scene still, or raise loop.replans; loop.watch_tolerance says how much is a move.",
+    ),
+    Code.TOOL_SLIPPED: Remedy(
+        "The tool is off in the hand, by more than is allowed or than a plan could be made for; the arm stands with it.",
+        "Take the tool out of the hand; more effort, softer pads, a grasp nearer to its middle. loop.slip_shift and loop.slip_turn are the limits.",
+    ),
+    Code.GOAL_MISSED: Remedy(
+        "Carried out, but by what cameras see afterwards the goal is not met, and no further try was allowed or found.",
+        "The message says what was measured; loop.executions allows more tries. Compare friction and densities of the strategy with the real things.",
+    ),
+    Code.GOAL_UNSEEN: Remedy(
+        "Carried out, but whether the goal is met cannot be told by what cameras see.",
+        "Look for yourself; another camera where the message says that something is not seen; loop.judge: false asks no such thing.",
+    ),
+    Code.ARM_NOT_AT_REST: Remedy(
+        "The arm was told to stop and is not known to stand.",
+        "Look at the arm first. Its controller may not honour a cancel, or joint_states are late or silent; loop.rest_time is the time given.",
+    ),
     Code.INTERNAL: Remedy("A defect of this software.", "Please report it with the node's output: it holds the traceback."),
 }
