@@ -283,7 +283,9 @@ class ClosedLoop:
 
     def _lies(self, item: SceneObject, job: Job) -> bool:
         """Whether an object is the tool, where it was before it was grasped, and seen there."""
-        before = job.claim.scene.objects[job.outcome.tool_id]
+        before = job.claim.scene.objects.get(job.outcome.tool_id)
+        if before is None:  # it was in the hand already
+            return False
         seen = item.source == SceneObject.CAMERA and SceneObject.ROBOT not in item.cut_off
         return seen and scene_change.distance(before, hull_of(item)) <= self._limits.object_tolerance
 

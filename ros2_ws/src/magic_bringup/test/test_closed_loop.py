@@ -151,6 +151,14 @@ def test_a_tool_that_is_off_in_the_hand_is_planned_with_as_it_is(bench):
     assert "motions begun: 2" in result.message
 
 
+def test_a_tool_that_is_out_of_sight_after_it_was_corrected_is_carried_on(bench):
+    bench.table.off = off(0.015)
+    scene = bench.table.scene
+    bench.fakes.see(lambda: replace(scene(), objects=scene().objects[len(asked(bench, "plan_motion")) > 1 :]))
+    result = run(bench)
+    assert "TOOL_SLIPPED" in result.notes[0] and "was not seen" in result.notes[1]
+
+
 def test_a_motion_planned_anew_has_its_own_verdict_or_does_not_begin(bench):
     bench.table.off = off(0.015)
     passes = bench.fakes.verify
