@@ -1,0 +1,71 @@
+"""Pushing, tipping, pressing, reaching, pulling a ring: the goals of the strategies that ship refuse what only looks like it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("magic_planner.object_motion")
+
+from magic_bringup import handling
+from magic_core import transforms
+from magic_core.contact import ContactCandidate
+from magic_core.errors import Code
+from magic_core.motion import MotionPlan
+from magic_core.shapes import make
+from magic_planner.object_motion import plan_tool_motion
+from magic_verifier import evaluate as ev
+from magic_verifier.cases import scene_for
+from magic_verifier.verification import verify
+
+
+def shown(name, change=lambda offset, phase: offset):
+    """The verdict on a demonstration whose waypoints were changed, in the scene as given."""
+    strategy = handling.STRATEGIES[name]()
+    waypoints = tuple(replace(w, offset=np.asarray(change(w.offset.copy(), w.phase))) for w in strategy.waypoints)
+    strategy = replace(strategy, waypoints=waypoints)
+    target, obstacles, _ = scene_for(strategy, "demonstration")
+    entry = strategy.environment["tool"]
+    item = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("tool", transforms.make(translation=[0.4, -0.3, 0.02]))
+    candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
+    motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
+    return verify(strategy, item, target, obstacles, ev.TABLE, candidate, MotionPlan("fg", motion), repetitions=1)
+
+
+def shorter(by):
+    """The way of the goal and of what follows ends so much (m) earlier."""
+    return lambda offset, phase: offset + (np.array([by, 0, 0]) if phase in ("goal", "retreat") else 0)
+
+
+def shifted(**by):
+    return lambda offset, phase: offset + np.array([by.get(axis, 0.0) for axis in "xyz"])
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "codes", "words"),
+    [
+        ("pushing", shorter(0.1), (Code.GOAL_NOT_REACHED,), "not pushed far enough"),
+        # Met near its end the block turns away from the tool.
+        ("pushing", shifted(y=0.13), (Code.DRIFT, Code.GOAL_NOT_REACHED), ""),
+        ("pushing", shifted(z=-0.06), (Code.GOAL_NOT_REACHED,), "not pushed far enough"),
+        # Low on its side a block slides and does not tip.
+        ("tipping", shifted(z=0.075), (Code.GOAL_NOT_REACHED,), "not tipped over"),
+        ("tipping", shorter(0.06), (Code.GOAL_NOT_REACHED,), "not tipped over"),
+        ("pressing", shorter(0.03), (Code.LOST_CONTACT, Code.GOAL_NOT_REACHED), ""),
+        ("pressing", shifted(y=0.25), (Code.LOST_CONTACT,), "the tool did not press on the target"),
+        ("reaching", shifted(x=0.02), (Code.LOST_CONTACT,), "does not reach"),
+        ("reaching", shorter(-0.04), (Code.DRIFT,), "the target was moved"),
+        ("ring_pulling", shorter(0.1), (Code.GOAL_NOT_REACHED,), "not pulled far enough"),
+        # In front of the ring it pulls nothing.
+        ("ring_pulling", shifted(x=-0.12), (Code.LOST_CONTACT,), "lost the target"),
+    ],
+)
+def test_what_only_looks_like_it_is_refused(name, change, codes, words):
+    verdict = shown(name, change)
+    assert not verdict.success and verdict.code in codes, verdict.message
+    assert words in verdict.message
+
+
+def test_a_ring_is_held_to_both_sides():
+    verdict = shown("ring_pulling")
+    assert verdict.success and verdict.metrics["sides_held"] == 2.0, verdict.message
