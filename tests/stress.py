@@ -73,6 +73,7 @@ SERVER_PARAMETERS = {
     "start_tolerance": 0.5,
     "trajectory_action": "arm/follow_joint_trajectory",
     "gripper_action": "gripper/gripper_action",
+    **fakes.OPEN_LOOP,
 }
 
 

@@ -20,9 +20,7 @@ SERVER = {
     "state_age": 10.0,
     "objects_age": 20.0,
     # The cameras show the same moment for ever: neither the mug in the hand nor where it hangs in the end.
-    "loop.look": False,
-    "loop.watch": False,
-    "loop.judge": False,
+    **fakes.OPEN_LOOP,
     "trajectory_action": "arm/follow_joint_trajectory",
     "gripper_action": "gripper/gripper_action",
     **ONCE,

@@ -22,6 +22,7 @@ SERVER = {
     "objects_age": 60.0,
     "trajectory_action": "arm/follow_joint_trajectory",
     "gripper_action": "gripper/gripper_action",
+    **fakes.OPEN_LOOP,
 }
 #: No move of the stand-in ends by itself before this, s.
 LONG = 30.0

@@ -29,6 +29,9 @@ from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
 
+#: Parameters of a strategy server that leave its loop open: what these stand-ins do not show is not looked for.
+OPEN_LOOP = {"loop.look": False, "loop.watch": False, "loop.judge": False, "loop.executions": 1}
+
 
 def box(size: float = 0.05) -> Mesh:
     """A cube about the origin with edges of ``size`` metres, faces counter-clockwise from outside."""

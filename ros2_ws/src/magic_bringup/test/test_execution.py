@@ -116,8 +116,7 @@ def folder(tmp_path_factory):
 
 
 ACTIONS = {"trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}
-#: The loop left open: nothing is looked at after the arm has begun but what the rule asks for.  (Closed: test_closed_loop.py.)
-OPEN = {"loop.look": False, "loop.watch": False, "loop.judge": False, "loop.executions": 1}
+OPEN = fakes.OPEN_LOOP  # closed: test_closed_loop.py
 
 
 @pytest.fixture(scope="module")

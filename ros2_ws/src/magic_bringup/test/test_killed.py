@@ -38,6 +38,7 @@ PARAMETERS = {
     "objects_age": 60.0,
     "trajectory_action": "arm/follow_joint_trajectory",
     "gripper_action": "gripper/gripper_action",
+    **{name: str(value).lower() for name, value in fakes.OPEN_LOOP.items()},
 }
 #: In which stage a role itself is at work.
 OWN = {"perception": "perceive", "matcher": "match", "planner": "plan", "verifier": "verify"}
