@@ -10,6 +10,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +42,15 @@ class _Layer:
 
 
 class Bodies:
-    """Coloured meshes by name, each in its own frame, ready to be looked at; several cameras may share them."""
+    """Coloured meshes by name, each in its own frame, ready to be looked at; several cameras may share them.  beside: others that are
+    there as well."""
 
-    def __init__(self, meshes: Mapping[str, Mesh]) -> None:
+    def __init__(self, meshes: Mapping[str, Mesh], beside: Bodies | None = None) -> None:
         self.casters = {name: Raycaster([mesh]) for name, mesh in meshes.items()}
         self.corners = {name: _corners(mesh) for name, mesh in meshes.items()}
+        if beside is not None:
+            self.casters |= beside.casters
+            self.corners |= beside.corners
 
 
 class Camera:
@@ -59,8 +64,7 @@ class Camera:
         self._rays = along / self._length[..., None]  # camera frame
         self._layers: dict[str, _Layer] = {}
         self._table = self._cast_table()
-        shape = (intrinsics.height, intrinsics.width)
-        self._noise = [sensor.Noise.draw(shape, [zlib.crc32(name.encode()), k]).light() for k in range(DRAWS)]
+        self._noise = _draws(name, (intrinsics.height, intrinsics.width))
         self._all: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]] | None = None
 
     def _cast_table(self) -> _Layer:
@@ -131,6 +135,12 @@ class Camera:
             cosine[layer.window][before] = layer.cosine[before]
             image[layer.window][before] = layer.image[before]
         return np.where(np.isfinite(depth), depth, np.float32(np.nan)), cosine, image
+
+
+@lru_cache(maxsize=8)
+def _draws(name: str, shape: tuple[int, int]) -> list[sensor.Noise]:
+    """A camera's draws of noise, the same after each reset."""
+    return [sensor.Noise.draw(shape, [zlib.crc32(name.encode()), k]).light() for k in range(DRAWS)]
 
 
 def _corners(mesh: Mesh) -> Array:

@@ -69,7 +69,8 @@ class LabNode(Node):
         self._read()
         self.robot = Description(RobotConfig(**robot_parameters(self)))
         self._base = self.robot.base_frame
-        self._links = {link: mesh for link in self.robot.links if (mesh := link_mesh(self.robot, link)) is not None and len(mesh.faces)}
+        links = {link: mesh for link in self.robot.links if (mesh := link_mesh(self.robot, link)) is not None and len(mesh.faces)}
+        self._links = Bodies(links)
         self._lock = threading.Lock()  # of the lab between two ticks
         self._resets: list[tuple[threading.Event, list[str]]] = []
         self._stopping = False
@@ -158,7 +159,7 @@ class LabNode(Node):
         scenario, case, seed, events = self._scene_parameters()
         scene = draw(scenario, case, seed, self._strategies)
         lab = Lab(scene, self.robot, events, self._allow_stalling)
-        bodies = Bodies({**self._links, **{thing.name: thing.item.mesh for thing in lab.scene.things}})
+        bodies = Bodies({thing.name: thing.item.mesh for thing in lab.scene.things}, self._links)
         self._cameras = [Camera(name, pose, bodies) for name, pose in sensor.STATION.items()]
         old = getattr(self, "lab", None)
         with self._lock:
@@ -269,7 +270,7 @@ class LabNode(Node):
 
     def _photograph(self, lab: Lab, positions: dict[str, float], stamp: float) -> None:
         links = self.robot.poses(positions)
-        poses = {**{name: links[name] for name in self._links}, **lab.world.poses()}
+        poses = {**{name: links[name] for name in self._links.casters}, **lab.world.poses()}
         self._pictures += 1
         for number, camera in enumerate(self._cameras):
             if number == 0 and lab.silent.camera:

@@ -220,7 +220,7 @@ class Session:
         return self.result
 
     def trial(self, scenario: Scenario, case: str, seed: int, out: Path, events: str = "") -> dict[str, Any]:
-        """One trial, as plain data; its picture and video lie in ``out``."""
+        """One trial, as plain data; it, its picture and its video lie in ``out``."""
         record: dict[str, Any] = {
             "scenario": scenario.name,
             "object": case,
@@ -263,8 +263,11 @@ class Session:
         record.setdefault("code", int(Code.INTERNAL))
         record["stage"] = _stage(record)
         record["wall_seconds"] = round(time.monotonic() - begun, 1)
-        name = f"{case.replace(':', '_').replace(' ', '_')}_{seed}"
-        record.update(film(seen, out, name))
+        path = _path(out, case, seed)
+        out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(record, indent=2) + "\n")  # what took minutes is not lost to who interrupts the film
+        record.update(film(seen, out, path.stem))
+        path.write_text(json.dumps(record, indent=2) + "\n")
         return record
 
 
@@ -297,7 +300,6 @@ def film(seen: Seen, out: Path, name: str) -> dict[str, Any]:
         frames.append(np.concatenate([np.concatenate(list(now.values()), axis=1), bar]))
     if not frames:
         return {}
-    out.mkdir(parents=True, exist_ok=True)
     animation = cv2.Animation()
     animation.frames, animation.durations = frames, np.full(len(frames), FRAME_MS)
     files = {"video": f"{name}.webp", "picture": f"{name}.jpg"}
@@ -369,7 +371,6 @@ def do(
                 if time.monotonic() > end:
                     break
                 record = session.trial(scenario, case, number, out)
-                _path(out, case, number).write_text(json.dumps(record, indent=2) + "\n")
                 records[case, number] = record
                 what = "succeeded" if record["success"] else f"failed at {record['stage']} [{Code(record['code']).name}]: {_reason(record)}"
                 say(f"{scenario.name}, {case}, seed {number}: {what} ({record['wall_seconds']:.0f} s)")

@@ -35,10 +35,10 @@ DEADLINE = 60.0
 
 
 def plan():
-    """Above the block at 2 s, round it at 3.2 s, up again at 4.4 s."""
+    """Above the block at 1.4 s, round it at 2 s, up again at 2.6 s."""
     rows = np.array([HOME, ABOVE, lowered(0.07), ABOVE])
     still = np.zeros_like(rows)
-    arm = ArmMotion(np.array([0.0, 2.0, 3.2, 4.4]), robot().names, rows, still, still, np.eye(4), 0.03, 3.2, None)
+    arm = ArmMotion(np.array([0.0, 1.4, 2.0, 2.6]), robot().names, rows, still, still, np.eye(4), 0.03, 2.0, None)
     return MotionPlan("arm", fakes.plan("fg").tool_motion, arm)
 
 
@@ -49,7 +49,7 @@ class Rig:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=free_domain())
         self.lab = self.made(magic_lab.node.LabNode, camera_rate=0.1, rate=2.0)
-        settings = {"objects_age": 3.0, "state_age": 1.5, "objects_timeout": 2.0, "server_timeout": 5.0, "effort": 40.0, **fakes.OPEN_LOOP}
+        settings = {"objects_age": 1.5, "state_age": 1.0, "objects_timeout": 1.0, "server_timeout": 5.0, "effort": 40.0, **fakes.OPEN_LOOP}
         self.server = self.made(StrategyServer, strategies=folder, execute=True, use_sim_time=True, **settings)
         self.fakes = fakes.FakeServers(context=self.context)
         self.fakes.on_match = self.match
@@ -110,7 +110,7 @@ class Rig:
         done = self.reset_client.call_async(Trigger.Request())
         self.until(done.done)
         assert done.result().success, done.result().message
-        since = self.lab.now + 0.3
+        since = self.lab.now + 0.2
         self.until(lambda: self.lab.now > since)
 
     def run(self):
@@ -122,9 +122,9 @@ class Rig:
         return answer.result().result
 
     def stands(self):
-        """Whether nothing is at work and the arm stands still within a second."""
+        """Whether nothing is at work and the arm stands still soon."""
         lab = self.lab.lab
-        end = lab.time + 1.0
+        end = lab.time + 0.6
         self.until(lambda: lab.time > end)
         return lab.arm.goal is None and lab.gripper.goal is None and float(np.abs(lab.joints[1]).max()) < 0.02
 
