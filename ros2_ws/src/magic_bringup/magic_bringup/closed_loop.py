@@ -44,6 +44,8 @@ from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
 SETTLED = 0.3
 #: An arm is at rest where no joint has moved by more than so many rad in so many seconds.
 STILL, STILL_FOR = 0.003, 0.1
+#: A simulation is given so many times the wall's time.
+SLOWEST = 20.0
 #: joint_states that are silent for so much longer than ``state_age`` while the arm moves stop it, s: a busy machine delivers late.
 SILENT = 1.0
 #: Failures after which the next candidate is tried, from the state as it is then.
@@ -62,6 +64,8 @@ class Robot(Server, Protocol):
     def world(self, claim: Claim) -> World: ...
 
     def get_clock(self) -> Any: ...
+
+    def get_parameter(self, name: str) -> Any: ...
 
 
 class Off(Exception):
@@ -117,6 +121,7 @@ class ClosedLoop:
         self._held: Held | None = None
         self._touched = self._may_touch = False
         self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
+        self._simulated = bool(server.get_parameter("use_sim_time").value)
         self._bounds = Bounds(settings.executions, settings.replans, time.monotonic() + settings.seconds)
 
     # ------------------------------------------------------------ the loop
@@ -206,7 +211,9 @@ class ClosedLoop:
             try:
                 with suppress(NotYet):  # what cannot be told in the base's frame yet has not come yet
                     newest[0] = server.look()
-                watching.take(newest[0], began, self._now(), time.monotonic(), server.hand()[:3, 3])
+                # Of a simulation that is slower than the wall's clock only its own clock tells how old a thing is.
+                now = newest[0].came if self._simulated and newest[0] is not None else time.monotonic()
+                watching.take(newest[0], began, self._now(), now, server.hand()[:3, 3])
                 self._heard()
             except MagicError:
                 raise
@@ -216,9 +223,12 @@ class ClosedLoop:
         return check
 
     def _heard(self) -> None:
-        joints = self._server.joints.all()
-        came = min((joints[name].came for name in self._server.robot.names if name in joints), default=-math.inf)
-        silent, allowed = time.monotonic() - came, self._limits.state_age + SILENT
+        joints = [joint for name, joint in self._server.joints.all().items() if name in self._server.robot.names]
+        if self._simulated:
+            silent = self._now() - min((joint.stamp for joint in joints), default=-math.inf)
+        else:
+            silent = time.monotonic() - min((joint.came for joint in joints), default=-math.inf)
+        allowed = self._limits.state_age + SILENT
         if not silent <= allowed:
             raise MagicError(
                 Code.STALE_DATA, "joint_states are silent while the arm moves, for s", round(silent, 2), f"at most {allowed:g}"
@@ -294,6 +304,13 @@ class ClosedLoop:
     def _now(self) -> float:
         return float(self._server.get_clock().now().nanoseconds * 1e-9)
 
+    def _wait(self, done: Callable[[], bool], seconds: float) -> bool:
+        """Wait until ``done()``, at most so many seconds by the clock of the stamps, which in a simulation may be slow; returns it."""
+        end, patience = self._now() + seconds, SLOWEST * seconds if self._simulated else seconds
+        over = (lambda: self._now() >= end) if self._simulated else (lambda: False)
+        self._token.wait(lambda: done() or over(), time.monotonic() + patience, alive=lambda: None)
+        return done()
+
     def _fresh(self, since: float | None = None) -> SceneObjectArray | None:
         """The objects as a picture shows them that was taken from now on; ``None`` where none comes in time."""
         server, since = self._server, self._now() + SETTLED if since is None else since
@@ -302,7 +319,7 @@ class ClosedLoop:
             scene = server.scene
             return scene is not None and conversions.time_from_msg(scene.header.stamp) >= since
 
-        if not self._token.wait(came, time.monotonic() + self._settings.look_time):
+        if not self._wait(came, self._settings.look_time):
             return None
         try:
             return server.in_base(server.scene)
@@ -331,7 +348,7 @@ class ClosedLoop:
                 return False
             return all(joints[name].stamp - first[name].stamp >= STILL_FOR for name in names)
 
-        if not self._token.wait(stands, time.monotonic() + self._settings.rest_time, alive=lambda: None):
+        if not self._wait(stands, self._settings.rest_time):
             raise MagicError(
                 Code.ARM_NOT_AT_REST, f"{error.message}; the arm is not known to stand {self._settings.rest_time:g} s after it was to stop"
             )
