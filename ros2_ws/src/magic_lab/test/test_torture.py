@@ -153,8 +153,8 @@ def rig(tmp_path_factory):
     [
         ("abort@1+0.5", {Code.EXECUTION_FAILED}),
         ("block@1+0.4", {Code.EXECUTION_FAILED}),
-        ("take_tool@1+0.5", {Code.GRASP_FAILED, Code.NO_OBJECTS, Code.STALE_DATA}),
-        ("take_target@1+0.5", {Code.NO_OBJECTS, Code.STALE_DATA}),
+        ("take_tool@1+0.5", {Code.GRASP_FAILED, Code.SCENE_CHANGED}),
+        ("take_target@1+0.5", {Code.SCENE_CHANGED}),
         ("freeze@1+0.2", {Code.STALE_DATA}),
         ("silence@1+0.2", {Code.STALE_DATA}),
     ],
