@@ -449,8 +449,9 @@ def _node(data: Any, path: str, values: dict[str, float], tries: bool, plain: bo
         raise _bad(f"{path}.say", beside["say"], "a sentence without a colon: what was measured follows it")
     if kind not in GROUPS:
         return Node(kind, _args(PREDICATES[kind].args, data[kind], inner, values), **beside)
-    # Below a phase's end, a 'not' or an 'any' nothing is tried: it would be asked at another time, or of a changed scene.
-    tries = tries and kind == "all" and (after is None or after.kind in ("settle", *TRIES))
+    # Below a phase's end, a settling time, a 'not' or an 'any' nothing is tried: it would be asked while the motion still runs, where
+    # nothing can go on from, or of a changed scene.
+    tries = tries and kind == "all" and (after is None or after.kind in TRIES)
     plain, timed = plain and kind == "all", timed if after is None else after.kind
     if kind == "not":
         return Node(kind, of=(_node(data[kind], inner, values, False, False, timed),), **beside)

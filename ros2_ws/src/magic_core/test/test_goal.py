@@ -86,6 +86,8 @@ ITEM = ("test", "all")
         ((*ITEM, 0, "after"), {"lunch": 1}, r"goal.test.all\[0\].after: key: 'lunch' \(allowed: phase, settle, rest, push\)"),
         ((*ITEM, 1, "any", 1, "not", "touching", "whom"), "", r"goal.test.all\[1\].any\[1\].not.touching.whom: '' \(allowed: the id of a body\)"),
         ((*ITEM, 1, "any", 0, "after"), {"push": {"what": "target", "speed": 1}}, r"goal.test.all\[1\].any\[0\].after: 'push' \(allowed: phase or settle here"),
+        ((*ITEM, 1), {"after": {"settle": 1.0}, "all": [{"above": {"what": "tool", "height": 0}, "after": {"push": {"what": "tool", "speed": 1}}}]},
+         r"goal.test.all\[1\].all\[0\].after: 'push' \(allowed: phase or settle here"),
         ((*ITEM, 1, "as_given"), True, None),
         ((*ITEM, 1, "any", 0, "as_given"), True, r"goal.test.all\[1\].any\[0\].as_given: True \(allowed: only in 'all'"),
         ((*ITEM, 0, "throughout"), True, r"goal.test.all\[0\].throughout: True \(allowed: only in a group after a push"),
