@@ -106,7 +106,8 @@ def rests(joints: Sequence[tuple[float, Mapping[str, float]]], names: Sequence[s
         near = positions[(times >= at - AROUND) & (times <= at + AROUND)]
         if len(near) < 2 or np.ptp(near, axis=0).max() > STILL:
             continue
-        if found and np.abs(positions[index] - found[-1][2]).max() < APART:
+        # The same pose again after a move is another rest: what lies between is no picture of an arm at rest.
+        if found and at - found[-1][1] <= 2 * AROUND and np.abs(positions[index] - found[-1][2]).max() < APART:
             found[-1] = (found[-1][0], float(at), found[-1][2])
         else:
             found.append((float(at), float(at), positions[index]))

@@ -127,6 +127,13 @@ def test_rests_are_where_no_joint_moves():
     assert found[0][0] == 0.0 and found[0][1] < 1.0 and found[1][0] > 2.0
 
 
+def test_a_pose_that_is_come_back_to_is_another_rest():
+    times = np.arange(0.0, 3.0, 0.05)
+    out_and_back = np.clip(0.5 - np.abs(times - 1.5), 0.0, None)
+    found = rests([(t, {"a": a}) for t, a in zip(times, out_and_back, strict=True)], ["a"])
+    assert len(found) == 2 and found[0][1] < 1.0 and found[1][0] > 2.0
+
+
 def test_the_board_is_drawn_at_its_size(tmp_path, capsys):
     from PIL import Image
 
