@@ -362,7 +362,7 @@ def _frame_findings(camera: str, image: Any, seen: Seen) -> Iterator[Finding]:
         seen.transforms.lookup(target, image.header.frame_id)
     except MagicError as error:
         given = f"extrinsics.{camera}"
-        mend = f"calibrate_cameras prints the static transform; or set perception's {given}"
+        mend = f"publish the static transform, or give perception its {given}: calibrate_cameras writes them (cameras.param.yaml)"
         yield Finding("note", f"camera {camera}: no pose in TF: {error.message} (none is needed where {given} is set)", mend)
 
 
