@@ -22,8 +22,10 @@ from magic_perception.segmentation import Looked
 MOST_OFFSET, MOST_ANGLE = 0.010, float(np.radians(1.5))
 #: Metres and radians below which a disagreement is not worth a word; standard errors that chance may reach.
 LEAST_OFFSET, LEAST_ANGLE, CHANCE = 0.004, float(np.radians(0.75)), 2.2
-#: Points of each camera that are looked for in the other.
-POINTS = 600
+#: A thing has moved where its two views contradict each other by less than this share once one of them is moved.
+FITS = 0.92
+#: Points of each camera that are looked for in the other: of all things, and where one thing is looked at.
+POINTS, SINGLE = 600, 300
 #: Errors of neighbouring points go together, so that a point counts for less than one; and what a standard error is at least, m and rad.
 SPREAD, FLOOR = 3.0, (0.001, float(np.radians(0.1)))
 #: Of the points every so many-th looks for where to begin; the longest step (3,) of the search, m and rad.
@@ -213,10 +215,8 @@ def _solve(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int] | None:
     """The motion (3,) of ``second`` that contradicts least, its covariance (3, 3), the middle (3,) that it turns about, in the table
     frame, and how many points told; ``None`` where too few did."""
-    table_from_world = transforms.inverse(world_from_table)
     axes = world_from_table[:3, :3]
-    centre = transforms.apply(table_from_world, np.concatenate([first.points, second.points])).mean(axis=0)
-    middle = transforms.apply(world_from_table, centre)
+    centre = transforms.apply(transforms.inverse(world_from_table), np.concatenate([first.points, second.points])).mean(axis=0)
     # Where to begin: the shifts of a lattice that contradict least, and none.
     steps = np.arange(-0.048, 0.0481, 0.008)
     shifts = np.stack([a.ravel() for a in np.meshgrid(steps, steps)], axis=1)
@@ -228,29 +228,62 @@ def _solve(
         beside, gap, _ = _contradictions(one, other, moved, np.tile(normals, (len(world), 1)), 0.02)
         total = total + _cost(beside.reshape(len(world), -1), gap.reshape(len(world), -1))
     starts = [np.zeros(3), np.append(shifts[int(np.argmin(total))], 0.0)]
-    found = []
-    for x in starts:
-        for gate in (0.02, 0.015, 0.010, 0.010):
-            motion = world_from_table @ _motion(x, centre) @ table_from_world
-            _, places, normals, offsets = _told(first, second, motion, gate)
-            if len(offsets) < 40:
-                break
-            # A turn about the table's normal through the middle (which moves with the shift).
-            arm = np.cross(axes[:, 2], places - middle - axes[:, :2] @ x[:2])
-            jacobian = np.column_stack([normals @ axes[:, 0], normals @ axes[:, 1], np.sum(normals * arm, axis=1)]) / SURFACE
-            r = offsets / SURFACE
-            weight = 1 / np.maximum(1.0, np.abs(r))[:, None]
-            information = jacobian.T @ (weight * jacobian) / SPREAD**2 + np.diag(1 / PRIOR**2)
-            slope = jacobian.T @ (weight[:, 0] * r) / SPREAD**2 + x / PRIOR**2
-            x = x - np.clip(np.linalg.solve(information, slope), -LARGEST, LARGEST)
-        else:
-            motion = world_from_table @ _motion(x, centre) @ table_from_world
-            cost, _, _, offsets = _told(first, second, motion, 0.010)
-            found.append((cost, x, np.linalg.inv(information), len(offsets)))
+    found = [solved for x in starts if (solved := _refined(first, second, world_from_table, x, centre)) is not None]
     if not found:
         return None
     _, x, covariance, count = min(found, key=lambda f: f[0])
     return x, covariance, centre, count
+
+
+def _refined(
+    first: _Witness, second: _Witness, world_from_table: NDArray[np.float64], x: NDArray[np.float64], centre: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64], int] | None:
+    """From a motion ``x`` (3,) on, by surfaces: what is left contradictory, the motion, its covariance and how many points told; ``None`` where too few did."""
+    table_from_world = transforms.inverse(world_from_table)
+    axes = world_from_table[:3, :3]
+    middle = transforms.apply(world_from_table, centre)
+    for gate in (0.02, 0.015, 0.010, 0.010):
+        motion = world_from_table @ _motion(x, centre) @ table_from_world
+        _, places, normals, offsets = _told(first, second, motion, gate)
+        if len(offsets) < 40:
+            return None
+        # A turn about the table's normal through the middle (which moves with the shift).
+        arm = np.cross(axes[:, 2], places - middle - axes[:, :2] @ x[:2])
+        jacobian = np.column_stack([normals @ axes[:, 0], normals @ axes[:, 1], np.sum(normals * arm, axis=1)]) / SURFACE
+        r = offsets / SURFACE
+        weight = 1 / np.maximum(1.0, np.abs(r))[:, None]
+        information = jacobian.T @ (weight * jacobian) / SPREAD**2 + np.diag(1 / PRIOR**2)
+        slope = jacobian.T @ (weight[:, 0] * r) / SPREAD**2 + x / PRIOR**2
+        x = x - np.clip(np.linalg.solve(information, slope), -LARGEST, LARGEST)
+    motion = world_from_table @ _motion(x, centre) @ table_from_world
+    cost, _, _, offsets = _told(first, second, motion, 0.010)
+    return cost, x, np.linalg.inv(information), len(offsets)
+
+
+def shifted(
+    first: Looked, second: Looked, labels: tuple[NDArray[np.int32], NDArray[np.int32]], label: int, world_from_table: NDArray[np.float64]
+) -> float:
+    """By how much, m, one thing stands elsewhere in the table's plane in ``second`` than in ``first``; 0 where chance may be it.
+
+    labels (H, W): of both looks.  It starts from no shift at all, so that more than some 2 cm is not found.
+    """
+    rng = np.random.default_rng(label)
+    # Beside another thing nothing tells where this one ends.
+    one, two = (
+        _witness(look, np.where(image == label, 1, np.where(image != 0, -1, 0)), SINGLE, rng)
+        for look, image in zip((first, second), labels, strict=True)
+    )
+    if one is None or two is None:
+        return 0.0
+    centre = transforms.apply(transforms.inverse(world_from_table), np.concatenate([one.points, two.points])).mean(axis=0)
+    found = _refined(one, two, world_from_table, np.zeros(3), centre)
+    if found is None:
+        return 0.0
+    cost, x, covariance, _ = found
+    offset, error = float(np.hypot(x[0], x[1])), float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])) + FLOOR[0]
+    # Surfaces alone say little of what is flat: the masks have to fit better as well.
+    better = cost < FITS * _told(one, two, np.eye(4), 0.010)[0]
+    return offset if better and offset > CHANCE * error else 0.0
 
 
 def measure(

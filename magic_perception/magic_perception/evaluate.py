@@ -7,6 +7,7 @@ captures  Single RealSense captures: how many objects, and their sizes beside th
 meshes    Ray-cast captures of scanned and modelled objects by two D435s (:mod:`magic_core.sensor`): mask IoU, and for the
           paper's reconstruction and this one side by side the Chamfer distance, the volumetric IoU and the holes that are open.
 
+views     (``--views N``, needs no data) Surfaces of N procedural scenes by the number of views, and what has moved between them.
 speed     (``--speed``, needs no data) Seconds by stage for two cameras over four objects, and memory over ``--frames`` scenes.
 
 Writes evaluation.json, evaluation.md and evaluation.png (the meshes part's pictures).
@@ -32,7 +33,7 @@ from magic_core.mesh import Mesh, load
 from magic_core.rendering import Raycaster
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.views import find_view, holes_of
-from magic_perception import speed
+from magic_perception import coverage, speed
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmentation import Segmenter, _frame_on, find_table, look
@@ -345,6 +346,8 @@ def markdown(result: dict) -> str:
             f"| {n} | {s['objects']} | {s['found']} | {', '.join(f'{x:.2f}' for x in s['best_iou'])} | {s['cpu_seconds']:.2f} |"
             for n, s in part["scenes"].items()
         ] + [""]
+    if "views" in result:
+        lines.append(coverage.markdown(result["views"]))
     if "speed" in result:
         lines.append(speed.markdown(result["speed"]))
     if "captures" in result:
@@ -402,7 +405,7 @@ def markdown(result: dict) -> str:
 def main(args: list[str] | None = None) -> None:
     """Entry point; exit status 1 where no data are found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed)")
+    parser.add_argument("--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed or --views)")
     parser.add_argument("--out", type=Path, default=Path("evaluation"), help="folder for the results (default ./evaluation)")
     parser.add_argument("--parts", nargs="+", choices=("osd", "captures", "meshes"), default=["osd", "captures", "meshes"])
     parser.add_argument("--poses", type=int, default=3, help="yaws of each mesh (default 3)")
@@ -412,21 +415,26 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--no-split", action="store_true", help="do not part touching objects (osd)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--speed", action="store_true", help="measure speed and memory instead")
+    parser.add_argument("--views", type=int, default=0, metavar="N", help="measure what several views bring instead, on N scenes")
     parser.add_argument("--frames", type=int, default=50, help="scenes of --speed (default 50; 1000 shows whether memory is flat)")
     parser.add_argument("--workers", type=int, default=1, help="threads of --speed (default 1)")
     given = parser.parse_args(args)
-    if given.data is None and not given.speed:
-        parser.error("--data is needed, or --speed")
-    if given.frames < 1 or given.workers < 1:
-        parser.error(f"--frames {given.frames}, --workers {given.workers}: at least 1 each")
+    if given.data is None and not given.speed and not given.views:
+        parser.error("--data is needed, or --speed, or --views")
+    if given.frames < 1 or given.workers < 1 or given.views < 0:
+        parser.error(f"--frames {given.frames}, --workers {given.workers}, --views {given.views}: at least 1 each")
     try:
         segmenter = make_segmenter(given.segmenter, given.weights)
         result: dict = {}
         given.out.mkdir(parents=True, exist_ok=True)
         if given.speed:
             result["speed"] = speed.measure(given.frames, segmenter, given.seed, given.workers)
+        if given.views:
+            result["views"] = coverage.measure(given.views, given.seed)
         for part, folder in (
-            () if given.speed else (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes"))
+            ()
+            if given.speed or given.views
+            else (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes"))
         ):
             if part not in given.parts:
                 continue

@@ -35,6 +35,7 @@ from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception.averaging import average
+from magic_perception.keyframes import STEADY, STILL, Keyframes
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
@@ -110,6 +111,10 @@ class Perception(Node):
         self.parameters = self._algorithm()
         self.given = {camera: pose for camera in self.cameras if (pose := self._extrinsics(camera)) is not None}
         self.segmenter = make_segmenter(name, weights, device)
+        self.keyframes = Keyframes(
+            p("keyframes", 4, "earlier views that are looked at together with the newest frames, at most; 0: none", low=0, high=16),
+            p("keyframe_age", 60.0, "an earlier view is forgotten after this, s", low=0.1, high=3600.0),
+        )
         self.robot = self._robot(tolerance)
         self.warm_up()
 
@@ -350,14 +355,16 @@ class Perception(Node):
         if now - self.last_run < self.period:
             return
         try:
-            frames, notes = self.gather(now)
+            frames, notes, still = self.gather(now)
             if not frames:
                 return
             self.last_run = now
             with self.lock:
                 known = self.known
             report = Report(notes=notes)
-            scene = perceive(frames, known, self.parameters, self.segmenter, report)
+            earlier = self.keyframes.useful(frames)
+            scene = perceive(frames, known, self.parameters, self.segmenter, report, earlier)
+            self.keyframes.update(frames, report.labels, report.earlier, still)
             scene = self.tracker.update(replace(scene, frame_id=self.frame))
             self.publish(scene)
             seconds = time.monotonic() - now
@@ -367,6 +374,7 @@ class Perception(Node):
                 "objects": ", ".join(o.id for o in scene.objects),
                 "seconds": round(seconds, 3),
                 "cameras": ", ".join(f.camera for f in frames),
+                "earlier views": ", ".join(f"{f.camera}, {frames[-1].stamp - f.stamp:.1f} s before" for f in earlier),
             }
             values.update({f"seconds {k}": round(v, 4) for k, v in report.seconds.items()})
             if report.cameras:
@@ -405,13 +413,13 @@ class Perception(Node):
             self.outcome = (DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
             self.get_logger().error(self.outcome[2], throttle_duration_sec=5.0)
 
-    def gather(self, now: float) -> tuple[list[RgbdFrame], list[str]]:
-        """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for."""
+    def gather(self, now: float) -> tuple[list[RgbdFrame], list[str], set[str]]:
+        """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for; notes; and which cameras stood still."""
         notes: list[str] = []
         with self.lock:
             streams = self.speaking(now, notes)
             if streams is None:
-                return [], notes
+                return [], notes, set()
             newest = max(s.pairs[-1].stamp for s in self.streams.values() if s.pairs)
             placed: dict[str, list[Placed]] = {}
             limit = math.inf
@@ -430,7 +438,7 @@ class Perception(Node):
                 self.done_stamp, self.again = stamp, False
                 placed = {camera: [p for p in found if p.pair.stamp <= stamp][-self.count :] for camera, found in placed.items()}
             elif placed:
-                return [], notes
+                return [], notes, set()
         frames = []
         for camera, found in placed.items():
             try:
@@ -441,7 +449,7 @@ class Perception(Node):
         if not frames and streams:
             worst = next(s.problems["frames"] for s in streams if "frames" in s.problems)
             raise MagicError(worst.code, worst.message)
-        return frames, notes
+        return frames, notes, {camera for camera, found in placed.items() if all(_still(p, found[-1]) for p in found)}
 
     @staticmethod
     def leave_out(stream: Stream, error: MagicError, notes: list[str], now: float) -> None:
@@ -525,10 +533,10 @@ class Perception(Node):
         assert intrinsics is not None
         last = placed[-1].world_from_camera
         frames = []
-        for pair, pose, color_from_depth in placed:
-            # Averaging is for a camera that stands still.
-            if np.linalg.norm(pose[:3, 3] - last[:3, 3]) > 0.001 or transforms.rotation_angle(pose, last) > 0.002:
-                continue
+        for place in placed:
+            if not _still(place, placed[-1]):
+                continue  # averaging is for a camera that stands still
+            pair, _, color_from_depth = place
             depth = pair.depth
             if color_from_depth is not None:
                 if stream.depth_intrinsics is None:
@@ -674,6 +682,12 @@ class Perception(Node):
                     name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values
                 )
         return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
+
+
+def _still(one: Placed, other: Placed) -> bool:
+    """Whether a camera was at one place at two times."""
+    apart = np.linalg.norm(one.world_from_camera[:3, 3] - other.world_from_camera[:3, 3])
+    return bool(apart <= STILL and transforms.rotation_angle(one.world_from_camera, other.world_from_camera) <= STEADY)
 
 
 def _wanted(qos: QoSProfile) -> str:

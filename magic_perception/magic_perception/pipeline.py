@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -15,9 +15,9 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.scene import FIXTURE, PICTURE, REGION, Scene, SceneObject
+from magic_core.scene import FIXTURE, PICTURE, REGION, UNSEEN, Scene, SceneObject
 from magic_core.views import find_view
-from magic_perception import cameras, clusters
+from magic_perception import cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
 from magic_perception.hidden import hangs, veil
 from magic_perception.parameters import Parameters
@@ -32,7 +32,8 @@ from magic_perception.smear import behind
 class Report:
     """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of all processors.
 
-    cameras: how far each pair of cameras disagrees.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
+    labels: of the frames.  cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer
+    ones contradict it.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -42,6 +43,7 @@ class Report:
     shapes: dict[str, str] = field(default_factory=dict)
     pixels: dict[str, int] = field(default_factory=dict)
     cameras: list[cameras.Disagreement] = field(default_factory=list)
+    earlier: list[tuple[RgbdFrame, RgbdFrame]] = field(default_factory=list)
     evidence: dict[str, Evidence] = field(default_factory=dict)
 
     @contextmanager
@@ -58,12 +60,15 @@ def perceive(
     parameters: Parameters = Parameters(),
     segmenter: Segmenter | None = None,
     report: Report | None = None,
+    earlier: Sequence[RgbdFrame] = (),
 ) -> Scene:
     """What stands and lies on the table.
 
     frames: one for each camera, taken at nearly the same time, with poses in one world whose z is up.  known: fixtures,
     taken over into the scene; what belongs to them is left out of the segmentation.  Objects are numbered by size
     (``object_1``, ...); :class:`magic_perception.tracking.Tracker` makes the numbers stable from call to call.
+    earlier: frames of the same scene from before (:class:`magic_perception.keyframes.Keyframes`), oldest first: they show what the frames do not,
+    as far as no newer one contradicts them.  What they alone show is told, and marked ``unseen``.
 
     Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has depth in the region of interest, ``NO_TABLE``,
     ``CAMERAS_DISAGREE`` where the cameras' poses contradict each other by more than may be corrected.
@@ -73,17 +78,14 @@ def perceive(
     segmenter = segmenter or DepthSegmenter()
     if not frames:
         raise MagicError(Code.NO_FRAMES, "frames", 0, "at least one RGB-D frame")
-    seeing = []
-    for frame in frames:
-        if np.isfinite(frame.depth).sum() < 100:
-            report.notes.append(f"{frame.camera}: no depth")
-        else:
-            seeing.append(frame)
-    if not seeing:
+    given = frames
+    seeing = [bool(np.isfinite(frame.depth).sum() >= 100) for frame in given]
+    report.notes += [f"{frame.camera}: no depth" for frame, sees in zip(given, seeing, strict=True) if not sees]
+    if not any(seeing):
         raise MagicError(
             Code.NO_DEPTH, "pixels with depth", {f.camera: int(np.isfinite(f.depth).sum()) for f in frames}, "at least 100 in one camera"
         )
-    frames = seeing
+    frames, now = [*(frame for frame, sees in zip(given, seeing, strict=True) if sees), *earlier], sum(seeing)
     with report.stage("table"):
         table, own = find_table(frames, parameters, report.notes)
         world_from_table = _frame_on(table, np.eye(4))
@@ -94,9 +96,21 @@ def perceive(
     with report.stage("masks"):
         fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
         labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
+        if earlier:
+            stale = keyframes.contradicted(looks, labels, now, world_from_table)
+            for i, pixels in enumerate(stale, now):
+                if pixels.any():
+                    frames[i] = frames[i].blinded(pixels)
+                    looks[i] = look(frames[i], own[i], world_from_table, parameters)
+            if any(pixels.any() for pixels in stale):
+                labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
+            report.earlier = list(zip(earlier, frames[now:], strict=True))
 
     with report.stage("cameras"):
-        pairs = cameras.measure(looks, labels, [frame.world_from_camera for frame in frames], world_from_table, parameters.seed)
+        poses = [frame.world_from_camera for frame in frames]
+        # One camera alone is measured against where it was before.
+        count = now if now > 1 else len(looks)
+        pairs = cameras.measure(looks[:count], labels[:count], poses[:count], world_from_table, parameters.seed)
         report.cameras = pairs
         worst = max(pairs, key=lambda pair: (pair.beyond, pair.offset), default=None)
         if worst is not None and worst.beyond:
@@ -108,16 +122,22 @@ def perceive(
             )
         for pair in pairs:
             if pair.certain:
-                report.notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if len(looks) == 2 else ""))
+                report.notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if now == 2 else ""))
             elif pair.offset > cameras.MOST_OFFSET:
                 report.notes.append(f"cameras may disagree: {pair}; more things in common view would tell")
-        both = sum(bool((image > 0).any()) for image in labels) > 1
+        both = sum(bool((image > 0).any()) for image in labels[:count]) > 1
         if both and not pairs:
             report.notes.append("whether the cameras agree could not be measured: they see no side of anything in common")
-        if len(looks) == 2 and worst is not None and worst.certain:
-            looks = cameras.brought_together(looks, worst, world_from_table)
+        if now == 2 and worst is not None and worst.certain:
+            # What a camera saw from where it still stands is off as it is now.
+            here = [
+                any(keyframes.alike(each.frame, other.frame, keyframes.STILL, keyframes.STEADY) for other in looks[:now]) for each in looks
+            ]
+            moved = cameras.brought_together(looks, worst, world_from_table)
+            looks = [after if same else before for before, after, same in zip(looks, moved, here, strict=True)]
             labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
-        report.labels = labels
+        found = iter(labels[:now])
+        report.labels = [next(found) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(given, seeing, strict=True)]
 
     offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
     # Cameras of which nothing is known may be as far apart as would be borne.
@@ -125,7 +145,7 @@ def perceive(
 
     def build(label: int) -> _Built | MagicError:
         try:
-            return _build(label, looks, labels, fixtures, world_from_table, apart, parameters)
+            return _build(label, looks, labels, now, fixtures, world_from_table, apart, parameters)
         except MagicError as error:
             return error
 
@@ -182,12 +202,13 @@ def _build(
     label: int,
     looks: list[Looked],
     labels: list[NDArray[np.int32]],
+    now: int,
     fixtures: tuple[Mesh, ...],
     world_from_table: NDArray[np.float64],
     apart: float,
     parameters: Parameters,
 ) -> _Built:
-    """The solid of the object with that label, and what was seen of it; ``apart``: how far the cameras disagree, m."""
+    """The solid of the object with that label, and what was seen of it; now: so many looks are no earlier ones; apart: how far the cameras disagree, m."""
     table_from_world = transforms.inverse(world_from_table)
     sights, clouds, paints, counts = [], [], [], []
     for looked, image in zip(looks, labels, strict=True):
@@ -214,6 +235,8 @@ def _build(
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
     cut, hanging = cut_off(looks, labels, label, parameters), hangs(looks, labels, label, fixtures)
+    if max(counts[:now]) < parameters.min_pixels:
+        cut.append(UNSEEN)
     # A wall, a monitor, a person: no thing on the table.
     across = float(np.ptp(np.percentile(points[:: max(1, len(points) // 500)], [1, 99], axis=0), axis=0).max())
     if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut) and not hanging:
@@ -229,12 +252,21 @@ def _build(
         solid.fit or agreement(solid.mesh, sights),
         witnessed(solid.mesh, sights),
         solid.mesh.extents,
-        len(sights),
+        _places(sights),
         apart,
         bool(cut),
     )
-    best = int(np.argmax(counts))
+    best = int(np.argmax(counts[:now] if max(counts[:now]) else counts))
     return _Built(solid, points, colors, labels[best] == label, looks[best].frame.camera, counts[best], cut, evidence, hanging)
+
+
+def _places(sights: list[Sight]) -> int:
+    """From how many places a thing was seen: a camera that has not moved is one."""
+    places: list[NDArray[np.float64]] = []
+    for sight in sights:
+        if all(np.linalg.norm(sight.eye - other) > keyframes.NEAR for other in places):
+            places.append(sight.eye)
+    return len(places)
 
 
 def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObject:

@@ -414,6 +414,34 @@ def test_a_moving_camera_s_frames_wait_for_their_transform():
             assert_places(cv.scene_from_msg(message).objects, meshes)
 
 
+def test_a_camera_at_the_wrist_remembers_what_it_no_longer_sees():
+    """It looks at two things, then, after a way on which nothing is kept, at one of them: both are told, the one out of sight as such."""
+    meshes = things()
+    poses = {20.0: ([0.25, 0.45, 0.62], [0.55, 0.0, 0.02]), 30.0: ([0.45, -0.5, 0.35], [0.5, -0.25, 0.02])}
+    with Bench(cameras=["left"], average=2, rate=1.0) as bench:
+        broadcaster = bench.tester.create_publisher(tf2_msgs.TFMessage, "/tf", RELIABLE)
+        bench.until(broadcaster.get_subscription_count, "discovery of /tf")
+        told = []
+        for start, where in poses.items():
+            pose = scenes.pose(*where)
+            for k in range(4):
+                stamp = start + 0.5 * k
+                t = TransformStamped(child_frame_id="left_color_optical_frame", transform=cv.transform_to_msg(pose))
+                t.header = cv.header("panda_link0", stamp)
+                broadcaster.publish(tf2_msgs.TFMessage(transforms=[t]))
+                bench.send(scenes.capture(meshes, "left", k, world_from_camera=pose, stamp=stamp)[0])
+                bench.until(
+                    lambda: bench.node.streams["left"].pairs and bench.node.streams["left"].pairs[-1].stamp >= stamp - 1e-6, "the pair"
+                )
+            bench.until(lambda: bench.objects and cv.time_from_msg(bench.objects[-1].header.stamp) >= start + 0.4, "the scene")
+            told.append(cv.scene_from_msg(bench.objects[-1]).objects)
+        first, second = told
+        assert_places(second, meshes)
+        assert {o.id for o in first} == {o.id for o in second} and all(o.cut_off == () for o in first)
+        hook, cylinder = sorted(second, key=lambda o: o.world_from_box[1, 3])
+        assert hook.cut_off == () and cylinder.cut_off == ("unseen",)
+
+
 def test_an_image_later_than_every_transform_is_refused_by_name(frames):
     with Bench(cameras=["left"], transform_timeout=0.3) as bench:
         _, publish = moving_camera(bench)

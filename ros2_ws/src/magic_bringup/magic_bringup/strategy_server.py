@@ -36,6 +36,7 @@ from magic_core.diagnostics import Diagnostics, clock_complaint, status
 from magic_core.errors import Code, MagicError
 from magic_core.node import RESULT_TIMEOUT, describe, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
+from magic_core.scene import UNSEEN
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObject, SceneObjectArray, StageTimes
@@ -574,9 +575,10 @@ def tell_rates(message: CandidateReport | RunStrategy.Result, verdict: Verdict) 
 
 
 def look_at(scene: SceneObjectArray) -> Look:
-    """The objects of a message as the rule wants to know them; ``came`` is not filled in."""
-    reaches = {item.id: hull_of(item) for item in scene.objects}
-    partly = frozenset(item.id for item in scene.objects if SceneObject.ROBOT in item.cut_off)
+    """The objects of a message as the rule wants to know them; ``came`` is not filled in.  What is only remembered has not been seen to be there."""
+    seen = [item for item in scene.objects if UNSEEN not in item.cut_off]
+    reaches = {item.id: hull_of(item) for item in seen}
+    partly = frozenset(item.id for item in seen if SceneObject.ROBOT in item.cut_off)
     return Look(reaches, scene.header.frame_id.lstrip("/"), conversions.time_from_msg(scene.header.stamp), -math.inf, partly)
 
 

@@ -12,8 +12,9 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 
-#: What besides an object's id may stand in SceneObject.cut_off: the border of the pictures, of the region of interest, a known object or the robot.
-PICTURE, REGION, FIXTURE, ROBOT = "picture", "region", "fixture", "robot"
+#: What besides an object's id may stand in SceneObject.cut_off: the border of the pictures, of the region of interest, a known object or the robot;
+#: and that no camera sees it now: what is told of it is remembered from earlier pictures.
+PICTURE, REGION, FIXTURE, ROBOT, UNSEEN = "picture", "region", "fixture", "robot", "unseen"
 
 VIEW_KINDS = ("top", "side", "section")
 
@@ -92,8 +93,8 @@ class SceneObject:
     ``confidence`` 0..1 is the chance, as measured on known scenes, that mask and solid
     overlap the truth by more than 0.8; ``seen_share`` 0..1 how much of the mesh's surface,
     what rests on the table left out, a camera saw.  ``cut_off`` names what keeps a part out
-    of sight: ``picture``, ``region``, ``fixture``, ``robot``, or ids of objects in front; such a
-    thing is no whole tool.
+    of sight: ``picture``, ``region``, ``fixture``, ``robot``, or ids of objects in front; ``unseen``:
+    no camera sees it now, it is remembered.  Such a thing is no whole tool.
     """
 
     id: str
