@@ -15,10 +15,10 @@ from magic_core.camera import RgbdFrame
 from magic_core.mesh import Mesh
 from magic_core.scene import Scene, SceneObject
 from magic_core.sensor import D435, SMEARED, STATION, capture, looking_at, scene_raycaster
-from magic_perception.parameters import Parameters
+from magic_perception.parameters import WORKSPACE, Parameters
 from magic_perception.pipeline import Report, perceive
 
-REGION = Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5))
+REGION = Parameters(**WORKSPACE)
 #: Where the camera at the wrist has looked from.
 WRIST = (
     looking_at([0.25, 0.3, 0.5], [0.5, 0, 0.02]),

@@ -36,7 +36,7 @@ from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception.averaging import average
 from magic_perception.keyframes import STEADY, STILL, Keyframes
-from magic_perception.parameters import METHODS, Parameters
+from magic_perception.parameters import METHODS, WORKSPACE, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
 from magic_perception.robot_in_view import RobotInView
@@ -154,8 +154,14 @@ class Perception(Node):
     def _algorithm(self) -> Parameters:
         """The parameters that :func:`magic_perception.pipeline.perceive` is told."""
         p = partial(parameter, self, read_only=True)
-        low = p("region_low", [0.15, -0.6, -0.05], "lower corner of the workspace box, m: x and y in `frame`, z from the table found")
-        high = p("region_high", [0.95, 0.6, 0.5], "upper corner of the workspace box, m: x and y in `frame`, z from the table found")
+        low = p(
+            "region_low", list(WORKSPACE["region_low"]), "lower corner of the workspace box, m: x and y in `frame`, z from the table found"
+        )
+        high = p(
+            "region_high",
+            list(WORKSPACE["region_high"]),
+            "upper corner of the workspace box, m: x and y in `frame`, z from the table found",
+        )
         if len(low) != 3 or len(high) != 3:
             raise MagicError(Code.BAD_REQUEST, "parameters region_low, region_high", f"{list(low)}, {list(high)}", "three numbers each")
         return Parameters(

@@ -311,8 +311,8 @@ def load_object(name: str, kind: str | None) -> tuple[Any, Any, Any, Meeting | N
     from magic_core import shapes
 
     if "//" in name:
+        from magic_core.decomposition import convex_pieces
         from magic_core.mesh import check_solid, load
-        from magic_verifier.decomposition import convex_pieces
 
         folder, _, rest = name.partition("//")
         path, _, scale = rest.rpartition("@")

@@ -31,9 +31,10 @@ import yaml
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.decomposition import extremes
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_verifier.simulation import MANY_POINTS, extremes
+from magic_verifier.simulation import MANY_POINTS
 
 #: Cells along the longer side of the height map that water is poured on.
 CELLS = 40

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from magic_core import transforms
+from magic_core.decomposition import extremes
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 
@@ -83,19 +84,6 @@ class Touch:
     normal: NDArray[np.float64]
     separation: float
     impulse: NDArray[np.float64]
-
-
-def extremes(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Of points (N, 3) those furthest out in ``count`` evenly spread directions."""
-    # A Fibonacci sphere: directions spread evenly without chance; two of them may share their furthest point.
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = np.pi * (1 + 5**0.5) * k
-    directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
-    chunk = max(1, 1_000_000 // len(points))
-    along = np.ascontiguousarray(points.T)
-    chosen = [np.argmax(directions[i : i + chunk] @ along, axis=1) for i in range(0, count, chunk)]
-    return points[np.unique(np.concatenate(chosen))]
 
 
 def reduced(points: NDArray[np.float64], limit: int = MAX_VERTICES) -> NDArray[np.float64]:

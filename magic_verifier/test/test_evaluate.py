@@ -15,6 +15,7 @@ pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import shapes, transforms
 from magic_core import strategy as strategies
+from magic_core.decomposition import convex_pieces
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
@@ -22,7 +23,6 @@ from magic_core.shapes import make
 from magic_verifier import evaluate as ev
 from magic_verifier import posing
 from magic_verifier.cases import METHODS, Options, all_cases, load_object, tool_names, tool_object
-from magic_verifier.decomposition import convex_pieces
 from magic_verifier.simulation import sphere_of, usable_pieces
 from magic_verifier.toolsets import evaluation_of
 

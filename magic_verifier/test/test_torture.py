@@ -9,11 +9,11 @@ import scenes
 import trimesh
 
 from magic_core import transforms
+from magic_core.decomposition import convex_pieces
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, from_trimesh
 from magic_core.strategy import Physics
 from magic_verifier import posing
-from magic_verifier.decomposition import convex_pieces
 from magic_verifier.floating import settled
 from magic_verifier.simulation import MAX_PIECES, usable_pieces
 from magic_verifier.verification import verify

@@ -60,6 +60,8 @@ class Draw:
         """One of several words."""
         value = choices[int(self._random.integers(len(choices)))]
         given = self._given.get(name, value)
+        if isinstance(given, float):
+            given = f"{given:g}"  # a count
         if given not in choices:
             raise MagicError(Code.BAD_REQUEST, f"{name} of a {self._family}", given, choices)
         self.parameters[name] = str(given)

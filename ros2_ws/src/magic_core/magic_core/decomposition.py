@@ -16,7 +16,6 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_verifier.simulation import extremes
 
 #: Faces above which the surface is sampled rather than used whole.
 SAMPLES = 400_000
@@ -26,6 +25,19 @@ CONVEX = 0.95
 THINNEST, FINEST = 6, 112
 MAX_EXTENT = 5.0
 MIN_EXTENT = 0.002
+
+
+def extremes(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Of points (N, 3) those furthest out in ``count`` evenly spread directions."""
+    # A Fibonacci sphere: directions spread evenly without chance; two of them may share their furthest point.
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k
+    directions = np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
+    chunk = max(1, 1_000_000 // len(points))
+    along = np.ascontiguousarray(points.T)
+    chosen = [np.argmax(directions[i : i + chunk] @ along, axis=1) for i in range(0, count, chunk)]
+    return points[np.unique(np.concatenate(chosen))]
 
 
 def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Mesh, ...]:
