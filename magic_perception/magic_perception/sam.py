@@ -1,4 +1,8 @@
-"""Masks by Segment Anything (Kirillov et al. 2023; SAM 2: Ravi et al. 2024) through transformers, prompted by the depth clusters."""
+"""Masks by Segment Anything (Kirillov et al. 2023; SAM 2: Ravi et al. 2024) through transformers, prompted by the depth clusters.
+
+The network says which thing a pixel belongs to.  What is no thing's, by depth and colour together (the table, smear past an edge, the hole of a
+handle, a shadow without depth), stays out of its masks, which are as coarse as a quarter of the network's picture.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +15,9 @@ from numpy.typing import NDArray
 from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_perception import clusters
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import DepthSegmenter, Looked, _fill
+from magic_perception.segmentation import DepthSegmenter, Looked, _sizeable, foreground
 
 #: Weights taken where none are named; the hub is asked only then.
 DEFAULTS = {"sam": "facebook/sam-vit-base", "sam2": "facebook/sam2.1-hiera-tiny"}
@@ -24,6 +29,7 @@ _STD = np.array([0.229, 0.224, 0.225], np.float32)
 class SamSegmenter:
     """The ``depth`` segmenter's clusters as prompts (a box and three points each), SAM's masks as the answer.
 
+    Both go through :func:`magic_perception.segmentation.foreground`, so that edges and holes are as sharp as those of ``depth``.
     weights: a hub name or a local folder.  A mask that does not agree with its prompt (IoU below ``agree``) is refused,
     and the cluster's own mask kept: a confident network is no reason to lose an object.
     Raises ``SEGMENTER_WEIGHTS`` where the weights cannot be loaded.
@@ -56,25 +62,28 @@ class SamSegmenter:
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`magic_perception.segmentation.Segmenter`."""
         labels = DepthSegmenter().segment(looks, known, parameters)
-        return [self._refine(looked, image) for looked, image in zip(looks, labels, strict=True)]
+        return _sizeable([self._refine(looked, image, parameters) for looked, image in zip(looks, labels, strict=True)], looks, parameters)
 
-    def _refine(self, looked: Looked, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    def _refine(self, looked: Looked, labels: NDArray[np.int32], parameters: Parameters) -> NDArray[np.int32]:
         numbers = [int(n) for n in np.unique(labels) if n > 0]
         if not numbers:
             return labels
         masks = self.masks(looked.frame.color, [labels == n for n in numbers])
         result = np.where(labels < 0, labels, 0).astype(np.int32)
         best = np.zeros(labels.shape, np.float32)
+        possible = foreground(looked, parameters)
         for number, (probability, _) in zip(numbers, masks, strict=True):
             prompt = labels == number
             mask = probability > 0.5
             union = (mask | prompt).sum()
             if union == 0 or (mask & prompt).sum() < self.agree * union:
                 mask, probability = prompt, np.where(prompt, 0.75, 0).astype(np.float32)
+            else:
+                mask = clusters.connected(mask & (possible | prompt), prompt)
             takes = mask & (probability > best) & (labels >= 0)
             result[takes] = number
             best[takes] = probability[takes]
-        return _fill(result, result > 0)
+        return result
 
     def masks(self, color: NDArray[np.uint8], prompts: list[NDArray[np.bool_]]) -> list[tuple[NDArray[np.float32], float]]:
         """For each prompt mask (H, W) the probability (H, W) of the network's best mask, and its own estimate of its IoU.

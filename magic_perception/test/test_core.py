@@ -3,18 +3,20 @@
 import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import scenes
 import trimesh
 from shapely.geometry import Point, Polygon
 
-from magic_core import shapes, transforms
+from magic_core import sensor, shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters, polygons, primitives
 from magic_perception.averaging import average
+from magic_perception.evaluate import overlap
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.reconstruction import as_in_paper
@@ -732,6 +734,30 @@ def test_sam_loads_and_never_loses_an_object(tmp_path, hooking, name, make):
     mask[100:200, 300:400] = True
     ((probability, score),) = segmenter.masks(captured[0][0].color, [mask])
     assert probability.shape == mask.shape and 0 <= probability.min() <= probability.max() <= 1 and np.isfinite(score)
+
+
+@pytest.mark.parametrize("name, make", [("sam", tiny_sam), ("sam2", tiny_sam2)])
+def test_coarse_masks_of_a_network_get_the_refinement_of_depth(tmp_path, monkeypatch, name, make):
+    """A network that is right but coarse: the handle's hole filled, the edge some pixels out.  Depth and colour have both put right."""
+    pytest.importorskip("transformers")
+    make(tmp_path)
+    mug = scenes.shape("mug", 3, 0.5, 0.0, 0.4)
+    frame = sensor.capture([mug], sensor.D435, scenes.pose([0.25, 0.45, 0.62], [0.5, 0.0, 0.04]), 3, model=sensor.SMEARED)
+    segmenter = make_segmenter(name, str(tmp_path))
+
+    def coarse(color, prompts):
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (41, 41))
+        filled = [cv2.morphologyEx(p.astype(np.uint8), cv2.MORPH_CLOSE, kernel) for p in prompts]
+        return [(0.9 * cv2.dilate(f, np.ones((9, 9), np.uint8)).astype(np.float32), 0.9) for f in filled]
+
+    monkeypatch.setattr(segmenter, "masks", coarse)
+    reports = Report(), Report()
+    plain, refined = (perceive([frame], segmenter=s, report=r) for s, r in zip((None, segmenter), reports, strict=True))
+    masks = [r.labels[0] > 0 for r in reports]
+    ((raw, _),) = coarse(frame.color, [masks[0]])
+    assert overlap(raw > 0.5, masks[0]) < 0.85 and overlap(masks[1], masks[0]) > 0.96
+    # The handle is open in both: genus 1.
+    assert [tight(scene.objects[0].mesh).euler_number for scene in (plain, refined)] == [0, 0]
 
 
 def test_missing_weights_are_named(tmp_path):
