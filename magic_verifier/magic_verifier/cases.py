@@ -246,8 +246,8 @@ def scene_for(strategy: Strategy, name: str) -> tuple[SceneObject, tuple[SceneOb
     if name == "demonstration" and entry:
         target = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("target", pose)
     elif name == "demonstration":  # one that cameras saw
+        from magic_core.decomposition import convex_pieces
         from magic_core.views import find_view
-        from magic_verifier.decomposition import convex_pieces
 
         pieces = convex_pieces(strategy.target_mesh)
         target = SceneObject("target", strategy.target_mesh, pieces, pose, find_view(strategy.target_mesh, pieces, "top"), source="known")

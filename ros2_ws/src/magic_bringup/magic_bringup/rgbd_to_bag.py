@@ -187,6 +187,12 @@ def chosen(scene: Scene, tool: str) -> SceneObject:
     raise MagicError(Code.NO_OBJECTS, "thing at the pixel --tool", tool, [_told(o) for o in seen])
 
 
+def standing_on(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """world_from_table (4, 4) of a plane (4,) whose normal points up: z along the normal, the origin below or above the world's, x as near to the world's as can be."""
+    origin = np.array([0.0, 0.0, -table[3] / table[2]])
+    return transforms.frame(origin, np.array([1.0, 0.0, 0.0]) - table[0] * table[:3], table[:3])
+
+
 def _told(item: SceneObject) -> str:
     rows, columns = np.nonzero(item.mask)
     # A pixel of the thing itself, near its middle: that of a ring is none.
@@ -237,7 +243,10 @@ def convert(
         points = intrinsics.unproject(depth)
         over, thing = camera_over_table(points, seed=seed), None
         if tool:
-            thing = chosen(perceive([RgbdFrame(color, depth, intrinsics, over, camera)], (), Parameters(seed=seed)), tool).points
+            first = perceive([RgbdFrame(color, depth, intrinsics, over, camera)], (), Parameters(seed=seed))
+            # The plane that most of the picture shows may be the floor: what the tool stands on is z = 0.
+            level = transforms.inverse(standing_on(first.table))
+            over, thing = level @ over, transforms.apply(level, chosen(first, tool).points)
         world_from_camera, size = place_camera(points, known, seed, over, thing)
         depths.check_sizes(float(np.nanmedian(depth)), [size], picture.unit, picture.told, images.REMEDY)
     else:

@@ -162,6 +162,16 @@ def test_the_named_thing_is_the_tool_and_lies_in_reach(
     np.testing.assert_allclose(target.world_from_box[:3, 3], [0.7, 0.0, 0.04], atol=1e-6)
 
 
+def test_a_table_above_the_floor_is_what_things_stand_on() -> None:
+    table = transforms.from_rpy(0.05, -0.03, 0.7, [0.3, -0.2, 0.42])
+    normal = table[:3, 2]
+    plane = np.append(normal, -normal @ table[:3, 3])
+    level = transforms.inverse(rgbd_to_bag.standing_on(plane))
+    points = transforms.apply(level @ table, [[0.0, 0, 0], [0.5, 0.2, 0], [0, 0, 0.1]])
+    np.testing.assert_allclose(points[:, 2], [0, 0, 0.1], atol=1e-12)
+    assert transforms.rotation_angle(level, np.eye(4)) < 0.06
+
+
 def test_targets_are_meshes_or_made(tmp_path: Path) -> None:
     make("rod", 0).mesh.save(tmp_path / "rod.obj")
     hanging = strategies.load(STRATEGIES / "hanging")
