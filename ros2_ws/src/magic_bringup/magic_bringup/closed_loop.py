@@ -37,6 +37,7 @@ from magic_bringup.stages import Server, Stages, hull_of
 from magic_bringup.watch import Bounds, SceneWatch
 from magic_core import conversions, transforms
 from magic_core.errors import Code, MagicError
+from magic_core.scene import UNSEEN
 from magic_core.strategy import Strategy
 from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
 
@@ -284,7 +285,7 @@ class ClosedLoop:
         stood = job.claim.scene.objects
         points = [np.zeros((0, 3))]
         for item in scene.objects:
-            if item.source != SceneObject.CAMERA:
+            if item.source != SceneObject.CAMERA or UNSEEN in item.cut_off:
                 continue
             before = stood.get(item.id) if item.id != job.outcome.tool_id else None
             if before is None or scene_change.gap(before, hull_of(item), True) > self._limits.object_tolerance:
@@ -296,7 +297,7 @@ class ClosedLoop:
         before = job.claim.scene.objects.get(job.outcome.tool_id)
         if before is None:  # it was in the hand already
             return False
-        seen = item.source == SceneObject.CAMERA and SceneObject.ROBOT not in item.cut_off
+        seen = item.source == SceneObject.CAMERA and not {SceneObject.ROBOT, UNSEEN} & set(item.cut_off)
         return seen and scene_change.distance(before, hull_of(item)) <= self._limits.object_tolerance
 
     # ------------------------------------------------------------ what is looked at, and when
@@ -439,6 +440,8 @@ class ClosedLoop:
         held, hand = self._held, self._server.hand()
         things = {}
         for item in scene.objects:
+            if after and UNSEEN in item.cut_off:
+                continue  # remembered from before the motion: what came of it is not known
             if not after or held is None or not held.sees(item, hand):
                 things[item.id] = seen_goal.Thing.of(conversions.mesh_from_msg(item.mesh), conversions.pose_from_msg(item.pose))
         if after and held is not None:
