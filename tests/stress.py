@@ -68,6 +68,7 @@ STAGES = ("perceive", "match", "plan", "verify", "execute")
 #: Of a strategy server whose arm is a stand-in.
 SERVER_PARAMETERS = {
     "execute": True,
+    "autostart": True,
     "state_age": 10.0,
     "objects_age": 3600.0,
     "start_tolerance": 0.5,

@@ -17,6 +17,7 @@ BAG = Path(__file__).resolve().parents[1] / "bags" / "hanging"
 HOME = [0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4]
 SERVER = {
     "execute": True,
+    "autostart": True,
     "state_age": 10.0,
     "objects_age": 20.0,
     # The cameras show the same moment for ever: neither the mug in the hand nor where it hangs in the end.

@@ -18,6 +18,7 @@ from magic_core.executor import ThreadedExecutor
 
 SERVER = {
     "execute": True,
+    "autostart": True,
     "state_age": 10.0,
     "objects_age": 60.0,
     "trajectory_action": "arm/follow_joint_trajectory",

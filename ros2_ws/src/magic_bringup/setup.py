@@ -63,6 +63,7 @@ setup(
             "reference = magic_bringup.programs:reference",
             "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
             "bag_player = magic_bringup.programs:bag_player",
+            "bridge = magic_bringup.programs:bridge",
             "bag_recorder = magic_bringup.programs:bag_recorder",
             "trials = magic_bringup.programs:trials",
         ],

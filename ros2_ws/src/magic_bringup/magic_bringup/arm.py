@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from action_msgs.msg import GoalStatus
-from control_msgs.action import FollowJointTrajectory, GripperCommand
+from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from magic_bringup import execution
+from magic_bringup import execution, gripper
 from magic_bringup.remote import RemoteAction, Token
 from magic_core.conversions import duration_to_msg, time_from_msg
 from magic_core.errors import Code, MagicError
@@ -35,7 +35,8 @@ class ArmSettings:
 
     speed: 1 as planned, less: slower by that factor.  start_tolerance: rad that a joint may be off where a move begins.
     state_age: s that a joint state may be old.  opening: m between the open fingers.  finger_scale: position of the gripper's
-    joint for a metre of opening (0.5 where the joint is one of two fingers).  squeeze: m that the fingers are told to close
+    joint for a metre of opening (0.5 where the joint is one of two fingers).  gripper_command: the gripper's action, of :mod:`magic_bringup.gripper`; gripper_joint: the
+    joint's name, which ParallelGripperCommand asks for.  squeeze: m that the fingers are told to close
     beyond the tool's thickness (for drivers that only control position).  effort: of the gripper, N; 0: the driver's own.
     grasp_tolerance: m that the opening of the closed fingers may differ from the planned one.  presence: s to wait for a
     server.  path_tolerance, goal_tolerance: rad that a joint may be off its trajectory on the way, and at the end within goal_time s
@@ -54,6 +55,8 @@ class ArmSettings:
     effort: float = 20.0
     grasp_tolerance: float = 0.01
     presence: float = 5.0
+    gripper_command: str = "GripperCommand"
+    gripper_joint: str = ""
 
 
 class Guard(Protocol):
@@ -86,7 +89,8 @@ class Arm:
         self.settings = settings
         self._patience = SLOW if node.get_parameter("use_sim_time").value else 1.0
         self._mover = RemoteAction(node, FollowJointTrajectory, trajectory_action, "arm's controller", group, Code.EXECUTION_FAILED)
-        self._gripper = RemoteAction(node, GripperCommand, gripper_action, "gripper", group, Code.EXECUTION_FAILED)
+        self._command = gripper.action_of(settings.gripper_command)
+        self._gripper = RemoteAction(node, self._command, gripper_action, "gripper", group, Code.EXECUTION_FAILED)
 
     def ready(self) -> list[str]:
         """The servers that are missing."""
@@ -158,21 +162,17 @@ class Arm:
 
     def _fingers(self, fingers: execution.Fingers, token: Token) -> None:
         settings = self.settings
-        goal = GripperCommand.Goal()
         opening = max(0.0, fingers.opening - settings.squeeze) if fingers.close else fingers.opening
-        goal.command.position = opening * settings.finger_scale
-        goal.command.max_effort = settings.effort
+        goal = gripper.goal(self._command, settings.gripper_joint, opening * settings.finger_scale, settings.effort)
         response = self._gripper.respond(goal, self._patience * FINGER_TIME, token, settings.presence)
-        result = response.result
+        result = gripper.found(response.result, settings.gripper_joint)
         found = result.position / settings.finger_scale
         if fingers.close:
             # A gripper that squeezes a tool may say that it stalled, or abort because it did not get where it was told to.
             if response.status != GoalStatus.STATUS_SUCCEEDED and not result.stalled:
                 raise MagicError(Code.GRASP_FAILED, f"the gripper ended its goal with status {response.status}")
             execution.check_grasp(fingers.opening, found, settings.grasp_tolerance)
-        elif response.status != GoalStatus.STATUS_SUCCEEDED or not (
-            result.reached_goal or found >= fingers.opening - settings.grasp_tolerance
-        ):
+        elif response.status != GoalStatus.STATUS_SUCCEEDED or not (result.reached or found >= fingers.opening - settings.grasp_tolerance):
             raise MagicError(
                 Code.EXECUTION_FAILED, f"the gripper did not open: mm between the fingers {1000 * found:.1f}, status {response.status}"
             )

@@ -104,7 +104,8 @@ class World:
     clock, now: the time, s, by the clock of the stamps and by the monotonic clock.  run: the one at work, empty: none; canceled:
     whether it was.  servers: by what they do (``verifier`` is one), those who serve it.  scene: the newest, None: none came.
     joints: what was heard of them, by name.  recorded: the server is told that all comes from a recording, which no time makes
-    older.  replaying: a bag is being played, whose stamps are of another time.
+    older.  replaying: a bag is being played, whose stamps are of another time.  active: the server's lifecycle is in the state
+    active; stopped: an emergency stop has been asked for since it came there.
     """
 
     clock: float
@@ -116,6 +117,8 @@ class World:
     joints: Mapping[str, Joint] = field(default_factory=dict)
     recorded: bool = False
     replaying: bool = False
+    active: bool = False
+    stopped: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,12 +137,13 @@ class Limits:
 def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tuple[str, ...]:
     """What the permission rests on without having been seen, in sentences; raises :class:`MagicError` where there is none.
 
-    CANCELED, SERVER_UNAVAILABLE, NOT_ALONE, NOT_VERIFIABLE, NOT_SURE_ENOUGH or the verdict's own code, BAD_REQUEST (frames,
+    CANCELED (an emergency stop too), SERVER_UNAVAILABLE (not active too), NOT_ALONE, NOT_VERIFIABLE, NOT_SURE_ENOUGH or the verdict's own code, BAD_REQUEST (frames,
     recordings), NO_OBJECTS, STALE_DATA, NO_FRAMES, BAD_MOTION; as :class:`NotYet` where it may pass by waiting.
 
     What was published stays valid only while nothing has changed that it was verified for: the objects, and where the arm
     stands.  That the run is over by then, or that servers have ended, does not speak against it.
     """
+    _in_operation(world, purpose)
     if purpose is not Purpose.STAND:
         _at_work(claim, world)
         _alone(claim, world)
@@ -153,6 +157,18 @@ def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tupl
     scene_change.check(claim.scene.objects, world.scene.objects, limits.object_tolerance, claim.meant, partly, claim.carried)
     notes = _arm(claim, world, limits, purpose)
     return (*notes, *((RECORDED,) if world.recorded or world.replaying else ()))
+
+
+def _in_operation(world: World, purpose: Purpose) -> None:
+    """Nobody has asked for an emergency stop, and somebody has for the arm to be moved."""
+    if world.stopped:
+        raise MagicError(
+            Code.CANCELED, "an emergency stop was asked for", allowed="nothing, until the strategy server's lifecycle is activated again"
+        )
+    if purpose is Purpose.MOVE and not world.active:
+        raise MagicError(
+            Code.SERVER_UNAVAILABLE, "the strategy server's lifecycle is not active", allowed="active: ros2 lifecycle set, or autostart"
+        )
 
 
 def _at_work(claim: Claim, world: World) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rclpy.node import Node
 
+from magic_bringup import gripper
 from magic_bringup.arm import ArmSettings
 from magic_core.errors import Code, MagicError
 from magic_core.node import parameter
@@ -22,7 +23,8 @@ class Settings:
     a whole run where the goal says nothing.  presence: s to wait for a server that is not there.  objects, match, plan, verify:
     s for each.  grace: s that an answer may come late.  required_rate: least lower end of the success rate's interval;
     objects_age: s that objects may be old, and object_tolerance: m that they may have moved, where a trajectory is published or
-    the arm begins to move.  recorded: what comes in is a recording.
+    the arm begins to move.  recorded: what comes in is a recording.  autostart: whether the lifecycle begins in
+    its state active, in which alone the arm moves.
     """
 
     strategies: str
@@ -37,6 +39,7 @@ class Settings:
     verify: float
     grace: float
     execute: bool
+    autostart: bool
     execute_unverified: bool
     trajectory_action: str
     gripper_action: str
@@ -99,6 +102,13 @@ def read(node: Node, preset: str = "") -> Settings:
         verify=seconds("verify_timeout", 120.0, "s for one verification"),
         grace=seconds("grace", 5.0, "s that an answer may come late before its server counts as dead"),
         execute=parameter(node, "execute", False, "carry verified plans out with arm and gripper", read_only=True),
+        autostart=parameter(
+            node,
+            "autostart",
+            False,
+            "begin in the lifecycle's state active, in which the arm may move, without being asked",
+            read_only=True,
+        ),
         execute_unverified=parameter(
             node,
             "execute_unverified",
@@ -135,8 +145,8 @@ def read(node: Node, preset: str = "") -> Settings:
     )
 
 
-def read_arm(node: Node, presence: float) -> ArmSettings:
-    """Declare the parameters of the execution and read them."""
+def read_arm(node: Node, presence: float, finger: str) -> ArmSettings:
+    """Declare the parameters of the execution and read them; ``finger``: the joint of a finger."""
 
     def number(name: str, text: str, low: float, high: float) -> float:
         return parameter(node, name, getattr(ArmSettings, name), text, low=low, high=high, read_only=True)
@@ -156,6 +166,18 @@ def read_arm(node: Node, presence: float) -> ArmSettings:
         effort=number("effort", "of the gripper, N; 0: the driver's own", 0.0, 1000.0),
         grasp_tolerance=number("grasp_tolerance", "m that the opening of the closed fingers may be off the planned one", 0.0, 0.1),
         presence=presence,
+        gripper_command=parameter(
+            node,
+            "gripper_command",
+            "GripperCommand",
+            "the gripper's action, of control_msgs",
+            choices=tuple(name for name, kind in gripper.ACTIONS.items() if kind is not None),
+            read_only=True,
+        ),
+        gripper_joint=parameter(
+            node, "gripper_joint", "", "joint that ParallelGripperCommand names; empty: the first finger's", read_only=True
+        )
+        or finger,
     )
 
 

@@ -12,14 +12,18 @@ from typing import Any
 import numpy as np
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from magic_bringup import markers, pipeline
+from magic_bringup import interop, markers, pipeline
 from magic_bringup import settings as parameters
 from magic_bringup.arm import Arm
 from magic_bringup.closed_loop import ClosedLoop, Job
@@ -56,7 +60,7 @@ TURNED = 1.0
 ASKING_PERIOD = 0.1
 
 
-class StrategyServer(Node):
+class StrategyServer(LifecycleNode):
     """Action ``run_strategy``: perceive, match, plan, verify, publish.
 
     Subscribes
@@ -67,11 +71,16 @@ class StrategyServer(Node):
     Publishes
         verified_trajectory (JointTrajectory, latched, variant arm), verified_tool_trajectory (MultiDOFJointTrajectory,
         latched, variant fg), verified_motion (VerifiedMotion, latched, at 1 Hz besides), strategy/markers (MarkerArray, latched),
+        /tf_static (the contacts of the candidate tried last, ``<object>/contact``),
         /diagnostics at 1 Hz.  A trajectory is published, and the arm moves, only where :mod:`magic_bringup.permission` says so;
         it is taken back, by an empty one, at the start, when the next run begins, when objects or arm are elsewhere, at the end.
     With ``execute``, calls also
         ``trajectory_action`` (control_msgs/FollowJointTrajectory) and ``gripper_action`` (control_msgs/GripperCommand): arm and
         gripper carry out a plan of the variant arm that the verifier has passed, where the arm stands at its start.
+
+    Nothing moves unless the node's lifecycle is active (``ros2 lifecycle set``: configure, activate; the parameter ``autostart``);
+    everything else works in each of its states.  Leaving active cancels what is being carried out.  ``~/emergency_stop``
+    (std_srvs/Trigger) cancels the run at work, takes back what is published and forbids both until it is activated again.
 
     One goal runs at a time; a second one is answered BUSY.  Cancel is heeded between
     the stages and inside them: it is forwarded to the running plan or verify goal.
@@ -81,13 +90,13 @@ class StrategyServer(Node):
         super().__init__("strategy_server")
         robot = robot_parameters(self)
         settings = self.settings = parameters.read(self, robot["preset"])
-        arm = parameters.read_arm(self, settings.presence)
+        self.robot = Description(RobotConfig(**robot))
+        arm = parameters.read_arm(self, settings.presence, self.robot.fingers[0].name)
         self._loop = parameters.read_loop(self)
         if settings.execute and settings.recorded:
             raise MagicError(
                 Code.BAD_REQUEST, "parameters execute and recorded", "both true", "one of them: no arm is moved by a recording"
             )
-        self.robot = Description(RobotConfig(**robot))
         self._limits = Limits(
             self.robot.base_frame,
             settings.required_rate,
@@ -104,6 +113,7 @@ class StrategyServer(Node):
         self._complaints: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._waiting: list[str] | None = None
         self._closing = False
+        self._active = self._stopped = self._moves = False
         self._group = group
         self._transforms: TransformListener | None = None
         self._look: tuple[SceneObjectArray, Look] | None = None
@@ -124,6 +134,7 @@ class StrategyServer(Node):
         self.create_subscription(JointState, "joint_states", self._on_joints, qos.SENSOR, callback_group=group)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=group)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
+        self._frames_pub = self.create_publisher(TFMessage, "/tf_static", qos.LATCHED)
         self._server = ActionServer(
             self,
             RunStrategy,
@@ -134,8 +145,56 @@ class StrategyServer(Node):
             callback_group=group,
             result_timeout=RESULT_TIMEOUT,
         )
+        self.create_service(Trigger, "~/emergency_stop", self._on_emergency_stop, callback_group=group)
+        if settings.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
         self._diagnostics = Diagnostics(self, self._report, group)
         self._diagnostics.publish()
+
+    # ------------------------------------------------------------ whether anything may move
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Say what is missing for the arm to be moved."""
+        missing = self._arm.ready() if self._arm is not None else ["an arm: the parameter execute is false"]
+        self.get_logger().info(f"configured; missing: {', '.join(missing)}" if missing else "configured: arm and gripper are there")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """From here on the arm may move, where the rule says so."""
+        self._active, self._stopped = True, False
+        if self._arm is not None:
+            self.get_logger().warning("active: from here on a run may move the arm")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """From here on nothing moves; what is being carried out is canceled."""
+        self._active = False
+        if self._moves:
+            self._cancel_all()
+        return super().on_deactivate(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As :meth:`on_deactivate`."""
+        self._active = False
+        if self._moves:
+            self._cancel_all()
+        return super().on_shutdown(state)
+
+    def _cancel_all(self) -> None:
+        for token in list(self._goals.values()):
+            token.request_cancel()
+
+    def _on_emergency_stop(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Stop; nothing moves and nothing is published until the lifecycle is activated again."""
+        self._stopped, moving = True, self._moves
+        self.get_logger().error("emergency stop")
+        self._cancel_all()
+        self.publication.take_back("an emergency stop was asked for")
+        response.success = True
+        was = "the arm was moving: its controller is told to stop" if moving else "nothing was being moved"
+        response.message = f"{was}; nothing moves until this node is deactivated and activated again (ros2 lifecycle set)"
+        return response
 
     # ------------------------------------------------------------ what comes in
 
@@ -240,6 +299,8 @@ class StrategyServer(Node):
             joints=self.joints.all(),
             recorded=self.settings.recorded,
             replaying=PLAYER in self.get_node_names(),
+            active=self._active,
+            stopped=self._stopped,
         )
 
     def _poke(self) -> None:
@@ -261,7 +322,12 @@ class StrategyServer(Node):
         message = "waiting for " + ", ".join(waiting) if waiting else "ready"
         self.publication.look()
         self._outlet.beat()
-        values = {"running": str(self._token is not None).lower(), "published": self._standing(), "joint_states": self._arm_state()}
+        values = {
+            "running": str(self._token is not None).lower(),
+            "lifecycle": self._lifecycle(),
+            "published": self._standing(),
+            "joint_states": self._arm_state(),
+        }
         return [status(self, "readiness", level, message, values)]
 
     def _standing(self) -> str:
@@ -270,6 +336,11 @@ class StrategyServer(Node):
         if not state.valid:
             return f"nothing: {state.reason}"
         return "; ".join([f"{state.strategy} ({state.variant}) of run {state.run_id}", *state.notes])
+
+    def _lifecycle(self) -> str:
+        if self._stopped:
+            return "stopped: an emergency stop was asked for"
+        return "active" if self._active else "not active: no arm is moved"
 
     def _arm_state(self) -> str:
         if not any(name in self.joints.all() for name in self.robot.names):
@@ -317,6 +388,7 @@ class StrategyServer(Node):
         if not token.end() and result.code == Code.OK:  # canceled when all was done
             result.code, result.message = int(Code.CANCELED), f"canceled: {result.message}"
         if result.code == Code.CANCELED:
+            result.message += "; an emergency stop was asked for" if self._stopped and "emergency" not in result.message else ""
             result.verified = False
             self.publication.take_back("its run was canceled", key.hex())
         if result.code in OUT_OF_TIME and (complaint := clock_complaint(self)):
@@ -490,16 +562,32 @@ class StrategyServer(Node):
         return result.verified
 
     def _show(self, stages: Stages, outcome: pipeline.Outcome) -> None:
-        """Markers of what was tried; where they cannot be drawn, the run has still ended as it has."""
+        """Markers of what was tried, and frames of its contacts; where they cannot be drawn, the run has still ended as it has."""
         if stages.scene is None or stages.matches is None:
             return
         plan = outcome.plan or next((r.plan for r in reversed(outcome.reports) if r.plan is not None), None)
         try:
+            self._tell_contacts(stages, outcome)
             self._marker_pub.publish(
                 markers.run_markers(stages.scene, list(stages.matches.candidates), outcome.target_id, outcome.reports, plan)
             )
         except Exception as error:
             self.get_logger().warning(f"no markers: {describe(self, error)[1]}")
+
+    def _tell_contacts(self, stages: Stages, outcome: pipeline.Outcome) -> None:
+        """The contacts of the candidate that was tried last, as frames on /tf_static, where they were when it was planned."""
+        if not outcome.reports:
+            return
+        frames = interop.contact_frames(stages.scene, outcome.reports[-1].trial.candidate, outcome.target_id)
+        header = Header(stamp=stages.scene.header.stamp, frame_id=self.robot.base_frame)
+        self._frames_pub.publish(
+            TFMessage(
+                transforms=[
+                    TransformStamped(header=header, child_frame_id=name, transform=conversions.transform_to_msg(pose))
+                    for name, pose in frames.items()
+                ]
+            )
+        )
 
     def _carry_out(self, loop: ClosedLoop, result: RunStrategy.Result) -> None:
         """Have arm and gripper do what was planned, and write into the result how that went."""
@@ -508,9 +596,12 @@ class StrategyServer(Node):
         self.get_logger().warning(f"the arm is about to move, if it may: carrying out the {kind} plan")
         notes, error = list(result.notes), None
         try:
+            self._moves = True
             seen = loop.execute()
         except Exception as failure:
             error = failure
+        finally:
+            self._moves = False
         last = loop.jobs[-1].outcome
         fill(result, pipeline.joined(loop.tried, last))
         result.notes = [*notes, *loop.notes]

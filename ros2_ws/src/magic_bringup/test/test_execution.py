@@ -9,8 +9,11 @@ from functools import partial
 import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionServer, GoalResponse
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 from test_strategy_server import Bench
 
 from magic_bringup import fakes
@@ -115,7 +118,7 @@ def folder(tmp_path_factory):
     return root
 
 
-ACTIONS = {"trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}
+ACTIONS = {"autostart": True, "trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}
 OPEN = fakes.OPEN_LOOP  # closed: test_closed_loop.py
 
 
@@ -142,6 +145,9 @@ def bench(shared):
     arm.moving.clear()
     arm.positions, arm.thickness, arm.opening, arm.tells, arm.squeezes, arm.late = [0.0] * 7, 0.03, 0.08, True, False, 0.0
     arm.velocity, arm.apart = 0.0, False
+    if not shared.server._active or shared.server._stopped:
+        shared.server.trigger_deactivate()
+        shared.server.trigger_activate()
     arm.on_move = lambda trajectory, canceled: (0, "")
     sees(shared, fakes.scene())
     believes(shared, [0.0] * 7)
@@ -362,6 +368,87 @@ def test_a_cancel_stops_the_arm(bench):
     assert (response.result.verified, response.result.executed) == (False, False)
     assert stopped == [True]
     assert told(bench) == [("open", 0.04, 20.0), "move"]
+
+
+def test_an_emergency_stop_stops_the_arm_and_lasts_until_the_server_is_activated_again(bench):
+    answers = []
+
+    def move(trajectory, canceled):
+        stop = bench.arm.create_client(Trigger, "/strategy_server/emergency_stop")
+        assert stop.wait_for_service(timeout_sec=10.0)
+        asked = stop.call_async(Trigger.Request())
+        deadline = time.monotonic() + 10.0
+        while not (canceled() and asked.done()) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        answers.append(asked.result())
+        return 0, ""
+
+    bench.arm.on_move = move
+    result, _ = bench.run(variant="arm")
+    assert (result.code, result.verified, result.executed) == (Code.CANCELED, False, False), result.message
+    assert "an emergency stop was asked for" in result.message
+    assert answers[0].success and "the arm was moving" in answers[0].message
+    assert told(bench) == [("open", 0.04, 20.0), "move"]
+    # Nothing is published, and nothing moves.
+    bench.arm.on_move = lambda trajectory, canceled: (0, "")
+    sees(bench, fakes.scene())
+    for variant in ("fg", "arm"):
+        result, _ = bench.run(variant=variant)
+        assert (result.code, result.verified, result.executed) == (Code.CANCELED, False, False)
+        assert "an emergency stop was asked for" in result.message
+    assert told(bench).count("move") == 1
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+        change(bench, transition)
+    sees(bench, fakes.scene())
+    believes(bench, [0.0] * 7)
+    assert bench.run(variant="arm")[0].executed
+
+
+def change(bench, transition):
+    """As ``ros2 lifecycle set`` does."""
+    client = bench.arm.create_client(ChangeState, "/strategy_server/change_state")
+    assert client.wait_for_service(timeout_sec=10.0)
+    asked = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+    bench.until(asked.done)
+    assert asked.result().success
+
+
+def test_nothing_moves_before_the_server_is_activated(folder):
+    bench = Bench(folder, execute=True, state_age=10.0, objects_age=10.0, **{**ACTIONS, "autostart": False})
+    bench.arm = fakes.FakeArm(context=bench.context)
+    bench.executor.add_node(bench.arm)
+    try:
+        bench.until(lambda: not bench.server._arm.ready())
+        believes(bench, [0.0] * 7)
+        for transition in (None, Transition.TRANSITION_CONFIGURE):
+            if transition is not None:
+                change(bench, transition)
+            sees(bench, fakes.scene())
+            result, _ = bench.run(variant="arm")
+            assert (result.code, result.verified, result.executed) == (Code.SERVER_UNAVAILABLE, True, False), result.message
+            assert "lifecycle is not active" in result.message
+        assert told(bench) == []
+        change(bench, Transition.TRANSITION_ACTIVATE)
+        sees(bench, fakes.scene())
+        assert bench.run(variant="arm")[0].executed
+        # Leaving the state stops what is under way.
+        bench.arm.positions = [0.0] * 7
+        believes(bench, [0.0] * 7)
+
+        def move(trajectory, canceled):
+            change(bench, Transition.TRANSITION_DEACTIVATE)
+            deadline = time.monotonic() + 10.0
+            while not canceled() and time.monotonic() < deadline:
+                time.sleep(0.01)
+            return 0, ""
+
+        bench.arm.on_move = move
+        sees(bench, fakes.scene())
+        result, _ = bench.run(variant="arm")
+        assert (result.code, result.executed) == (Code.CANCELED, False)
+    finally:
+        bench.close()
+        bench.arm.destroy_node()
 
 
 def test_a_cancel_between_two_steps_sends_nothing_more(bench, monkeypatch):

@@ -34,6 +34,7 @@ DEADLINE = 60.0
 PARAMETERS = {
     "server_timeout": 10.0,
     "execute": "true",
+    "autostart": "true",
     "state_age": 10.0,
     "objects_age": 60.0,
     "trajectory_action": "arm/follow_joint_trajectory",

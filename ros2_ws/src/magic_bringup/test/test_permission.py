@@ -31,7 +31,7 @@ VERDICT = Verdict(Code.OK, "pulled", 0.95, 0.8, 0.99, 20, (), b"v", "r1")
 CLAIM = Claim("r1", frozenset({BASE}), look(TABLE), VERDICT, joints=JOINTS, start=(0.1, 0.2))
 AT_START = {name: Joint(position, 0.0, CLOCK - 0.01, NOW - 0.01) for name, position in zip(JOINTS, CLAIM.start)}
 SERVERS = {"verifier": V, "planner": frozenset({b"p"}), "matcher": frozenset({b"m"}), "strategy server": frozenset({b"s"})}
-WORLD = World(CLOCK, NOW, "r1", False, SERVERS, look(TABLE), AT_START)
+WORLD = World(CLOCK, NOW, "r1", False, SERVERS, look(TABLE), AT_START, active=True)
 
 
 def seen(**changes):
@@ -57,6 +57,7 @@ def test_what_all_speaks_for_is_permitted(purpose):
     "change, code, says",
     [
         ({"canceled": True}, Code.CANCELED, "canceled"),
+        ({"stopped": True}, Code.CANCELED, "an emergency stop"),
         ({"run": "r2"}, Code.CANCELED, "r2"),
         ({"run": ""}, Code.CANCELED, "none"),
         (served(verifier=V | W), Code.NOT_ALONE, "servers of verifier: 2"),
@@ -133,6 +134,18 @@ def test_an_arm_that_nobody_has_heard_of_is_said_to_be_and_is_not_moved():
     assert permit(home, WORLD, LIMITS, Purpose.PUBLISH) == ()
     with pytest.raises(MagicError, match="BAD_MOTION"):
         permit(home, replace(WORLD, **at(position=1.0)), LIMITS, Purpose.STAND)
+
+
+def test_only_an_active_server_moves_and_a_stopped_one_does_nothing():
+    resting = replace(WORLD, active=False)
+    for purpose in (Purpose.PUBLISH, Purpose.STAND):
+        assert permit(CLAIM, resting, LIMITS, purpose) == ()
+    with pytest.raises(MagicError, match="SERVER_UNAVAILABLE.*not active"):
+        permit(CLAIM, resting, LIMITS, Purpose.MOVE)
+    waived = replace(CLAIM, verdict=None, waived=True)
+    for claim, purpose in ((CLAIM, Purpose.STAND), (waived, Purpose.MOVE)):
+        with pytest.raises(MagicError, match="CANCELED.*emergency stop"):
+            permit(claim, replace(WORLD, stopped=True), LIMITS, purpose)
 
 
 def test_without_an_arm_its_state_does_not_matter():
@@ -234,6 +247,9 @@ WEIGHTS = {
     "perception_changes_its_frame": 1,
     "the_arm_is_heard": 8,
     "time_passes": 3,
+    "activate": 4,
+    "deactivate": 2,
+    "emergency_stop": 1,
 }
 
 
@@ -253,6 +269,8 @@ class Events:
         self.arm, self.heard, self.known = 0.1, 0.0, self.dice.random() < 0.8
         self.count = self.published = self.refused = self.moved = self.anew = 0
         self.holding, self.slipped = False, 0.0
+        self.active = self.dice.random() < 0.8
+        self.stopped = False
         self.run = self.exchange = self.verdict = self.late = None
         self.asked, self.canceled = set(), False
         self.shelf = Shelf()
@@ -280,7 +298,8 @@ class Events:
         joints = {"a": Joint(self.arm, 0.0, self.heard + self.offset, self.heard)} if self.known else {}
         servers = {"verifier": self.there(), "matcher": frozenset(m.encode() for m in self.matchers)}
         scene = look(self.places, self.stamp, self.came, self.frame)
-        return World(self.now + self.offset, self.now, self.run or "", self.canceled, servers, scene, joints)
+        state = {"active": self.active, "stopped": self.stopped}
+        return World(self.now + self.offset, self.now, self.run or "", self.canceled, servers, scene, joints, **state)
 
     def begin(self):
         self.late = self.verdict or self.late
@@ -348,7 +367,8 @@ class Events:
             carried=look({"tool": HAND}).objects["tool"] if self.holding else None,
             mark=self.mark(),
         )
-        allowed = not late and self.judged() and not self.canceled and self.scene_holds(meant) and self.known and self.arm_holds()
+        allowed = not late and self.judged() and not self.canceled and self.active and not self.stopped
+        allowed = allowed and self.scene_holds(meant) and self.known and self.arm_holds()
         try:
             permit(claim, self.world(), LIMITS, Purpose.MOVE)
         except MagicError as error:
@@ -389,22 +409,22 @@ class Events:
             return
         self.verdict = Verdict(Code.OK if ok else Code.DRIFT, "", 1.0, low, 1.0, 20, (), server, self.run, self.mark())
 
-    def publish(self):
-        if self.run is None or self.verdict is None:
-            return
+    def claim(self):
+        """What is asked for, whether the arm is in it, and whether everything but what an arm does speaks for it."""
         late = self.late is not None and self.dice.random() < 0.2  # by a defect, the answer to an earlier run is taken
         places, frame, start, known, with_arm = self.planned
         verdict = self.late if late else self.verdict
         claim = Claim(self.run, frozenset({frame}), look(places, frame=frame), verdict, state_known=known, mark=self.mark())
         if with_arm:
             claim = replace(claim, joints=("a",), start=(start,))
-        allowed = (
-            not late
-            and self.judged()
-            and not self.canceled
-            and self.scene_holds()
-            and (not with_arm or (not known and not self.known) or (self.known and self.arm_holds()))
-        )
+        allowed = not late and self.judged() and not self.canceled and not self.stopped and self.scene_holds()
+        return claim, with_arm, known, allowed
+
+    def publish(self):
+        if self.run is None or self.verdict is None:
+            return
+        claim, with_arm, known, allowed = self.claim()
+        allowed = allowed and (not with_arm or (not known and not self.known) or (self.known and self.arm_holds()))
         try:
             self.publication.offer(claim)
         except MagicError as error:
@@ -415,6 +435,19 @@ class Events:
             assert allowed
             assert self.shelf.standing is self.publication.standing is claim
             self.published += 1
+
+    def activate(self):
+        self.active, self.stopped = True, False
+
+    def deactivate(self):
+        self.active = False
+
+    def emergency_stop(self):
+        """As the server does: the run at work is canceled."""
+        self.stopped = True
+        if self.run is not None:
+            self.canceled = True
+        self.publication.take_back("an emergency stop was asked for")
 
     def cancel(self):
         if self.run is not None:
@@ -483,6 +516,7 @@ class Events:
         assert self.scene_holds()
         assert not with_arm or (not known and not self.known) or abs(self.arm - start) <= 0.02
         assert not self.canceled
+        assert not self.stopped
         assert claim.run == f"r{self.count}"  # the next run took it back
 
 

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.action.client import ClientGoalHandle
 from rclpy.node import Node
 from rclpy.task import Future
+from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
@@ -67,13 +68,14 @@ class Bench:
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.feedback = []
         self.heard = threading.Condition()
-        self.messages = {"arm": [], "tool": [], "markers": [], "state": []}
+        self.messages = {"arm": [], "tool": [], "markers": [], "state": [], "frames": []}
         self.valid = dict.fromkeys(("arm", "tool"))  # the trajectories that have not been taken back
         for key, kind, topic in (
             ("arm", JointTrajectory, "verified_trajectory"),
             ("tool", MultiDOFJointTrajectory, "verified_tool_trajectory"),
             ("markers", MarkerArray, "strategy/markers"),
             ("state", VerifiedMotion, "verified_motion"),
+            ("frames", TFMessage, "/tf_static"),
         ):
             self.node.create_subscription(kind, topic, lambda m, k=key: self._hear(k, m), qos.LATCHED)
         self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -164,7 +166,9 @@ def test_a_verified_tool_trajectory_is_published(bench):
     assert (result.tool_id, result.target_id, result.features, result.simulations) == ("object_1", "object_2", "fake", 1)
     assert [r.code for r in result.candidates] == [0]
     assert result.times.total > 0
-    bench.wait(lambda: bench.messages["tool"] and bench.messages["markers"])
+    bench.wait(lambda: bench.messages["tool"] and bench.messages["markers"] and bench.messages["frames"])
+    frames = {(t.header.frame_id, t.child_frame_id) for t in bench.messages["frames"][-1].transforms}
+    assert frames == {("panda_link0", "object_1/contact"), ("panda_link0", "object_2/contact")}
     assert bench.messages["tool"][0].joint_names == ["object_1"]
     assert not bench.messages["arm"]
     assert {f.stage for f in bench.feedback} == {"perceive", "match", "plan", "verify"}

@@ -28,6 +28,7 @@ from magic_core import presence, presets
 from magic_core.diagnostics import Diagnostics, status
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
+from magic_core.robot_description import file_of
 
 #: What a node is given to wind down while messages still flow, and then its callbacks to end, s.
 WINDING_DOWN, ENDING = 5.0, 2.0
@@ -203,10 +204,14 @@ def robot_parameters(node: Node) -> dict[str, Any]:
         node, "robot.preset", "", "Arm whose values are the defaults here and whose published limits hold.", choices=("", *presets.PRESETS)
     )
     default = presets.config_of(preset)
+
+    def described(name: str, text: str) -> str:
+        return file_of(node, f"robot.{name}", parameter(node, f"robot.{name}", getattr(default, name), text))
+
     return {
         "preset": preset,
-        "urdf": parameter(node, "robot.urdf", default.urdf, "URDF of arm and gripper; empty: the Panda of example-robot-data."),
-        "srdf": parameter(node, "robot.srdf", default.srdf, "SRDF with the pairs of links that may touch."),
+        "urdf": described("urdf", "URDF of arm and gripper, a file or topic:/robot_description; empty: the Panda of example-robot-data."),
+        "srdf": described("srdf", "SRDF with the pairs of links that may touch, a file or topic:/robot_description_semantic."),
         "package_root": parameter(
             node, "robot.package_root", default.package_root, "Folder that package:// stands for; empty: found from the URDF's place."
         ),

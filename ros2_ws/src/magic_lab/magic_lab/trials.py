@@ -45,7 +45,7 @@ NEAR = 0.35
 #: Size of each camera's picture in the video, and how long each frame stands, ms: twice as fast as it was.
 SIZE, FRAME_MS = (400, 300), 100
 #: Parameters of the graph beside a laboratory.
-SERVER = {"execute": True, "effort": 60.0}
+SERVER = {"execute": True, "autostart": True, "effort": 60.0}
 
 
 @dataclass

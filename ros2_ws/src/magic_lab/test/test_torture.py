@@ -50,7 +50,7 @@ class Rig:
         rclpy.init(context=self.context, domain_id=free_domain())
         self.lab = self.made(magic_lab.node.LabNode, camera_rate=0.1, rate=2.0)
         settings = {"objects_age": 1.5, "state_age": 1.0, "objects_timeout": 1.0, "server_timeout": 5.0, "effort": 40.0, **fakes.OPEN_LOOP}
-        self.server = self.made(StrategyServer, strategies=folder, execute=True, use_sim_time=True, **settings)
+        self.server = self.made(StrategyServer, strategies=folder, execute=True, autostart=True, use_sim_time=True, **settings)
         self.fakes = fakes.FakeServers(context=self.context)
         self.fakes.on_match = self.match
         self.fakes.on_plan = lambda goal, _canceled: PlanMotion.Result(plan=conversions.plan_to_msg(plan(), goal.tool.id))
