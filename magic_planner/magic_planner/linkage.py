@@ -57,11 +57,11 @@ class Ungripped(Description):
     @property
     def document(self) -> ET.Element:
         """The URDF."""
-        return self._root
+        return self.root
 
     def mesh_path(self, name: str) -> str:
         """The absolute path of a mesh that the URDF names, as it is where there is no such file."""
-        path = self._mesh_file(name)
+        path = self.mesh_file(name)
         return name if path is None else path.resolve().as_uri()
 
     def beyond(self, link: str) -> list[str]:

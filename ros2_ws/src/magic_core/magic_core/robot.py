@@ -140,7 +140,7 @@ class Description:
     a turn more is the same to the hand, and takes a planner round in circles.  fingers: two sliding joints beyond the last of these,
     closed (2,) and opened (2,) their positions in metres.  finger_links: what moves with the fingers; foot: what never moves.
     base: the root link; base_frame: what its frame is called outside the URDF, the frame of everything that is planned and
-    verified.  moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
+    verified.  root: the URDF's own element.  moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
     may touch.
     """
 
@@ -153,12 +153,12 @@ class Description:
         for path, what in ((self.urdf, "URDF"), (self.srdf, "SRDF")):
             if not path.is_file():
                 raise MagicError(Code.BAD_REQUEST, what, str(path), "an existing file")
-        self._root = _parsed(self.urdf, "URDF")
+        self.root = _parsed(self.urdf, "URDF")
         try:
-            self.joints = {joint.name: joint for joint in map(_joint, self._root.findall("joint"))}
+            self.joints = {joint.name: joint for joint in map(_joint, self.root.findall("joint"))}
         except (ValueError, TypeError, AttributeError) as error:
             raise MagicError(Code.BAD_REQUEST, f"joints of {self.urdf}", str(error), "joints with parent, child and numbers") from error
-        self._links = {link.get("name", ""): link for link in self._root.findall("link")}
+        self._links = {link.get("name", ""): link for link in self.root.findall("link")}
         self._above = {joint.child: joint for joint in self.joints.values()}
         for joint in self.joints.values():
             for link in {joint.parent, joint.child} - set(self._links):
@@ -345,7 +345,7 @@ class Description:
 
     def shapes(self, link: str, what: str = "collision") -> list[Shape]:
         """The ``collision`` or ``visual`` shapes of a link."""
-        colors = {m.get("name", ""): m.find("color") for m in self._root.findall("material")}
+        colors = {m.get("name", ""): m.find("color") for m in self.root.findall("material")}
         return [shape for element in self._links[link].findall(what) if (shape := self._shape(element, colors)) is not None]
 
     def _shape(self, element: ET.Element, colors: Mapping[str, ET.Element | None]) -> Shape | None:
@@ -370,9 +370,9 @@ class Description:
         if body.tag not in sizes:
             return None
         size = tuple(float(v) for v in sizes[body.tag]())
-        return Shape(at, body.tag, size, self._mesh_file(body.get("filename", "")) if body.tag == "mesh" else None, color)
+        return Shape(at, body.tag, size, self.mesh_file(body.get("filename", "")) if body.tag == "mesh" else None, color)
 
-    def _mesh_file(self, name: str) -> Path | None:
+    def mesh_file(self, name: str) -> Path | None:
         """Where a mesh that the URDF names lies; None where it is not found."""
         if not name.startswith("package://"):
             path = self.urdf.resolve().parent / name.removeprefix("file://")
@@ -404,8 +404,8 @@ class Description:
         for a mesh that is missing.
         """
         limited = {joint.name: joint for joint in self.arm if joint is not self.joints[joint.name]}
-        tree = ET.Element("robot", {"name": self._root.get("name", "robot")})
-        for element in copy.deepcopy([*self._root.findall("link"), *self._root.findall("joint")]):
+        tree = ET.Element("robot", {"name": self.root.get("name", "robot")})
+        for element in copy.deepcopy([*self.root.findall("link"), *self.root.findall("joint")]):
             for unused in [*element.findall("visual"), *element.findall("mimic")]:
                 element.remove(unused)
             if element.tag == "joint" and element.get("name") not in self.moving:
@@ -419,7 +419,7 @@ class Description:
                     limit.set("velocity", repr(joint.velocity))
                 element.set("type", joint.kind)
             for mesh in element.iterfind("collision/geometry/mesh"):
-                path = self._mesh_file(mesh.get("filename", ""))
+                path = self.mesh_file(mesh.get("filename", ""))
                 if path is None:
                     raise MagicError(
                         Code.BAD_REQUEST,
