@@ -34,7 +34,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        *tree("launch", "config", "strategies", "rviz"),
+        *tree("launch", "config", "strategies", "rviz", "foxglove"),
     ],
     install_requires=[
         "numpy<2",

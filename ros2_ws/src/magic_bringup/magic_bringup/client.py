@@ -184,12 +184,13 @@ def run(client: Client, given: argparse.Namespace) -> int:
 
 
 def written(record: Record, folder: Path) -> Path:
-    """Write ``summary.json``, the messages and ``report.html`` of a run into a folder that is there; the page's path."""
-    from magic_bringup import report
+    """Write ``summary.json``, the messages, the bag ``run`` and ``report.html`` of a run into a folder that is there; the page's path."""
+    from magic_bringup import report, run_bag
 
     write_summary(record, folder)
     report.save(record, folder)
     report.write(record, folder / "report.html")
+    run_bag.write(record, folder)
     return folder / "report.html"
 
 

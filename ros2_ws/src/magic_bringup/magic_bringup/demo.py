@@ -551,10 +551,11 @@ def _run(options: Options) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     write_summary(record, options.out)
     try:
-        from magic_bringup import report
+        from magic_bringup import report, run_bag
 
         report.save(record, options.out)
         report.write(record, options.out / "report.html", options.out / "logs")
+        run_bag.write(record, options.out)
     except Exception as error:  # the summary counts, the pictures are an addition
         import traceback
 

@@ -79,6 +79,7 @@ class Recording:
     def write(self, topic: str, message: Any, stamp: float, latched: bool = False, depth: int = 10) -> None:
         """One message of any installed type; the topic is declared with its first message."""
         from rclpy.serialization import serialize_message
+        from rosbags.serde import SerdeError
         from rosbags.typesys import get_types_from_msg
 
         name = _type_name(message)
@@ -89,8 +90,12 @@ class Recording:
                 self._store.register(
                     {k: v for k, v in get_types_from_msg(message_definition(name)[0], name).items() if k not in self._store.fielddefs}
                 )
-        # Padding in DDS's serialisation is whatever was in memory; written once more, it is zero.
-        data = bytes(self._store.serialize_cdr(self._store.deserialize_cdr(serialize_message(message), name), name))
+        data = serialize_message(message)
+        try:
+            # Padding in DDS's serialisation is whatever was in memory; written once more, it is zero.
+            data = bytes(self._store.serialize_cdr(self._store.deserialize_cdr(data, name), name))
+        except SerdeError:
+            pass  # what the library cannot read over again is written as it is
         self._writer.write(topic, round(stamp * 1e9), data)
 
     def cameras(self, frames: Sequence[RgbdFrame], stamp: float) -> None:
