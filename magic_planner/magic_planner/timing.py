@@ -119,8 +119,8 @@ def _timed(knots: Array, rows: Array, limits: Limits, step: float, clocked: bool
         bounds = np.stack([low, high], axis=2) * SHARE
         if clocked:
             bounds = np.concatenate([bounds, np.tile([[[-1.0, 1.0]]], (len(grid), 1, 1))], axis=1)
-        index = {float(s): i for i, s in enumerate(grid)}
-        constraints.append(constraint.JointVelocityConstraintVarying(lambda s: bounds[index[float(s)]]))
+        # It is asked at the grid's points, and once before at 0.
+        constraints.append(constraint.JointVelocityConstraintVarying(lambda s: bounds[int(np.abs(grid - s).argmin())]))
     try:
         instance = algorithm.TOPPRA(constraints, toppra.SplineInterpolator(knots, columns), gridpoints=grid)
         _, speeds, _ = instance.compute_parameterization(0.0, 0.0)

@@ -12,8 +12,11 @@ import numpy as np
 import planner_scenes as scenes
 import pytest
 
-from magic_core import transforms
+from magic_core import interpolation, transforms
 from magic_core.errors import Code, MagicError
+from magic_core.joint_limits import PUBLISHED
+from magic_core.presets import PRESETS
+from magic_core.robot import Description
 from magic_core.testing import six_axis
 from magic_planner.arm import ArmPlanner
 from magic_planner.object_motion import plan_tool_motion
@@ -120,3 +123,22 @@ def test_what_is_wrong_with_a_configuration_is_said(config, change, words):
         Robot(dataclasses.replace(config, **change))
     assert error.value.code == Code.BAD_REQUEST
     assert words in error.value.message
+
+
+def test_the_preset_of_an_fr3_plans_within_its_limits():
+    """With the Panda's description, whose links are the same: what the preset publishes is narrower in places, and is kept."""
+    panda = Description()
+    files = {"urdf": str(panda.urdf), "srdf": str(panda.srdf), "move_group": panda.config.move_group}
+    planner = ArmPlanner(Robot(dataclasses.replace(PRESETS["fr3"].config, **files)))
+    tool, tool_contact = scenes.hook()
+    target, target_contact = scenes.standing_cylinder(at=(0.62, 0.0))
+    strategy, candidate = scenes.pulling(), scenes.candidate(tool, tool_contact, target_contact)
+    plan = planner.plan(strategy, tool, target, candidate, "keep", plan_tool_motion(strategy, tool, target, candidate))
+    arm, limits = plan.arm_motion, PUBLISHED["fr3"]
+    assert np.all(arm.positions >= limits.lower) and np.all(arm.positions <= limits.upper)
+    low, high = limits.braking.velocities(arm.positions)
+    assert np.all((low - 1e-6 <= arm.velocities) & (arm.velocities <= high + 1e-6))
+    fast, strong, sharp = interpolation.extremes(arm.times, arm.positions, arm.velocities, arm.accelerations)
+    assert np.all(fast <= 0.31 * np.array(limits.velocity))
+    assert np.all(strong <= 0.21 * np.array(limits.acceleration))
+    assert np.all(sharp <= 0.06 * np.array(limits.jerk))

@@ -171,7 +171,7 @@ def read_arm(node: Node, presence: float, finger: str) -> ArmSettings:
             "gripper_command",
             "GripperCommand",
             "the gripper's action, of control_msgs",
-            choices=tuple(name for name, kind in gripper.ACTIONS.items() if kind is not None),
+            choices=tuple(gripper.ACTIONS),
             read_only=True,
         ),
         gripper_joint=parameter(
