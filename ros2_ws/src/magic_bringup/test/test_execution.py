@@ -414,7 +414,7 @@ def change(bench, transition):
 
 
 def test_nothing_moves_before_the_server_is_activated(folder):
-    bench = Bench(folder, execute=True, state_age=10.0, objects_age=10.0, **{**ACTIONS, "autostart": False})
+    bench = Bench(folder, execute=True, state_age=10.0, objects_age=10.0, **{**ACTIONS, "autostart": False}, **OPEN)
     bench.arm = fakes.FakeArm(context=bench.context)
     bench.executor.add_node(bench.arm)
     try:
