@@ -58,7 +58,7 @@ class Rig:
         self.objects = self.node.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.reset_client = self.node.create_client(Trigger, "lab/reset")
-        self.node.create_timer(0.1, self.perceive)
+        self.node.create_timer(0.2, self.perceive)
         self.executor = ThreadedExecutor(16, context=self.context)
         self.nodes = (self.lab, self.server, self.fakes, self.node)
         for node in self.nodes:
@@ -110,8 +110,8 @@ class Rig:
         done = self.reset_client.call_async(Trigger.Request())
         self.until(done.done)
         assert done.result().success, done.result().message
-        since = self.lab.now + 0.2
-        self.until(lambda: self.lab.now > since)
+        since = self.lab.now
+        self.until(lambda: self.server.scene is not None and conversions.time_from_msg(self.server.scene.header.stamp) > since)
 
     def run(self):
         """The result of one run."""
