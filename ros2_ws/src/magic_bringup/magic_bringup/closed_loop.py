@@ -385,12 +385,15 @@ class ClosedLoop:
             stages = Stages(self._server, self._token, self._run, needs, heatmap=False, since=since)
         else:
             request = replace(request, tool_id=last.tool_id, target_id=last.target_id)
-            stages = HeldStages(self._server, self._token, self._run, needs, held, since)
+            known = self.jobs[-1].claim.scene.objects
+            stages = HeldStages(self._server, self._token, self._run, needs, held, known, since)
         outcome = self._work(request, stages, self._strategy.reflections, self._made)
         return Job(outcome, stages, self._claim(outcome, stages), held)
 
     def _in_hand(self, held: Held, before: Stages) -> HeldStages:
-        return HeldStages(self._server, self._token, self._run, self._strategy.simulatable, held, -math.inf, before)
+        return HeldStages(
+            self._server, self._token, self._run, self._strategy.simulatable, held, self.jobs[-1].claim.scene.objects, -math.inf, before
+        )
 
     def _claim(self, outcome: pipeline.Outcome, stages: Stages) -> Claim:
         return self._claim_of(outcome, stages) if outcome.code == Code.OK else self.jobs[-1].claim
@@ -442,7 +445,7 @@ class ClosedLoop:
         for item in scene.objects:
             if after and UNSEEN in item.cut_off:
                 continue  # remembered from before the motion: what came of it is not known
-            if not after or held is None or not held.sees(item, hand):
+            if not after or held is None or not held.sees(item, hand, self.jobs[-1].claim.scene.objects):
                 things[item.id] = seen_goal.Thing.of(conversions.mesh_from_msg(item.mesh), conversions.pose_from_msg(item.pose))
         if after and held is not None:
             things[held.tool.id] = seen_goal.Thing.of(held.mesh, held.pose(hand))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,11 +41,11 @@ class Held:
         """Its hull (see :mod:`magic_bringup.scene_change`) with the hand at a pose."""
         return scene_change.hull(transforms.apply(self.pose(world_from_tcp), self.mesh.vertices))
 
-    def sees(self, item: SceneObject, world_from_tcp: NDArray[np.float64]) -> bool:
-        """Whether an object, as it is seen, is this tool in the hand, whatever its id."""
+    def sees(self, item: SceneObject, world_from_tcp: NDArray[np.float64], known: Collection[str]) -> bool:
+        """Whether an object, as it is seen, is this tool in the hand, whatever its id; ``known``: ids of other things, which are none."""
         if item.id == self.tool.id:
             return True
-        return item.hanging and scene_change.contained(hull_of(item), self.hull(world_from_tcp), scene_change.ABOUT)
+        return item.id not in known and scene_change.contained(hull_of(item), self.hull(world_from_tcp), scene_change.ABOUT)
 
     def at(self, world_from_tcp: NDArray[np.float64]) -> SceneObject:
         """The object with the hand at a pose; the points seen of it before are left out."""
@@ -60,14 +61,23 @@ class Held:
 class HeldStages(Stages):
     """The stages of a run with the tool in the hand: nothing is grasped, and the tool is matched by its view from before.
 
-    ``kept``: the contacts that are known already, for a scene that is as it was; else the target is looked at and matched anew.
+    ``known``: ids of the other things.  ``before``: whose contacts are kept, for a scene that is as it was; else the target is looked at
+    and matched anew.
     """
 
     def __init__(
-        self, server: Server, token: Token, run: str, needs_verifier: bool, held: Held, since: float, before: Stages | None = None
+        self,
+        server: Server,
+        token: Token,
+        run: str,
+        needs_verifier: bool,
+        held: Held,
+        known: Collection[str],
+        since: float,
+        before: Stages | None = None,
     ) -> None:
         super().__init__(server, token, run, needs_verifier, heatmap=False, since=since)
-        self.held = held
+        self.held, self._known = held, frozenset(known)
         self._kept = before
         self._tool = held.tool
 
@@ -88,7 +98,7 @@ class HeldStages(Stages):
         """The scene without what is in the hand, whatever its id."""
         hand = self._server.hand()
         rest = copy.copy(scene)
-        rest.objects = [o for o in scene.objects if not self.held.sees(o, hand)]
+        rest.objects = [o for o in scene.objects if not self.held.sees(o, hand, self._known)]
         return rest
 
     def _enough(self, scene: SceneObjectArray, request: pipeline.Request) -> bool:

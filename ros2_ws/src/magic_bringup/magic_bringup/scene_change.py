@@ -22,7 +22,7 @@ def _directions(count: int = 200) -> NDArray[np.float64]:
 
 DIRECTIONS = _directions()
 #: What is seen of a tool in the hand, with what is left of the hand at its edges, reaches so far beyond the tool at most, m.
-ABOUT = 0.05
+ABOUT = 0.1
 
 
 def hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
