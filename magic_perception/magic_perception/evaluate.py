@@ -2,7 +2,7 @@
 
 Three parts, each left out, and said so, where its data are absent:
 
-osd       Segmentation of the OSD scenes: mean best IoU of the labelled objects.
+osd       Segmentation of the OSD scenes by the field's measures (:mod:`magic_perception.measures`).
 captures  Single RealSense captures: how many objects, and their sizes beside those read from the images by hand.
 meshes    Ray-cast captures of scanned and modelled objects by two D435s (:mod:`magic_core.sensor`): mask IoU, and for the
           paper's reconstruction and this one side by side the Chamfer distance, the volumetric IoU and the holes that are open.
@@ -19,7 +19,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -33,7 +33,7 @@ from magic_core.mesh import Mesh, load
 from magic_core.rendering import Raycaster
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.views import find_view, holes_of
-from magic_perception import coverage, speed
+from magic_perception import coverage, measures, speed
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmentation import Segmenter, _frame_on, find_table, look
@@ -66,9 +66,10 @@ def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
 
 
 def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:
-    """Best IoU of each labelled object.  Labels 40, 41, ... are surfaces of one thing (a bowl's outside and inside): objects are told by their tens."""
+    """Best IoU of each labelled object, and the field's measures.  Labels 40, 41, ... are surfaces of one thing (a bowl's outside and inside): objects are told by their tens."""
     scenes: dict[str, object] = {}
     everything: list[float] = []
+    measured: list[measures.Measures] = []
     intrinsics = json.loads((folder / "intrinsics.json").read_text())
     for name in sorted(path.name.removesuffix("_label.png") for path in folder.glob("*_label.png")):
         k = intrinsics.get(name, intrinsics.get("all scenes"))
@@ -84,17 +85,17 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
         table, own = find_table([frame], parameters)
         labels = segmenter.segment([look(frame, own[0], _frame_on(table, np.eye(4)), parameters)], (), parameters)[0]
         seconds = time.process_time() - start
-        scores = []
-        for value in np.unique(truth[truth >= 20]):
-            mask = truth == value
-            scores.append(max((overlap(mask, labels == i) for i in np.unique(labels[mask]) if i > 0), default=0.0))
+        truth[truth < 20] = 0
+        scores = measures.best_ious(labels, truth)
+        measured.append(measures.measure(labels, truth))
         scenes[name] = {
             "objects": len(scores),
             "found": int(labels.max()),
-            "best_iou": [round(s, 3) for s in scores],
+            "best_iou": scores.round(3).tolist(),
+            "measures": {key: round(value, 4) for key, value in asdict(measured[-1]).items()},
             "cpu_seconds": round(seconds, 3),
         }
-        everything += scores
+        everything += scores.tolist()
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(pictures / f"{name}.png"), tinted(frame.color, labels)[..., ::-1])
@@ -102,6 +103,7 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
         "mean_best_iou": round(float(np.mean(everything)), 4),
         "above_0.75": round(float(np.mean(np.array(everything) > 0.75)), 4),
         "objects": len(everything),
+        "measures": {key: round(value, 4) for key, value in asdict(measures.mean(measured)).items()},
         "scenes": scenes,
     }
 
@@ -336,8 +338,12 @@ def markdown(result: dict) -> str:
     lines = ["# Perception, measured", ""]
     if "osd" in result:
         part = result["osd"]
+        m = part["measures"]
         lines += [
             f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects of {len(part['scenes'])} scenes; above 0.75: {part['above_0.75']:.1%}.",
+            "Mean of the scenes, in percent: overlap P {:.1f}, R {:.1f}, F {:.1f}; boundary P {:.1f}, R {:.1f}, F {:.1f}; F@.75 {:.1f}.".format(
+                *(100 * m[f"{kind}_{what}"] for kind in ("overlap", "boundary") for what in ("precision", "recall", "f")), 100 * m["detected"]
+            ),
             "",
             "| scene | objects | found | best IoU | CPU s |",
             "| --- | --- | --- | --- | --- |",

@@ -464,6 +464,7 @@ class DepthSegmenter:
             labels.append(_fill(image, mask))
         # What is too small for a thing and hangs together with one in the mask belongs to it: depth is not to be trusted there.
         labels = [_fill(image, mask) for image, mask in zip(_sizeable(labels, looks, parameters), masks, strict=True)]
+        labels = _with_depth(labels, looks, parameters)
         for image, known_pixels in zip(labels, fixed, strict=True):
             image[known_pixels] = -1
         return _behind_one(_attached(labels, looks, parameters), looks, parameters)
@@ -502,6 +503,23 @@ class DepthSegmenter:
                 instance[mine[part == number]] = following
                 following += 1
         return convexity.insides(cloud, normal, instance, heights)
+
+
+#: Least share of a thing's pixels that has depth in one camera at least.
+MEASURED = 0.2
+
+
+def _with_depth(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
+    """Labels without what colour alone tells of: beyond the table's edge, where depth ends, the floor is of another colour."""
+    top = max((int(image.max()) for image in labels), default=0)
+    share = np.zeros(top + 1)
+    for look, image in zip(looks, labels, strict=True):
+        count, seen = (np.bincount(image[where], minlength=top + 1) for where in (image > 0, (image > 0) & np.isfinite(look.frame.depth)))
+        share = np.maximum(share, seen / np.maximum(count, 1))
+    if np.all(share[1:] >= MEASURED):
+        return labels
+    table = np.where(share >= MEASURED, np.arange(top + 1), 0).astype(np.int32)
+    return _sizeable([table[image] for image in labels], looks, parameters)
 
 
 def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0) -> NDArray[np.int32]:
