@@ -20,6 +20,7 @@ setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(exclude=["test"]),
+    package_data={PACKAGE: ["*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -47,6 +48,8 @@ setup(
             "perception = magic_perception.programs:perception",
             "perceive_images = magic_perception.programs:perceive_images",
             "evaluate = magic_perception.programs:evaluate",
+            "learn_seams = magic_perception.programs:learn_seams",
+            "learn_confidence = magic_perception.programs:learn_confidence",
         ]
     },
 )

@@ -1,37 +1,39 @@
 """How likely it is that a reconstructed thing is right, computed from what was seen of it.
 
 A thing is right where its masks and its solid overlap the truth (intersection over union, seen by each camera and by volume) by more
-than 0.8.  The chance of that is a logistic function of a few numbers, fitted with a ridge penalty to 356 things of procedural scenes that the
-model of a D435 saw with two cameras, with one, and with two whose poses were off by up to 10 mm.  README.md says how it does on others.
+than 0.8.  The chance of that is a logistic function of a few numbers.  ``confidence.json`` holds its weights, made by
+``ros2 run magic_perception learn_confidence`` from procedural scenes; README.md says how it does on others.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_perception import logistic
 from magic_perception.seen import Witnessed
 from magic_perception.sight import Agreement
 
 #: Shapes that are fitted or carved whole from what masks tell; and those with a body of revolution.
-EXACT, ROUND = ("sphere", "cylinder", "flat"), ("round", "round with handle")
-#: What each number adds to the logarithm of the odds.
-CONSTANT = -26.249
-WEIGHTS = {
-    "exact": 4.492,
-    "overlap": 20.888,
-    "through": 4.390,
-    "seen": 8.936,
-    "residual_mm": -1.372,
-    "far": 3.632,
-    "flat": -0.554,
-    "round": 2.095,
-    "thin": 1.539,
-    "cut": -1.587,
-    "several": 0.619,
-    "apart_mm": -0.671,
+EXACT, ROUND = ("sphere", "cylinder", "box", "flat"), ("round", "round with handle")
+#: The numbers that speak for or against a solid, and what they are.
+NUMBERS = {
+    "exact": "1 for a ball, cylinder, box or flat thing",
+    "overlap": "of its silhouette with the masks",
+    "through": "share of rays that pass through it, up to 0.3",
+    "seen": "share of its surface that was seen",
+    "residual_mm": "median distance between measured and drawn depth, up to 8",
+    "far": "share of the measured points farther than 6 mm from it",
+    "flat": "1 for a flat thing",
+    "round": "1 for a body of revolution",
+    "thin": "log of its smallest size over 20 mm",
+    "cut": "1 where it is cut off",
+    "several": "1 where several cameras saw it",
+    "apart_mm": "how far they disagree, up to 12",
 }
 
 
@@ -52,9 +54,9 @@ class Evidence:
     apart: float
     cut: bool
 
-    def numbers(self) -> dict[str, float]:
-        """What the chance is computed from, each within the range of what it was fitted to."""
-        return {
+    def row(self) -> NDArray[np.float64]:
+        """The :data:`NUMBERS`, each within the range of what the chance was fitted to."""
+        told = {
             "exact": float(self.shape in EXACT),
             "overlap": min(self.fit.overlap, 1.0),
             "through": min(self.fit.through, 0.3),
@@ -68,9 +70,14 @@ class Evidence:
             "several": float(self.cameras > 1),
             "apart_mm": min(1000 * self.apart, 12.0),
         }
+        return np.array([told[name] for name in NUMBERS])
+
+
+@cache
+def _learned() -> logistic.Logistic:
+    return logistic.load(Path(__file__).with_name("confidence.json"), NUMBERS)
 
 
 def chance(evidence: Evidence) -> float:
     """0..1: how likely masks and solid overlap the truth by more than 0.8."""
-    odds = CONSTANT + sum(WEIGHTS[name] * value for name, value in evidence.numbers().items())
-    return float(1 / (1 + np.exp(-np.clip(odds, -30, 30))))
+    return _learned().chance(evidence.row())

@@ -19,6 +19,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -36,7 +37,7 @@ from magic_core.views import find_view, holes_of
 from magic_perception import coverage, measures, speed
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
-from magic_perception.segmentation import Segmenter, _frame_on, find_table, look
+from magic_perception.segmentation import Looked, Segmenter, _frame_on, find_table, look
 from magic_perception.segmenters import make_segmenter
 from magic_perception.table import camera_over_table
 
@@ -65,11 +66,15 @@ def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
 # ---------------------------------------------------------------- OSD
 
 
-def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:
-    """Best IoU of each labelled object, and the field's measures.  Labels 40, 41, ... are surfaces of one thing (a bowl's outside and inside): objects are told by their tens."""
-    scenes: dict[str, object] = {}
-    everything: list[float] = []
-    measured: list[measures.Measures] = []
+#: The whole of a picture, up to 2 m.
+OSD_PARAMETERS = Parameters(region_low=(-2, -2, -0.05), region_high=(2, 2, 0.6))
+
+
+def osd_scenes(folder: Path) -> Iterator[tuple[str, RgbdFrame, NDArray[np.int64]]]:
+    """Name, frame and truth (H, W) of each labelled scene: 0 for none, else the number of the object.
+
+    Labels 40, 41, ... are surfaces of one thing (a bowl's outside and inside): objects are told by their tens.
+    """
     intrinsics = json.loads((folder / "intrinsics.json").read_text())
     for name in sorted(path.name.removesuffix("_label.png") for path in folder.glob("*_label.png")):
         k = intrinsics.get(name, intrinsics.get("all scenes"))
@@ -80,12 +85,26 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
             name,
         )
         truth = cv2.imread(str(folder / f"{name}_label.png"), cv2.IMREAD_UNCHANGED).astype(int) // 10 * 10
-        parameters = Parameters(region_low=(-2, -2, -0.05), region_high=(2, 2, 0.6), split=split)
-        start = time.process_time()
-        table, own = find_table([frame], parameters)
-        labels = segmenter.segment([look(frame, own[0], _frame_on(table, np.eye(4)), parameters)], (), parameters)[0]
-        seconds = time.process_time() - start
         truth[truth < 20] = 0
+        yield name, frame, truth
+
+
+def looked_at(frame: RgbdFrame, parameters: Parameters) -> Looked:
+    """A frame over the table that it sees."""
+    table, own = find_table([frame], parameters)
+    return look(frame, own[0], _frame_on(table, np.eye(4)), parameters)
+
+
+def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:
+    """Best IoU of each labelled object, and the field's measures."""
+    scenes: dict[str, object] = {}
+    everything: list[float] = []
+    measured: list[measures.Measures] = []
+    parameters = replace(OSD_PARAMETERS, split=split)
+    for name, frame, truth in osd_scenes(folder):
+        start = time.process_time()
+        labels = segmenter.segment([looked_at(frame, parameters)], (), parameters)[0]
+        seconds = time.process_time() - start
         scores = measures.best_ious(labels, truth)
         measured.append(measures.measure(labels, truth))
         scenes[name] = {
@@ -342,7 +361,8 @@ def markdown(result: dict) -> str:
         lines += [
             f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects of {len(part['scenes'])} scenes; above 0.75: {part['above_0.75']:.1%}.",
             "Mean of the scenes, in percent: overlap P {:.1f}, R {:.1f}, F {:.1f}; boundary P {:.1f}, R {:.1f}, F {:.1f}; F@.75 {:.1f}.".format(
-                *(100 * m[f"{kind}_{what}"] for kind in ("overlap", "boundary") for what in ("precision", "recall", "f")), 100 * m["detected"]
+                *(100 * m[f"{kind}_{what}"] for kind in ("overlap", "boundary") for what in ("precision", "recall", "f")),
+                100 * m["detected"],
             ),
             "",
             "| scene | objects | found | best IoU | CPU s |",

@@ -103,6 +103,8 @@ def boundary(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _near(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(2,): pixels of outline a near b, and of b near a."""
     x, y, w, h = cv2.boundingRect((a | b).view(np.uint8))
+    if w == 0:
+        return np.zeros(2)
     reach = int(np.ceil(NEAR * np.hypot(*a.shape)))
     step = np.arange(-reach, reach + 1)
     disc = (step[:, None] ** 2 + step**2 <= reach**2).astype(np.uint8)

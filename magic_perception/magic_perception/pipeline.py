@@ -19,6 +19,7 @@ from magic_core.scene import FIXTURE, PICTURE, REGION, UNSEEN, Scene, SceneObjec
 from magic_core.views import find_view
 from magic_perception import cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
+from magic_perception.glass import once, unmeasured
 from magic_perception.hidden import hangs, veil
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
@@ -138,6 +139,8 @@ def perceive(
             labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
         found = iter(labels[:now])
         report.labels = [next(found) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(given, seeing, strict=True)]
+        blank = [item for look, image in zip(looks[:now], labels[:now], strict=True) for item in unmeasured(look, image, world_from_table)]
+        report.notes += [f"[{int(Code.NO_DEPTH)} {Code.NO_DEPTH.name}] {item}" for item in once(blank)]
 
     offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
     # Cameras of which nothing is known may be as far apart as would be borne.

@@ -3,7 +3,7 @@
 Everything here is in the table frame: z = 0 is the table, z up.  The paper projects the points to the table,
 takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstruct` does better where that fails:
 
-* balls and upright cylinders are recognised by their residual;
+* balls, upright cylinders and boxes are recognised by their residual;
 * flat things are carved: a cell of the table is part of the thing if the whole upright column above it, up to the
   measured thickness, falls into the thing's mask in every camera.  For a prism this is its visual hull; it takes its
   sharpness from the colour image, not from depth, and a hole through which the table is seen stays open;
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_perception import clusters, polygons, primitives
+from magic_perception.boxes import recognise_box
 from magic_perception.carved import build_carved
 from magic_perception.layers import build_layers
 from magic_perception.lying import build_lying
@@ -50,6 +51,11 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     if found is not None:
         fit = agreement(found.mesh, sights)
         if fit.overlap > 0.75 and fit.through < _FREE:
+            return replace(found, fit=fit)
+    found = recognise_box(points, sights, height, noise)
+    if found is not None:
+        fit = agreement(found.mesh, sights)
+        if fit.overlap > 0.85 and fit.through < _FREE:
             return replace(found, fit=fit)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]

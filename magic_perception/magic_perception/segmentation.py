@@ -22,6 +22,7 @@ from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters, convexity, smear
 from magic_perception.parameters import Parameters
+from magic_perception.seams import Judge, learned
 from magic_perception.table import Plane, fit_plane, supports
 
 T, R = TypeVar("T"), TypeVar("R")
@@ -436,73 +437,118 @@ def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...],
     return result
 
 
+@dataclass(frozen=True)
+class Clusters:
+    """What is above the table, by what hangs together in space.
+
+    masks (H, W) for each look, without what is known; fixed (H, W): what is.  spots: rows and columns of the mask's pixels with depth in
+    each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1 for noise.
+    """
+
+    masks: list[NDArray[np.bool_]]
+    fixed: list[NDArray[np.bool_]]
+    spots: list[tuple[NDArray, NDArray]]
+    cloud: NDArray[np.float32]
+    instance: NDArray[np.int64]
+
+
+def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> Clusters:
+    """The clusters in all looks together; known: meshes (world) that are left out."""
+    masks = each(lambda looked: foreground(looked, parameters), looks, parameters.workers)
+    fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
+    masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
+    spots = [
+        np.nonzero(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights))
+        for mask, looked in zip(masks, looks, strict=True)
+    ]
+    cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
+    instance = clusters.cluster(cloud, parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
+    return Clusters(masks, fixed, spots, cloud, instance)
+
+
+#: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
+POINTS, TALL = 1500, 0.05
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The points of all clusters (N,): unit normals (N, 3), NaN outside of the tall clusters and where there is none; heights (N,) above the table, m;
+    colours (N, 3), 0..255.  tall: the indices of the points of each cluster that may be more than one thing."""
+
+    normal: NDArray[np.float32]
+    heights: NDArray[np.float32]
+    rgb: NDArray[np.float32]
+    tall: list[NDArray[np.int64]]
+
+
+def surfaces(looks: list[Looked], found: Clusters) -> Surfaces:
+    """Of the clusters what their seams are found by."""
+    heights = np.concatenate([looked.heights[where] for looked, where in zip(looks, found.spots, strict=True)])
+    rgb = np.concatenate([looked.frame.color[where] for looked, where in zip(looks, found.spots, strict=True)]).astype(np.float32)
+    members = [np.nonzero(found.instance == label)[0] for label in range(int(found.instance.max(initial=-1)) + 1)]
+    tall = [mine for mine in members if len(mine) >= POINTS and np.percentile(heights[mine], 97) >= TALL]
+    normal = np.full((len(found.cloud), 3), np.nan, np.float32)
+    flags = np.zeros(len(found.cloud), bool)
+    for mine in tall:
+        flags[mine] = True
+    start = 0
+    for looked, (rows, columns) in zip(looks, found.spots, strict=True):
+        here = flags[start : start + len(rows)]
+        if here.any():
+            v, u = rows[here], columns[here]
+            r0, r1 = max(int(v.min()) - 8, 0), min(int(v.max()) + 9, looked.heights.shape[0])
+            c0, c1 = max(int(u.min()) - 8, 0), min(int(u.max()) + 9, looked.heights.shape[1])
+            window = looked.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
+            field = convexity.normals(window, looked.frame.world_from_camera[:3, 3])
+            near = np.nonzero((rows >= r0) & (rows < r1) & (columns >= c0) & (columns < c1))[0]
+            normal[start + near] = field[rows[near] - r0, columns[near] - c0]
+        start += len(rows)
+    return Surfaces(normal, heights, rgb, tall)
+
+
 class DepthSegmenter:
-    """Table plane, table colour, clusters: no weights."""
+    """Table plane, table colour, clusters: no weights but those of a few criteria of seams.
+
+    judge: what tells whether a seam parts two things, instead of the weights that ship with the package.
+    """
 
     name = "depth"
 
+    def __init__(self, judge: Judge | None = None) -> None:
+        self._judge = judge or learned()
+
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`Segmenter`."""
-        masks = each(lambda looked: foreground(looked, parameters), looks, parameters.workers)
-        fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
-        masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
-        solid = [
-            mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights) for mask, looked in zip(masks, looks, strict=True)
-        ]
-        spots = [np.nonzero(s) for s in solid]
-        cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
-        counts = [len(where[0]) for where in spots]
-        instance = clusters.cluster(cloud, parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
-        if parameters.split:
-            instance = self._split(looks, spots, cloud, instance)
+        found = clustered(looks, known, parameters)
+        instance = _parted(looks, found, self._judge) if parameters.split else found.instance
         labels = []
         start = 0
-        for mask, where, count in zip(masks, spots, counts, strict=True):
+        for mask, where in zip(found.masks, found.spots, strict=True):
             image = np.zeros(mask.shape, np.int32)
-            image[where] = instance[start : start + count] + 1
-            start += count
+            image[where] = instance[start : start + len(where[0])] + 1
+            start += len(where[0])
             labels.append(_fill(image, mask))
         # What is too small for a thing and hangs together with one in the mask belongs to it: depth is not to be trusted there.
-        labels = [_fill(image, mask) for image, mask in zip(_sizeable(labels, looks, parameters), masks, strict=True)]
+        labels = [_fill(image, mask) for image, mask in zip(_sizeable(labels, looks, parameters), found.masks, strict=True)]
         labels = _with_depth(labels, looks, parameters)
-        for image, known_pixels in zip(labels, fixed, strict=True):
+        for image, known_pixels in zip(labels, found.fixed, strict=True):
             image[known_pixels] = -1
         return _behind_one(_attached(labels, looks, parameters), looks, parameters)
 
-    @staticmethod
-    def _split(
-        looks: list[Looked], spots: list[tuple[NDArray, NDArray]], cloud: NDArray[np.float32], instance: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
-        """Part clusters at concave seams; only what is taller than 50 mm: tools lie flat, and their parts belong together."""
-        heights = np.concatenate([looked.heights[where] for looked, where in zip(looks, spots, strict=True)])
-        color = np.concatenate([looked.frame.color[where] for looked, where in zip(looks, spots, strict=True)]).astype(np.float32)
-        color /= np.maximum(color.sum(axis=1, keepdims=True), 1)
-        following = int(instance.max(initial=-1)) + 1
-        members = [np.nonzero(instance == label)[0] for label in range(following)]
-        tall = [mine for mine in members if len(mine) >= 1500 and np.percentile(heights[mine], 97) >= 0.05]
-        if not tall:
-            return instance
-        flags = np.zeros(len(cloud), bool)
-        flags[np.concatenate(tall)] = True
-        normal = np.full((len(cloud), 3), np.nan, np.float32)
-        start = 0
-        for looked, (rows, columns) in zip(looks, spots, strict=True):
-            here = flags[start : start + len(rows)]
-            if here.any():
-                v, u = rows[here], columns[here]
-                r0, r1 = max(int(v.min()) - 8, 0), min(int(v.max()) + 9, looked.heights.shape[0])
-                c0, c1 = max(int(u.min()) - 8, 0), min(int(u.max()) + 9, looked.heights.shape[1])
-                window = looked.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
-                field = convexity.normals(window, looked.frame.world_from_camera[:3, 3])
-                near = np.nonzero((rows >= r0) & (rows < r1) & (columns >= c0) & (columns < c1))[0]
-                normal[start + near] = field[rows[near] - r0, columns[near] - c0]
-            start += len(rows)
-        for mine in tall:
-            part = convexity.parts(cloud[mine], normal[mine], heights[mine], color[mine])
-            for number in range(1, int(part.max()) + 1):
-                instance[mine[part == number]] = following
-                following += 1
-        return convexity.insides(cloud, normal, instance, heights)
+
+def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.int64]:
+    """The instances (N,) with tall clusters parted at the seams between things."""
+    seen = surfaces(looks, found)
+    if not seen.tall:
+        return found.instance
+    instance = found.instance.copy()
+    following = int(instance.max()) + 1
+    for mine in seen.tall:
+        part = convexity.parts(found.cloud[mine], seen.normal[mine], seen.heights[mine], seen.rgb[mine], judge)
+        for number in range(1, int(part.max()) + 1):
+            instance[mine[part == number]] = following
+            following += 1
+    return convexity.insides(found.cloud, seen.normal, instance, seen.heights)
 
 
 #: Least share of a thing's pixels that has depth in one camera at least.

@@ -1,0 +1,166 @@
+"""Which seams part things, boxes by their faces, things without depth, and how chances are fitted."""
+
+import numpy as np
+import pytest
+import scenes
+import trimesh
+
+from magic_core import sensor, shapes, transforms
+from magic_core.errors import Code
+from magic_core.mesh import Mesh
+from magic_perception import learn_confidence, learn_seams, logistic, seams
+from magic_perception.parameters import Parameters
+from magic_perception.piles import pile
+from magic_perception.pipeline import Report, perceive
+
+
+def box(size, x=0.0, y=0.0, z=0.0, yaw=0.0, color=(180, 60, 50)):
+    made = trimesh.creation.box(size)
+    made.apply_transform(transforms.from_rpy(0, 0, yaw, [x, y, z + size[2] / 2]))
+    return Mesh(made.vertices, made.faces).painted(color)
+
+
+def test_a_fit_finds_the_weights_that_made_its_examples(tmp_path):
+    random = np.random.default_rng(0)
+    rows = random.normal(size=(6000, 2)) * [1.0, 5.0]
+    truth = random.random(6000) < 1 / (1 + np.exp(-(0.5 + rows @ [2.0, -0.3])))
+    model = logistic.fit(rows, truth)
+    assert model.constant == pytest.approx(0.5, abs=0.15) and model.weights == pytest.approx([2.0, -0.3], abs=0.15)
+    model.save(tmp_path / "m.json", ["a", "b"])
+    again = logistic.load(tmp_path / "m.json", ["b", "a"])
+    assert again.odds(np.array([1.0, 2.0])) == pytest.approx(model.odds(np.array([2.0, 1.0])), abs=1e-3)
+    assert again.chance(np.array([0.0, 50.0])) > 0.999
+
+
+def two_faces(angle):
+    """Voxels of two strips (0 to 60 mm) that meet at an edge and bend there by ``angle`` degrees, inward where it is positive."""
+    steps = np.arange(8) * 0.008 + 0.004
+    s, t = (a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
+    zero, one = np.zeros_like(s), np.ones_like(s)
+    c, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    centre = np.vstack([np.column_stack([-s, t, zero]), np.column_stack([s * c, t, s * sine])])
+    normal = np.vstack([np.column_stack([zero, zero, one]), np.column_stack([-sine * one, zero, c * one])])
+    a, b = (i.ravel() for i in np.triu_indices(len(centre), 1))
+    near = np.linalg.norm(centre[a] - centre[b], axis=1) < 0.0144
+    a, b = a[near], b[near]
+    d = (centre[a] - centre[b]) / np.linalg.norm(centre[a] - centre[b], axis=1, keepdims=True)
+    opening = np.sum((normal[a] - normal[b]) * d, axis=1)
+    bend = np.degrees(np.arccos(np.clip(np.sum(normal[a] * normal[b], axis=1), -1, 1)))
+    color = np.vstack([np.tile([0.6, 0.2, 0.2], (64, 1)), np.tile([0.2, 0.2, 0.6], (64, 1))])
+    return seams.Voxels(centre, normal, centre[:, 2], color, a, b, opening, bend, np.ones(len(a), bool)), np.repeat([0, 1], 64)
+
+
+@pytest.mark.parametrize("angle", [60, -60])
+def test_what_is_measured_at_an_edge(angle):
+    voxels, part = two_faces(angle)
+    seen = []
+    joined = seams.joined(voxels, part, lambda row, *_: seen.append(dict(zip(seams.CRITERIA, row, strict=True))) or 1.0)
+    assert np.array_equal(joined, part)
+    (told,) = seen
+    assert told["bend"] == pytest.approx(angle / 90, abs=0.01)
+    assert told["concave"] == (1.0 if angle > 0 else 0.0)
+    assert (told["hull"] > 0.7) == (angle > 0)
+    assert told["own"] == 0.5 and told["hue"] == pytest.approx(0.3) and told["edge"] > 2
+    assert told["told"] == 1.0
+
+
+def test_parts_are_joined_until_none_is_likelier_one():
+    voxels, part = two_faces(60)
+    assert seams.joined(voxels, part, lambda *_: -1.0).max() == 0
+    fine = part * 2 + (voxels.centre[:, 1] > 0.03)
+    # Only what differs in colour is two.
+    by_color = seams.joined(voxels, fine, lambda row, *_: row[list(seams.CRITERIA).index("hue")] - 0.1)
+    assert np.array_equal(by_color, part)
+
+
+def test_examples_tell_things_from_parts_of_one():
+    single = next(s for s in (learn_seams._procedural(k) for k in range(3, 9)) if s.things == 1)
+    assert not single.examples.two.any()
+    made = pile(6)
+    again = pile(6)
+    assert made.things == 6 and np.array_equal(made.frames[0].color, again.frames[0].color)
+    assert np.array_equal(made.frames[0].depth, again.frames[0].depth, equal_nan=True)
+    assert set(np.unique(made.truth[0])) <= set(range(-1, 7))
+
+
+def test_a_box_of_which_two_faces_show_has_its_sizes():
+    size = (0.158, 0.060, 0.210)
+    mesh = scenes.placed(box(size, yaw=0.6), 0.5, 0.02)
+    pose = scenes.pose([-0.15, 0.1, 0.55], [0.5, 0.0, 0.08])
+    frame = sensor.capture([mesh], sensor.D435, pose, 3, model=sensor.SMEARED)
+    report = Report()
+    (item,) = perceive([frame], report=report).objects
+    assert report.shapes[item.id] == "box"
+    assert np.sort(item.box_extents) == pytest.approx(np.sort(size), abs=0.006)
+    assert item.mesh.to_trimesh().is_watertight and len(item.pieces) == 1
+
+
+def test_a_mug_and_a_bottle_are_no_boxes():
+    for family, seed in (("mug", 1), ("mug", 4)):
+        mesh = scenes.placed(shapes.make(family, seed).mesh, 0.5, 0.0, 0.4)
+        report = Report()
+        perceive([scenes.capture([mesh])[0]], report=report)
+        assert "box" not in report.shapes.values()
+
+
+def without_depth(frame, ids, number):
+    depth = frame.depth.copy()
+    depth[ids == number] = np.nan
+    return type(frame)(frame.color, depth, frame.intrinsics, frame.world_from_camera, frame.camera, frame.stamp)
+
+
+def test_a_glass_without_depth_is_said_and_no_object():
+    glass = scenes.placed(
+        Mesh(*(lambda m: (m.vertices, m.faces))(trimesh.creation.cylinder(0.035, 0.11))).painted((190, 205, 215)), 0.5, 0.08
+    )
+    block = scenes.placed(box((0.08, 0.06, 0.06)), 0.5, -0.1)
+    frame, ids = scenes.capture([glass, block], "left")
+    scene = perceive([without_depth(frame, ids, 0)], parameters=Parameters())
+    assert len(scene.objects) == 1
+    (note,) = [n for n in scene.notes if "gives no depth" in n]
+    assert (f"{int(Code.NO_DEPTH)} NO_DEPTH" in note and "(0.50, 0.0" in note) or "(0.49, 0.0" in note or "(0.51, 0.0" in note
+    # A hole in the depth of the bare table is none.
+    bare, ids = scenes.capture([block], "left")
+    bare.depth[200:260, 250:300] = np.nan
+    assert not [n for n in perceive([bare]).notes if "gives no depth" in n]
+
+
+def test_confidence_is_judged_by_scenes_it_does_not_know():
+    random = np.random.default_rng(1)
+    things = []
+    for scene in range(100):
+        good = bool(random.random() < 0.5)
+        row = random.normal(size=len(learn_confidence.NUMBERS)) + 2.0 * good
+        things.append(learn_confidence.Judged(scene, "box", row, 0.9 if good else 0.4, 0.9))
+    text = learn_confidence.cross_validated(things)
+    assert "100 things in 100 scenes" in text and "| 0.8 to 1.0 |" in text
+
+
+def ring(radius, inward):
+    """Voxels on the upright wall of half a round body, 48 mm high."""
+    turn, z = (a.ravel() for a in np.meshgrid(np.linspace(0, np.pi, 20), np.arange(6) * 0.008, indexing="ij"))
+    way = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
+    return radius * way + [0.3, 0.1, 0] + np.column_stack([0 * z, 0 * z, z]), -way if inward else way
+
+
+@pytest.mark.parametrize("inward, aside, cup", [(True, 0.0, True), (False, 0.0, False), (True, 0.05, False)])
+def test_the_inside_and_the_outside_of_a_bowl_are_told_by_their_normals(inward, aside, cup):
+    (outer, away), (inner, toward) = ring(0.06, False), ring(0.055, inward)
+    centre, normal = np.vstack([outer, inner + [aside, 0, 0]]), np.vstack([away, toward])
+    part = np.repeat([0, 1], len(outer))
+    voxels = seams.Voxels(centre, normal, centre[:, 2], np.full_like(centre, 0.5), *(np.zeros(0, int),) * 2, *(np.zeros(0),) * 3)
+    assert seams._cup(voxels, *(seams._part(voxels, part, i, voxels.shade) for i in (0, 1))) == cup
+
+
+def test_what_colour_alone_tells_of_beyond_the_tables_edge_is_no_thing():
+    block = scenes.placed(box((0.08, 0.06, 0.06)), 0.5, -0.1)
+    frame, _ = scenes.capture([block], "left")
+    # The floor: another colour, and depth in a few spots, some mm over the table's plane.
+    frame.color[100:300, :60] = (60, 40, 30)
+    spots = np.zeros(frame.depth.shape, bool)
+    spots[150:260:30, 20:26] = spots[151:261:30, 20:26] = spots[152:262:30, 20:26] = True
+    floor = np.zeros(frame.depth.shape, bool)
+    floor[100:300, :60] = True
+    frame.depth[spots] -= 0.008
+    frame.depth[floor & ~spots] = np.nan
+    assert len(perceive([frame]).objects) == 1
