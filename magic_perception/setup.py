@@ -37,7 +37,7 @@ setup(
         "contourpy",
         beside("magic_core"),
     ],
-    extras_require={"sam": ["torch", "transformers"]},
+    extras_require={"sam": ["torch", "transformers"], "learn": ["scikit-learn"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",
