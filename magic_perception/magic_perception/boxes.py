@@ -64,7 +64,7 @@ def recognise_box(points: NDArray[np.float64], sights: list[Sight], height: floa
     edges = [_edges(sight) for sight in sights]
     # Far from any box: what follows would take its time in vain.
     rough = start is None or float(np.percentile(np.abs(start.distance(sample)), 80)) > 3 * RESIDUAL
-    box = None if rough else _fitted(start, sample, sights, edges)
+    box = None if rough else _fitted(start, sample[::2], sights, edges)
     if box is None or box.size.min() < LEAST or box.size.max() > 0.5:
         return None
     limit = max(RESIDUAL, 2.5 * noise)
@@ -81,6 +81,7 @@ def _start(points: NDArray[np.float64], height: float) -> Box | None:
     """A box by the direction in which the sides' points lie nearest to two lines at right angles (after Zhang et al. 2017)."""
     side = points[(points[:, 2] < 0.9 * height - 0.003) & (points[:, 2] > 0.1 * height), :2]
     flat = side if len(side) > 60 else points[:, :2]
+    flat = flat[:: max(1, len(flat) // 300)]
     best: tuple[float, float] | None = None
     for yaw in np.radians(np.arange(0, 90, 1.5)):
         c, s = np.cos(yaw), np.sin(yaw)
@@ -143,7 +144,9 @@ def _fitted(start: Box, points: NDArray[np.float64], sights: list[Sight], edges:
         return 30 * np.concatenate(parts)
 
     first = np.array([*start.middle, *start.size, start.yaw])
-    found = least_squares(errors, first, loss="soft_l1", f_scale=30 * ROBUST / np.sqrt(len(points)), x_scale=[0.1] * 5 + [1.0], max_nfev=25)
+    found = least_squares(
+        errors, first, loss="soft_l1", f_scale=30 * ROBUST / np.sqrt(len(points)), x_scale=[0.1] * 5 + [1.0], ftol=1e-4, max_nfev=12
+    )
     return made(found.x)
 
 

@@ -161,4 +161,44 @@ def insides(
                 best = (within, j)
         if best is not None:
             labels[labels == i] = best[1]
+    return _outsides(points, normal, labels, heights)
+
+
+def _outsides(
+    points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]
+) -> NDArray[np.int64]:
+    """Labels (N,) with the outside of open round things joined to an inside that shows more of their form: of a bowl seen from above little but the
+    near wall's lower half is seen from without.
+
+    The inside's upright surfaces look to its own axis; the outside's look away from that, lie within its rim, as high, and end beside it.
+    """
+    from magic_perception.primitives import fit_circle
+
+    upright = np.isfinite(normal[:, 0]) & (np.abs(normal[:, 2]) < 0.8)
+    members = [np.nonzero((labels == i) & upright)[0] for i in np.unique(labels[labels >= 0])]
+    members = [m[:: max(1, len(m) // 1500)] for m in members if len(m) > 200]
+    for mine in members:
+        centre, radius = fit_circle(points[mine, :2].astype(float))
+        away = points[mine, :2] - centre
+        distance = np.linalg.norm(away, axis=1)
+        if (
+            not 0.02 < radius < 0.2
+            or np.mean(np.sum(normal[mine, :2] * away, axis=1) < 0) < 0.8
+            or np.percentile(np.abs(distance - radius), 80) > 0.3 * radius
+        ):
+            continue
+        rim, top = float(np.percentile(distance, 97)), float(np.percentile(heights[mine], 97))
+        for other in members:
+            if labels[other[0]] == labels[mine[0]]:
+                continue
+            away = points[other, :2] - centre
+            far = np.linalg.norm(away, axis=1)
+            high = heights[other] >= np.percentile(heights[other], 80)
+            if (
+                np.mean(np.sum(normal[other, :2] * away, axis=1) > 0) > 0.8
+                and np.mean(far < 1.15 * rim + 0.005) > 0.85
+                and np.median(far[high]) > 0.85 * rim
+                and abs(float(np.percentile(heights[other], 97)) - top) < 0.02
+            ):
+                labels[labels == labels[other[0]]] = labels[mine[0]]
     return labels

@@ -8,7 +8,7 @@ seam (:data:`CRITERIA`), and the chance of two things is a logistic function of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -22,7 +22,7 @@ CRITERIA = {
     "length": "log of the pairs of voxels that meet at the seam, over 24",
     "concave": "share of those whose normals tell that bends inward by more than 25 degrees",
     "bend": "their median bend in right angles, negative where the seam is convex",
-    "told": "share of the pairs whose normals tell anything (not those across a jump)",
+    "told": "share of the pairs whose normals tell anything (not those across a jump or a gap in what was seen)",
     "across": "largest extent of the seam over the middle extent of the smaller part: small where a part is attached at a spot",
     "hull": "share of voxels of either part that lie before the other's surface: 0 where both are faces of one convex body",
     "breadth": "log of the lesser middle extent of the parts, over 40 mm",
@@ -39,7 +39,9 @@ CRITERIA = {
     "edge": "log of the median change of colour across the seam over that beside it within the parts",
 }
 
-FLOOR, REST, FOOT = 0.015, 0.015, 0.025
+#: What begins below FLOOR stands on the table; slack between the top of one and the bottom of what stands on it; the height of a foot; and how much
+#: wider than the narrowest place of a gap what faces it may be, m.
+FLOOR, REST, FOOT, BRIDGE = 0.015, 0.015, 0.025, 0.008
 
 
 @dataclass(frozen=True)
@@ -222,9 +224,37 @@ def learned() -> Judge:
     return judge_by(logistic.load(Path(__file__).with_name("seams.json"), CRITERIA))
 
 
+def _bridged(voxels: Voxels, part: NDArray[np.int64]) -> Voxels:
+    """The voxels with pairs across gaps in what was seen, which tell nothing of the surface, so that no group of parts is without a neighbour."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    total = int(part.max()) + 1
+    while True:
+        links = coo_matrix((np.ones(len(voxels.a)), (part[voxels.a], part[voxels.b])), shape=(total, total))
+        count, group = connected_components(links, directed=False)
+        if count < 2:
+            return voxels
+        mine = np.nonzero(group[part] == np.argmin(np.bincount(group[part], minlength=count)))[0]
+        others = np.setdiff1d(np.arange(len(part)), mine)
+        distance, nearest = cKDTree(voxels.centre[others]).query(voxels.centre[mine])
+        near = distance < distance.min() + BRIDGE
+        none = np.zeros(np.count_nonzero(near))
+        voxels = replace(
+            voxels,
+            a=np.concatenate([voxels.a, mine[near]]),
+            b=np.concatenate([voxels.b, others[nearest[near]]]),
+            opening=np.concatenate([voxels.opening, none]),
+            bend=np.concatenate([voxels.bend, none]),
+            clear=np.concatenate([voxels.clear, none > 0]),
+        )
+
+
 def joined(voxels: Voxels, part: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
     """Parts (V,) of voxels joined, the likeliest to be one thing first, until all that touch are likelier two."""
     part = np.unique(part, return_inverse=True)[1]
+    voxels = _bridged(voxels, part)
     shade = voxels.shade
     parts = {i: _part(voxels, part, i, shade) for i in range(int(part.max()) + 1)}
     found: dict[tuple[int, int], float] = {}

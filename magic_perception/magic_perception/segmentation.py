@@ -468,11 +468,13 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
 
 #: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
 POINTS, TALL = 1500, 0.05
+#: From this height on, m, a cluster may be the inside or the outside of another.
+RAISED = 0.02
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The points of all clusters (N,): unit normals (N, 3), NaN outside of the tall clusters and where there is none; heights (N,) above the table, m;
+    """The points of all clusters (N,): unit normals (N, 3), NaN outside of the raised clusters and where there is none; heights (N,) above the table, m;
     colours (N, 3), 0..255.  tall: the indices of the points of each cluster that may be more than one thing."""
 
     normal: NDArray[np.float32]
@@ -486,11 +488,12 @@ def surfaces(looks: list[Looked], found: Clusters) -> Surfaces:
     heights = np.concatenate([looked.heights[where] for looked, where in zip(looks, found.spots, strict=True)])
     rgb = np.concatenate([looked.frame.color[where] for looked, where in zip(looks, found.spots, strict=True)]).astype(np.float32)
     members = [np.nonzero(found.instance == label)[0] for label in range(int(found.instance.max(initial=-1)) + 1)]
-    tall = [mine for mine in members if len(mine) >= POINTS and np.percentile(heights[mine], 97) >= TALL]
+    tops = [float(np.percentile(heights[mine], 97)) if len(mine) >= POINTS else 0.0 for mine in members]
+    tall = [mine for mine, top in zip(members, tops, strict=True) if top >= TALL]
     normal = np.full((len(found.cloud), 3), np.nan, np.float32)
     flags = np.zeros(len(found.cloud), bool)
-    for mine in tall:
-        flags[mine] = True
+    for mine, top in zip(members, tops, strict=True):
+        flags[mine] = top >= RAISED
     start = 0
     for looked, (rows, columns) in zip(looks, found.spots, strict=True):
         here = flags[start : start + len(rows)]
@@ -539,10 +542,8 @@ class DepthSegmenter:
 def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.int64]:
     """The instances (N,) with tall clusters parted at the seams between things."""
     seen = surfaces(looks, found)
-    if not seen.tall:
-        return found.instance
     instance = found.instance.copy()
-    following = int(instance.max()) + 1
+    following = int(instance.max(initial=-1)) + 1
     for mine in seen.tall:
         part = convexity.parts(found.cloud[mine], seen.normal[mine], seen.heights[mine], seen.rgb[mine], judge)
         for number in range(1, int(part.max()) + 1):

@@ -8,7 +8,7 @@ import trimesh
 from magic_core import sensor, shapes, transforms
 from magic_core.errors import Code
 from magic_core.mesh import Mesh
-from magic_perception import learn_confidence, learn_seams, logistic, seams
+from magic_perception import convexity, learn_confidence, learn_seams, logistic, seams
 from magic_perception.parameters import Parameters
 from magic_perception.piles import pile
 from magic_perception.pipeline import Report, perceive
@@ -164,3 +164,34 @@ def test_what_colour_alone_tells_of_beyond_the_tables_edge_is_no_thing():
     frame.depth[spots] -= 0.008
     frame.depth[floor & ~spots] = np.nan
     assert len(perceive([frame]).objects) == 1
+
+
+def test_parts_across_a_gap_are_judged_too():
+    voxels, part = two_faces(60)
+    keep = part[voxels.a] == part[voxels.b]
+    cut = seams.Voxels(
+        *(getattr(voxels, n) for n in ("centre", "normal", "height", "rgb")),
+        *(getattr(voxels, n)[keep] for n in ("a", "b", "opening", "bend", "clear")),
+    )
+    seen = []
+    assert seams.joined(cut, part, lambda row, *_: seen.append(row) or -1.0).max() == 0
+    (row,) = seen
+    assert dict(zip(seams.CRITERIA, row, strict=True))["told"] == 0
+    assert seams.joined(cut, part, lambda *_: 1.0).max() == 1
+
+
+def test_the_outside_of_a_bowl_belongs_to_its_inside_though_little_of_it_shows():
+    turn, up = (a.ravel() for a in np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(0, 1, 12), indexing="ij"))
+    way = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
+    wall = np.column_stack([(0.05 + 0.03 * up)[:, None] * way[:, :2], 0.05 * up])
+    near = np.cos(turn) < -0.5
+    points = np.vstack([wall, wall[near] + 0.004 * way[near]])
+    normal = np.vstack([-way, way[near]])
+    labels = np.repeat([0, 1], [len(wall), near.sum()])
+    assert convexity.insides(points, normal, labels, points[:, 2]).max() == 0
+    # An egg in the bowl is no part of it.
+    egg = np.column_stack([0.015 * way[:, :2], 0.02 + 0.025 * up])
+    apart = convexity.insides(
+        np.vstack([wall, egg]), np.vstack([-way, way]), np.repeat([0, 1], len(wall)), np.concatenate([wall[:, 2], egg[:, 2]])
+    )
+    assert apart.max() == 1
