@@ -16,6 +16,8 @@ from magic_perception.solids import Reconstruction, hull_of
 LEAST, FACE = 0.02, 0.08
 #: The 90th percentile of the points' distances to the surface, m, and the median distance of the masks' edges to its outline, pixels, may be so large.
 RESIDUAL, EDGE = 0.004, 2.0
+#: A share of the points larger than this that lies farther than AWAY, m, from the surface is a part of its own (a handle), and no noise.
+PART, AWAY = 0.02, 0.010
 #: Errors beyond this are outliers, m.
 ROBUST = 0.003
 
@@ -68,7 +70,8 @@ def recognise_box(points: NDArray[np.float64], sights: list[Sight], height: floa
     if box is None or box.size.min() < LEAST or box.size.max() > 0.5:
         return None
     limit = max(RESIDUAL, 2.5 * noise)
-    if float(np.percentile(np.abs(box.distance(sample)), 90)) > limit or _faces(box, sample, limit) < 2:
+    distance = np.abs(box.distance(sample))
+    if float(np.percentile(distance, 90)) > limit or float(np.mean(distance > AWAY)) > PART or _faces(box, sample, limit) < 2:
         return None
     for sight, pixels in zip(sights, edges, strict=True):
         if len(pixels) > 20 and float(np.median(np.abs(_outline(box, sight, pixels)))) > EDGE:

@@ -55,7 +55,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     found = recognise_box(points, sights, height, noise)
     if found is not None:
         fit = agreement(found.mesh, sights)
-        if fit.overlap > 0.85 and fit.through < _FREE:
+        if fit.overlap > 0.9 and fit.through < _FREE:
             return replace(found, fit=fit)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
