@@ -146,6 +146,8 @@ class _Tree:
         """A node in one line."""
         if node.kind in PREDICATES:
             return leaf_words(node)
+        if node.kind == "not":
+            return f"not: {_Tree.words(node.of[0])}"
         return f" {'and' if node.kind == 'all' else 'or'} ".join(_Tree.words(child) for child in node.of)
 
     def _told(self, node: Node) -> Told:
@@ -296,6 +298,9 @@ class Watch(_Tree):
         """Kicks (m/s a step, standard deviation) and what resistance takes of the target's speed in a step (m/s)."""
         frequency = self.run.setup.settings.frequency
         kick = slowing = 0.0
+        acts = [name for name, args in self._trial.items() if name == "resists" or (name == "kicked" and args["radii"] > 0)]
+        if acts and self.run.setup.target_kind != DYNAMIC:
+            raise MagicError(Code.BAD_STRATEGY, "goal: trial of a target that is fixed", ", ".join(acts), "none: nothing moves it")
         if (kicked := self._trial.get("kicked")) and kicked["radii"] > 0:
             kick = kicked["radii"] * self.asked.radius(self.asked.direction("pull")) * float(np.sqrt(240.0 / frequency))
         if resists := self._trial.get("resists"):
@@ -379,9 +384,10 @@ class Watch(_Tree):
         _, first, _, counts = next(w for w in self._windows if w[0] is node)
         looks = self._looks[id(node)]
         yes = [truth for time, truth in looks if time > counts or (counts == first and time == first)]
-        if None in yes and (True not in yes if node.ever is not None else False not in yes):
+        # Nothing was looked at, or what was tells neither: a 'not' above must not make a yes of that.
+        if not yes or (None in yes and (True not in yes if node.ever is not None else False not in yes)):
             return Told(None, wanted=leaf_words(node))
-        truth = True in yes if node.ever is not None else bool(yes) and False not in yes
+        truth = True in yes if node.ever is not None else False not in yes
         if node.kind != "touching":
             return Told(truth, now.measured, now.wanted, now.metrics)
         metrics = {"touching": float(truth)} if not (node.ever or node.always)["phase"] else {}  # type: ignore[index]
@@ -403,7 +409,7 @@ class Watch(_Tree):
         if found.truth:
             return Judgement(Code.OK, f"the goal is reached: {found.state}", metrics)
         if found.truth is None:
-            told_of = "contacts of a tool that is led, or of a fixed target, with what is fixed"
+            told_of = "contacts of a tool that is led, or of a fixed target, with what is fixed, or a time at which nothing was looked at"
             return Judgement(Code.NOT_VERIFIABLE, f"the goal cannot be told in simulation, {told_of}: {'; '.join(found.untold)}", metrics)
         return Judgement(found.code, found.failure(), metrics)
 

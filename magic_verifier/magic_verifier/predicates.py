@@ -474,10 +474,14 @@ def told(asked: Asked, node: Node) -> Told:
     """What a predicate says now; of what the state cannot tell, nothing."""
     state, bodies = asked.state, asked.bodies(node.args.get("what", TARGET))
     missing = set(PREDICATES[node.kind].needs) - state.has
-    unseen = isinstance(state, Sighted) and not all(state.sees(name) for name in bodies)
+    measured_by = (TARGET,) if node.args.get("of") in ("radius", "start") else ()
+    unseen = isinstance(state, Sighted) and not all(state.sees(name) for name in (*bodies, *measured_by))
     # Whether it touches one other body may be told by that one; whether it touches nothing else, by itself alone.
     other = node.args.get("whom", "") if node.kind == "touching" else ""
     unfelt = "whom" in node.args and not missing and not all(state.feels(name, other) for name in bodies)
     if missing or unseen or unfelt:
         return Told(None, wanted=leaf_words(node))
-    return DECIDED[node.kind](asked, **node.args)
+    found = DECIDED[node.kind](asked, **node.args)
+    if found.truth and isinstance(state, Sighted) and node.args.get("what") == "row" and "row" in asked.strategy.goal.resolved().trial:
+        return Told(None, found.measured, leaf_words(node), found.metrics)  # of what stands beside the target nothing was looked at
+    return found

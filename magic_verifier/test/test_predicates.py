@@ -123,9 +123,20 @@ def test_what_no_camera_has_seen_cannot_be_told():
     before, after = looks(at(0.3))
     found = goals.seen(strategy(FAR), {"tool": before["tool"]}, after, scenes.TABLE)
     assert found.truth is None and found.untold
+    # What is measured by the target, too.
+    aside = {"drift": {"what": "tool", "along": "left", "below": 0.5, "of": "radius"}}
+    inside = {"inside": {"what": "tool", "low": [-1, -1, -1], "high": [1, 1, 1], "of": "start"}}
+    for test in (aside, inside):
+        assert goals.seen(strategy(test), {"tool": before["tool"]}, after, scenes.TABLE).truth is None
     with pytest.raises(MagicError) as error:
         goals.seen(strategy(FAR), before, [], scenes.TABLE)
     assert error.value.code == Code.BAD_REQUEST
+
+
+def test_of_a_row_cameras_tell_no_more_than_that_the_target_did_not_go_along():
+    sweep = replace(scenes.strategy("hook"), goal=Goal("sweep"))
+    assert goals.seen(sweep, *looks(at(0.45)), scenes.TABLE).truth is False
+    assert goals.seen(sweep, *looks(at(0.35)), scenes.TABLE).truth is None
 
 
 def test_every_predicate_is_decided_here():
@@ -204,6 +215,7 @@ def test_a_resistance_is_pressed_against():
         ({"not": {"touching": {"what": "tool", "whom": "table"}, "ever": {"phase": "goal"}}}, False),
         ({"not": {"touching": {"what": "tool", "whom": "table"}}}, False),
         ({"touching_only": {"what": "tool", "whom": "target"}}, False),
+        ({"after": {"phase": "contact"}, "not": {"touching": {"what": "target", "whom": "tool"}, "ever": {"phase": "retreat"}}}, False),
         ({"any": [{"touching_only": {"what": "tool", "whom": "target"}}, moved(0.1)]}, True),
     ],
 )
@@ -211,7 +223,7 @@ def test_contacts_that_physics_does_not_tell_of_pass_nothing(test, tellable):
     verdict = pulled({"all": [test]})
     assert (verdict.code == Code.OK) == tellable, verdict.message
     if not tellable:
-        assert verdict.code == Code.NOT_VERIFIABLE and "the tool touches" in verdict.message
+        assert verdict.code == Code.NOT_VERIFIABLE and "touches" in verdict.message
 
 
 @pytest.mark.parametrize(
@@ -229,3 +241,12 @@ def test_contacts_that_physics_does_not_tell_of_pass_nothing(test, tellable):
 def test_what_the_scene_does_not_have_is_refused(test, says):
     verdict = pulled({"all": [test]})
     assert verdict.code == Code.BAD_STRATEGY and says.replace("\\", "") in verdict.message.replace("\\", ""), verdict.message
+
+
+@pytest.mark.parametrize("trial", [{"resists": {"force": 1.0}}, {"kicked": {"radii": 1.0}}])
+def test_a_fixed_target_is_not_tried(trial):
+    scene, tool, target, motion = scenes.hooking("L", noise=0.0)
+    physics = replace(scene.physics, target_is_fixed=True)
+    scene = replace(scene, physics=physics, goal=from_data({"test": {"all": [moved(0.1)]}, "trial": trial}))
+    verdict = verify(scene, tool, target, (), scenes.TABLE, None, motion, repetitions=1)
+    assert verdict.code == Code.BAD_STRATEGY and "nothing moves it" in verdict.message
