@@ -105,6 +105,7 @@ class LabNode(Node):
             GripperCommand,
             self._gripper_action,
             self._grip,
+            goal_callback=self._admit_grip,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             callback_group=group,
             result_timeout=RESULT_TIMEOUT,
@@ -337,6 +338,15 @@ class LabNode(Node):
             self.get_logger().warning(f"trajectory refused [{error.code.name}]: {error.reason}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
+
+    def _admit_grip(self, request: GripperCommand.Goal) -> GoalResponse:
+        command = request.command
+        if np.isfinite([command.position, command.max_effort]).all():
+            return GoalResponse.ACCEPT
+        self.get_logger().warning(
+            f"gripper command refused: position {command.position}, effort {command.max_effort} (allowed: finite numbers)"
+        )
+        return GoalResponse.REJECT
 
     def _follow(self, handle: Any) -> FollowJointTrajectory.Result:
         request, result = handle.request, FollowJointTrajectory.Result()
