@@ -52,7 +52,7 @@ class ArmSettings:
     opening: float = 0.08
     finger_scale: float = 0.5
     squeeze: float = 0.0
-    effort: float = 20.0
+    effort: float = 60.0
     grasp_tolerance: float = 0.01
     presence: float = 5.0
     gripper_command: str = "GripperCommand"

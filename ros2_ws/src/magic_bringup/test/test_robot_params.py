@@ -20,6 +20,16 @@ from magic_core.robot import RobotConfig
 SHARE = Path(__file__).resolve().parents[1]
 
 
+def test_the_gripper_is_told_the_force_that_was_planned_and_verified_with():
+    """A motion that was verified with a firmer grip than the hand is told would slip."""
+    from magic_bringup.arm import ArmSettings
+
+    root = SHARE.parents[2]
+    planner = yaml.safe_load((root / "magic_planner/config/planner.param.yaml").read_text())["/**"]["ros__parameters"]
+    verifier = yaml.safe_load((root / "magic_verifier/config/verifier.param.yaml").read_text())["/**"]["ros__parameters"]
+    assert planner["grasp"]["grip_force"] == verifier["arm"]["grip_force"] == ArmSettings.effort
+
+
 def test_it_holds_the_defaults():
     """What is set and what is only shown, which a preset would otherwise not get past."""
     text = (SHARE / "config/robot.param.yaml").read_text()
