@@ -337,8 +337,15 @@ def _resolve(text: str, name: _Name, seen: Sequence[Looks]) -> Reading:
     listed = "; ".join(str(o) for o in seen) or "no objects"
     said = []
     fitting = [o for o in seen if name.noun in o.shapes and (not name.known or not o.tool)]
+    doubtful: set[str] = set()  # ids of those that fit or do not, by less than measuring may err by
+
+    def only(fits: Callable[[Looks], bool | None]) -> list[Looks]:
+        answers = [(o, fits(o)) for o in fitting]
+        doubtful.update(o.id for o, answer in answers if answer is None)
+        return [o for o, answer in answers if answer is not False]
+
     for colour in name.colours:
-        fitting = [o for o in fitting if o.colours.get(colour, 0.0) >= COVERED]
+        fitting = only(lambda o, colour=colour: _least(o.colours.get(colour, 0.0), COVERED, COVERED / 1.5))
         if len(fitting) == 1:
             said.append(f"{100 * fitting[0].colours[colour]:.0f} % {colour}")
     if name.other is not None:
@@ -348,7 +355,7 @@ def _resolve(text: str, name: _Name, seen: Sequence[Looks]) -> Reading:
         if name.relation == "nearest to":
             fitting = _first(text, fitting, lambda o: -_gap(o, anchor), lambda a, b: a - b < ASIDE, listed)
         else:
-            fitting = [o for o in fitting if _related(name.relation, o, anchor)]
+            fitting = only(lambda o: _related(name.relation, o, anchor))
         said.append(f"{name.relation} {other.id}")
     if not fitting:
         raise MagicError(Code.UNKNOWN_OBJECT, "no object is called", text, listed)
@@ -362,7 +369,14 @@ def _resolve(text: str, name: _Name, seen: Sequence[Looks]) -> Reading:
         said.append(f"the {name.superlative}, {abs(value(fitting[0])):.2f} m")
     if len(fitting) > 1:
         raise MagicError(Code.AMBIGUOUS_OBJECT, f"{len(fitting)} objects ({', '.join(o.id for o in fitting)}) are called", text, listed)
+    if fitting[0].id in doubtful:
+        raise MagicError(Code.AMBIGUOUS_OBJECT, f"{fitting[0].id} is too near to the limit to tell whether it is called", text, listed)
     return Reading(fitting[0].id, f"{text!r} is {fitting[0]}" + (f" ({', '.join(said)})" if said else ""))
+
+
+def _least(value: float, least: float, doubt: float) -> bool | None:
+    """Is a value at least that; ``None`` where it is less, but at least ``doubt``."""
+    return True if value >= least else None if value >= doubt else False
 
 
 def _first(
@@ -381,17 +395,16 @@ def _gap(a: Looks, b: Looks) -> float:
     return float(np.linalg.norm(np.maximum(0.0, np.maximum(a.low - b.high, b.low - a.high))))
 
 
-def _related(relation: str, a: Looks, b: Looks) -> bool:
-    """Is a left of b (and so on): by the middles, and more along that axis than along the other level one."""
+def _related(relation: str, a: Looks, b: Looks) -> bool | None:
+    """Is a left of b (and so on): by the middles, and clearly more along that axis than along the other level one; ``None``: in between."""
     dx, dy, dz = a.centre - b.centre
     level = np.minimum(a.high, b.high)[:2] - np.maximum(a.low, b.low)[:2]
     over = bool(level.min() > 0)
-    return {
-        "left of": dy > ASIDE and dy >= abs(dx),
-        "right of": -dy > ASIDE and -dy >= abs(dx),
-        "behind": dx > ASIDE and dx >= abs(dy),
-        "in front of": -dx > ASIDE and -dx >= abs(dy),
-        "above": over and dz > 0 and a.low[2] > b.centre[2],
-        "below": over and dz < 0 and b.low[2] > a.centre[2],
-        "next to": _gap(a, b) <= BESIDE,
-    }[relation]
+    if relation == "above":
+        return over and bool(dz > 0 and a.low[2] > b.centre[2])
+    if relation == "below":
+        return over and bool(dz < 0 and b.low[2] > a.centre[2])
+    if relation == "next to":
+        return _least(-_gap(a, b), -BESIDE, -BESIDE - ASIDE)
+    along, across = {"left of": (dy, dx), "right of": (-dy, dx), "behind": (dx, dy), "in front of": (-dx, dy)}[relation]
+    return _least(along, max(ASIDE, 1.2 * abs(across)), max(ASIDE / 2, 0.8 * abs(across)))

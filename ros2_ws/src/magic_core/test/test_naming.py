@@ -124,3 +124,19 @@ def test_alike_within_what_measuring_errs_by(table):
         naming.resolve("the longest box", near)
     assert error.value.code == Code.AMBIGUOUS_OBJECT
     assert naming.resolve("the longest box", [near[0], thing("b", box((0.14, 0.05, 0.05)), (0.5, -0.2), RED)]).id == "b"
+
+
+def test_what_is_near_to_a_limit_is_not_told_apart():
+    """A third of the one box is red and a quarter of the other; the one is as far behind as to the left."""
+    shape = box((0.1, 0.05, 0.05))
+    part = np.array([RED] * 17 + [WHITE] * 33, np.uint8), np.array([RED] * 13 + [WHITE] * 37, np.uint8)
+    items = [replace(thing(name, shape, (0.5, y), RED), colors=c) for name, y, c in zip("ab", (0.2, -0.2), part, strict=True)]
+    for objects in (items, items[1:]):
+        with pytest.raises(MagicError) as error:
+            naming.resolve("the red box", objects)
+        assert error.value.code == Code.AMBIGUOUS_OBJECT
+    corner = [thing("a", shape, (0.5, 0.0), RED), thing("b", shape, (0.7, 0.2), BLUE)]
+    for words in ("the blue box left of the red box", "the blue box behind the red box"):
+        with pytest.raises(MagicError, match="b is too near to the limit"):
+            naming.resolve(words, corner)
+    assert naming.resolve("the blue box behind the red box", [corner[0], thing("b", shape, (0.8, 0.1), BLUE)]).id == "b"
