@@ -72,12 +72,6 @@ class Session:
     ) -> None:
         """say: what is told as it happens; server, lab: more parameters of the strategy server and of the laboratory; pictures: results
         are to have the film strip and the heat map."""
-        from rclpy.parameter_client import AsyncParameterClient
-        from sensor_msgs.msg import Image as ImageMsg
-        from std_srvs.srv import Trigger
-        from tf2_msgs.msg import TFMessage
-
-        from magic_core import qos
         from magic_lab.node import TCP
 
         self.say, self.pictures = say, pictures
@@ -89,13 +83,29 @@ class Session:
         self._before = {k: os.environ.get(k) for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
         os.environ.update({k: env[k] for k in self._before})
         self.graph = Graph(logs, env)
+        self.watcher: Watcher | None = None
+        try:
+            self._start(logs, env, server or {}, lab or {})
+        except BaseException:  # nobody would stop what has been started
+            self.__exit__()
+            raise
+
+    def _start(self, logs: Path, env: dict[str, str], server: dict[str, Any], lab: dict[str, Any]) -> None:
+        """Start graph, laboratory and what listens to them."""
+        from rclpy.parameter_client import AsyncParameterClient
+        from sensor_msgs.msg import Image as ImageMsg
+        from std_srvs.srv import Trigger
+        from tf2_msgs.msg import TFMessage
+
+        from magic_core import qos
+
         simulated = {"use_sim_time": True}
         nodes = ("perception", "matcher", "planner", "verifier", "strategy_server")
         parameters: dict[str, dict[str, object]] = {name: dict(simulated) for name in nodes}
         parameters["matcher"]["features"] = "embedded"
-        parameters["strategy_server"].update({**SERVER, **(server or {})})
+        parameters["strategy_server"].update({**SERVER, **server})
         self.graph.start_nodes(parameters)
-        given = [x for k, v in (lab or {}).items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
+        given = [x for k, v in lab.items() for x in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
         command = [sys.executable, "-m", "magic_lab.node", *(["--ros-args", *given] if given else [])]
         self.graph.processes["lab"] = Process.start("lab", command, logs / "lab.log", env)
         self.watcher = Watcher((), self._on_line)
@@ -112,7 +122,8 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         self.graph.stop()
-        self.watcher.close()
+        if self.watcher is not None:
+            self.watcher.close()
         for key, value in self._before.items():
             if value is None:
                 os.environ.pop(key, None)
