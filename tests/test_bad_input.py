@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from magic_bringup import bag_file, demo, fakes
+from magic_bringup import bag_file, demo, fakes, record
 from magic_bringup.testing import DEADLINE, Bench, camera_messages, feeding, started, until
 from magic_core import conversions, shapes, transforms
 from magic_core.errors import Code
@@ -130,7 +130,7 @@ def test_the_demo_on_an_empty_bag(tmp_path, capsys):
     out = tmp_path / "out"
     assert demo.main(["--bag", str(tmp_path / "bag"), "--out", str(out)]) == 1
     summary = summary_of(out)
-    assert list(summary) == list(demo.empty_summary(demo.parse([])))
+    assert list(summary) == list(record.empty_summary("hooking", "arm"))
     assert summary["code"] == Code.BAD_BAG
     assert "empty" in summary["message"]
     assert str(tmp_path / "bag") in summary["message"]

@@ -370,7 +370,9 @@ class Perception(Node):
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
             scene = perceive(frames, known, self.parameters, self.segmenter, report, earlier)
-            self.keyframes.update(frames, report.labels, report.earlier, still)
+            # An arm that could not be cut out would be remembered as a thing.
+            whole = {f.camera for f in frames if not isinstance(self.cut.get(f.camera), MagicError)}
+            self.keyframes.update(frames, report.labels, report.earlier, still & whole)
             scene = self.tracker.update(replace(scene, frame_id=self.frame))
             self.publish(scene)
             seconds = time.monotonic() - now

@@ -164,7 +164,7 @@ class Watcher:
         self.objects_at: float | None = None
         self.complained_at: float | None = None
         self.replay_at = time.monotonic()
-        self.published = False
+        self.trajectory: Any = None
         self._last = ""
         self.node.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED)
         self.node.create_subscription(JointTrajectory, "verified_trajectory", self._on_trajectory, qos.LATCHED)
@@ -207,7 +207,7 @@ class Watcher:
             return
         self._say(f"verified trajectory with {len(message.points)} points published")
         with self.changed:
-            self.published = True
+            self.trajectory = message
             self.changed.notify_all()
 
     def perceive_seconds(self) -> float:
@@ -239,7 +239,7 @@ class Watcher:
 
     def send(self, options: Options) -> Any:
         """Send the goal; returns a holder whose ``result`` is filled in."""
-        self.published = False
+        self.trajectory = None
         goal = self._goal_type(
             strategy=options.strategy,
             variant=options.variant,
@@ -401,7 +401,7 @@ class Demo:
         take(summary, result, watcher.perceive_seconds())
         summary["success"] = False  # until the trajectory has come
         if result.verified and result.code == 0:
-            came = self._wait(graph, watcher, lambda: watcher.published, 5.0)
+            came = self._wait(graph, watcher, lambda: watcher.trajectory is not None, 5.0)
             summary["success"] = came
             if not came:
                 summary.update(code=int(Code.INTERNAL), message="physics agreed, but no trajectory was published")

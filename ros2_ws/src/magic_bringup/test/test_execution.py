@@ -185,7 +185,7 @@ def test_arm_and_gripper_carry_a_verified_plan_out(bench):
     assert (result.code, result.verified, result.executed) == (0, True, True), result.message
     assert status == GoalStatus.STATUS_SUCCEEDED
     assert "carried out by the arm" in result.message
-    assert told(bench) == [("open", 0.04, 20.0), "move", ("close", 0.015, 20.0), "move"]
+    assert told(bench) == [("open", 0.04, 60.0), "move", ("close", 0.015, 60.0), "move"]
     there, task = (entry for entry in bench.arm.log if not isinstance(entry, tuple))
     assert tuple(there.joint_names) == fakes.JOINTS
     assert (there.header.stamp.sec, there.header.stamp.nanosec) == (0, 0)  # begin at once
@@ -210,7 +210,7 @@ def test_a_release_opens_the_fingers(bench):
     )
     result, _ = bench.run(variant="arm")
     assert result.executed, result.message
-    assert told(bench) == [("open", 0.04, 20.0), "move", ("close", 0.015, 20.0), "move", ("open", 0.04, 20.0), "move"]
+    assert told(bench) == [("open", 0.04, 60.0), "move", ("close", 0.015, 60.0), "move", ("open", 0.04, 60.0), "move"]
 
 
 def refused(bench, code, published=True):
@@ -340,7 +340,7 @@ def test_a_controller_that_gives_up_ends_it(bench):
     message = refused(bench, Code.EXECUTION_FAILED)
     assert "error -4 (PATH_TOLERANCE_VIOLATED" in message
     assert "joint 3 lags" in message
-    assert told(bench) == [("open", 0.04, 20.0), "move"]
+    assert told(bench) == [("open", 0.04, 60.0), "move"]
 
 
 def test_an_arm_that_did_not_arrive_goes_no_further(bench):
@@ -367,7 +367,7 @@ def test_a_cancel_stops_the_arm(bench):
     assert (response.result.code, response.status) == (Code.CANCELED, GoalStatus.STATUS_CANCELED)
     assert (response.result.verified, response.result.executed) == (False, False)
     assert stopped == [True]
-    assert told(bench) == [("open", 0.04, 20.0), "move"]
+    assert told(bench) == [("open", 0.04, 60.0), "move"]
 
 
 def test_an_emergency_stop_stops_the_arm_and_lasts_until_the_server_is_activated_again(bench):
@@ -388,7 +388,7 @@ def test_an_emergency_stop_stops_the_arm_and_lasts_until_the_server_is_activated
     assert (result.code, result.verified, result.executed) == (Code.CANCELED, False, False), result.message
     assert "an emergency stop was asked for" in result.message
     assert answers[0].success and "the arm was moving" in answers[0].message
-    assert told(bench) == [("open", 0.04, 20.0), "move"]
+    assert told(bench) == [("open", 0.04, 60.0), "move"]
     # Nothing is published, and nothing moves.
     bench.arm.on_move = lambda trajectory, canceled: (0, "")
     sees(bench, fakes.scene())
@@ -464,7 +464,7 @@ def test_a_cancel_between_two_steps_sends_nothing_more(bench, monkeypatch):
     try:
         result, _ = bench.run(variant="arm")
         assert (result.code, result.executed) == (Code.CANCELED, False), result.message
-        assert told(bench) == [("open", 0.04, 20.0)]
+        assert told(bench) == [("open", 0.04, 60.0)]
         monkeypatch.undo()
         sees(bench, fakes.scene())
         assert bench.run(variant="arm")[0].executed  # what the first run had sent would have come before this

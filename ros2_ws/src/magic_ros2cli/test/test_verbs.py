@@ -18,7 +18,6 @@ from magic_bringup.domain import free_domain
 HERE = Path(__file__).parent
 ENVIRONMENT = {
     **os.environ,
-    "ROS_DOMAIN_ID": str(free_domain()),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     "PYTHONUNBUFFERED": "1",
 }
@@ -69,6 +68,12 @@ class Follow:
         status = self.process.wait(TIMEOUT)
         self.text += (self.process.stdout.read() or b"").decode()
         return status
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain() -> None:
+    """Drawn when the tests begin: one drawn while they are collected is free for others until then."""
+    ENVIRONMENT["ROS_DOMAIN_ID"] = str(free_domain())
 
 
 @pytest.fixture(scope="module")
