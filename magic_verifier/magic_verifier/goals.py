@@ -1,47 +1,30 @@
-"""Decides a strategy's goal (:mod:`magic_core.goal`): over a simulated run, and over what cameras saw of a motion.
+"""Decides a strategy's goal (:mod:`magic_core.goal`) over a simulated run.
 
-In simulation a :class:`Watch` accompanies a run step by step and ends with a :class:`Judgement`: the code and the sentence of the first
+A :class:`Watch` accompanies a run step by step and ends with a :class:`Judgement`: the code and the sentence of the first
 predicate that does not hold, with what was measured and what was wanted.  The trees that ship (``magic_core/goals/*.yaml``)
 have two parts: the tests of the tasks as the paper's authors released them, whose group has the metric ``released_test``, and what finds
 out that something passed by chance: held by something else, balanced, glued by friction, pushed and not hooked.
-
-After a motion was carried out, :func:`seen` asks the same tree of perceived poses::
-
-    from magic_verifier import goals
-
-    before = {"tool": tool, "target": target}                       # SceneObjects as the motion began
-    after = [(t0, {"tool": pose, "target": pose}), (t1, {...})]     # looks when it was over: seconds, world_from_object (4, 4)
-    sight = goals.seen(strategy, before, after, scene.table)
-    sight.truth       # True, False, or None: it cannot be told
-    sight.message     # "not pulled far enough: target moved 120 mm along (needed: 200 mm)"
-    sight.untold      # what cameras cannot tell, such as what touches what
-
-Poses tell where things are and how they are turned, two looks at different times how fast they are; contacts, masses, the hand and what only
-a try shows cannot be told.  ``False`` means that the goal is not reached, whatever the rest may be; ``None`` that nothing that was seen speaks
-against it.  What a tree asks at the end of a phase is asked of the last look.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import goal as trees
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.goal import PREDICATES, TRIES, Moment, Node, leaf_words
-from magic_core.scene import SceneObject
+from magic_core.goal import PREDICATES, TRIES, Moment, Node, leaf_words, node_words
 from magic_core.strategy import Strategy
 from magic_verifier.floating import TARGET, TOOL, phase_end, phase_start
-from magic_verifier.predicates import BESIDE, TOUCH, Asked, Sighted, Simulated, Told, note_presses, told
+from magic_verifier.predicates import BESIDE, TOUCH, Asked, Simulated, Told, note_presses, told
 from magic_verifier.simulation import DYNAMIC
 
-__all__ = ["TOUCH", "Judgement", "Sight", "Watch", "around", "goal_test", "require", "seen"]
+__all__ = ["TOUCH", "Judgement", "Watch", "around", "goal_test", "require"]
 
 #: What is watched over time is looked at every so many steps.
 OBSERVE_EVERY = 6
@@ -103,141 +86,13 @@ class _Answer:
         return f"{self.say}{': ' + self.state if self.state else ''}{f' ({self.wanted})' if self.wanted else ''}"
 
 
-class _Tree:
-    """Asks the nodes of a tree; what it is asked of, and when, belongs to who derives from it."""
-
-    def __init__(self, asked: Asked, drawn: bool) -> None:
-        self.asked = asked
-        self.drawn = drawn
-        self.metrics: dict[str, float] = {}
-
-    def before(self, node: Node) -> str | None:
-        """Make the moment of a node: what to say of it, ``None`` where it cannot be made."""
-        raise NotImplementedError
-
-    def noted(self, node: Node) -> _Answer | None:
-        """What was answered when it was time, if it was."""
-        return None
-
-    def windowed(self, node: Node, now: Told) -> Told:
-        """A leaf with ``ever`` or ``always``, over its time."""
-        raise NotImplementedError
-
-    def ask(self, node: Node, when: str = "") -> _Answer:
-        """The answer of a node, its ``when`` included in what it says."""
-        if node.as_given and self.drawn:
-            return _Answer(True)
-        known = self.noted(node)
-        if known is not None:
-            return known
-        if node.after is not None:
-            said = self.before(node)
-            if said is None:
-                return _Answer(None, untold=(f"{trees.moment_words(node.after)}, {self.words(node)}",))
-            when = said or when
-        if node.kind in PREDICATES:
-            return self._leaf(node, when)
-        if node.kind == "not":
-            return self._not(node, when)
-        return self._all(node, when) if node.kind == "all" else self._any(node, when)
-
-    @staticmethod
-    def words(node: Node) -> str:
-        """A node in one line."""
-        if node.kind in PREDICATES:
-            return leaf_words(node)
-        if node.kind == "not":
-            return f"not: {_Tree.words(node.of[0])}"
-        return f" {'and' if node.kind == 'all' else 'or'} ".join(_Tree.words(child) for child in node.of)
-
-    def _told(self, node: Node) -> Told:
-        found = told(self.asked, node)
-        if found.truth is not None and (node.ever is not None or node.always is not None):
-            found = self.windowed(node, found)
-        metrics = list(found.metrics.items())
-        if node.metric and metrics:
-            metrics[0] = node.metric, metrics[0][1]
-        self.metrics.update(metrics)
-        return found
-
-    def _leaf(self, node: Node, when: str) -> _Answer:
-        found = self._told(node)
-        code = Code[node.code] if node.code else PREDICATES[node.kind].code
-        say = (node.say or f"it does not hold that {leaf_words(node)}") + when
-        if found.truth is None:
-            return _Answer(None, code, untold=(found.wanted,))
-        measured = {(node.kind, node.args.get("what", "")): found.measured} if found.measured else {}
-        return _Answer(found.truth, code, say, found.wanted, measured)
-
-    def _state(self, node: Node) -> dict[tuple[str, str], str]:
-        """What the plain leaves of a group measure, all of them: a failure is said with what was around it."""
-        result = {}
-        for child in node.of:
-            if child.as_given and self.drawn:
-                continue
-            if child.after is not None or (child.kind in PREDICATES and "trying" in PREDICATES[child.kind].needs):
-                continue
-            if child.kind in PREDICATES:
-                found = self._told(child)
-                if found.measured and child.kind != "touching_only":  # said where it is the fault
-                    result[child.kind, child.args.get("what", "")] = found.measured
-            elif child.kind == "any":
-                result |= self._state(child)
-        return result
-
-    def _all(self, node: Node, when: str) -> _Answer:
-        measured = self._state(node)
-        truth: bool | None = True
-        untold: tuple[str, ...] = ()
-        if node.metric:
-            self.metrics[node.metric] = 0.0
-        for child in node.of:
-            found = self.ask(child, when)
-            if found.truth is False:
-                if not found.message:
-                    found = replace(found, say=node.say + when if node.say else found.say, measured={**measured, **found.measured})
-                return replace(found, code=Code[node.code] if node.code else found.code, message=found.failure())
-            truth = truth if found.truth else None
-            untold += found.untold
-            measured |= found.measured
-        if node.metric and truth:
-            self.metrics[node.metric] = 1.0
-        return _Answer(truth, measured=measured, untold=untold)
-
-    def _any(self, node: Node, when: str) -> _Answer:
-        found = []
-        for child in node.of:
-            found.append(self.ask(child, when))
-            if found[-1].truth:
-                break
-        measured = {key: text for answer in found for key, text in answer.measured.items()}
-        truth = True if found[-1].truth else (None if any(a.truth is None for a in found) else False)
-        if node.metric:
-            self.metrics[node.metric] = float(bool(truth))
-        code = Code[node.code] if node.code else found[0].code
-        say = node.say + when if node.say else found[0].say or found[0].message
-        wanted = " or ".join(dict.fromkeys(a.wanted for a in found if a.wanted)).replace(" or needed: ", " or ")
-        untold = tuple(text for answer in found for text in answer.untold) if truth is None else ()
-        return _Answer(truth, code, say, wanted, measured, untold=untold)
-
-    def _not(self, node: Node, when: str) -> _Answer:
-        (child,) = node.of
-        found = self.ask(child, when)
-        truth = None if found.truth is None else not found.truth
-        if node.metric:
-            self.metrics[node.metric] = float(bool(truth))
-        code = Code[node.code] if node.code else Code.GOAL_NOT_REACHED
-        say = (node.say or f"it holds that {self.words(child)}") + when
-        return _Answer(truth, code, say, "needed: that it does not", found.measured, untold=found.untold)
-
-
 def _moments(node: Node, moment: Moment | None = None) -> list[tuple[Node, Moment | None]]:
     """All nodes with what they are asked after: their own, or that of what they are in."""
     moment = node.after if node.after is not None else moment
     return [(node, moment), *(pair for child in node.of for pair in _moments(child, moment))]
 
 
-class Watch(_Tree):
+class Watch:
     """Watches a floating or an arm run for a strategy's goal.
 
     ``disturb`` before and ``observe`` after each step, ``judge`` at the end, which is :meth:`until`.  ``nudge``: direction (rad) of the
@@ -251,9 +106,10 @@ class Watch(_Tree):
         self.nudge = nudge
         self.tree = goal.tree
         self._trial = goal.trial
-        super().__init__(Asked(strategy, None, rng), nudge is not None)
-        beside = self._put_beside() if "row" in self._trial else ()
-        self.asked.state = Simulated(run, beside)
+        self.drawn = nudge is not None
+        self.metrics: dict[str, float] = {}
+        self.asked = Asked(strategy, None, rng)
+        self.asked.state = Simulated(run, self._put_beside() if "row" in self._trial else ())
         self._check_names()
         self._go_on: GoOn = lambda _seconds: None
         self._answers: dict[int, _Answer] = {}
@@ -380,7 +236,7 @@ class Watch(_Tree):
                     if found.truth is False and self.tree.kind == "all" and any(late[1] is child for child in self.tree.of):
                         self._late.clear()  # the goal is missed: what comes after it is not asked
 
-    def windowed(self, node: Node, now: Told) -> Told:
+    def _windowed(self, node: Node, now: Told) -> Told:
         _, first, _, counts = next(w for w in self._windows if w[0] is node)
         looks = self._looks[id(node)]
         yes = [truth for time, truth in looks if time > counts or (counts == first and time == first)]
@@ -396,10 +252,104 @@ class Watch(_Tree):
         said = f"{node.args['what']} {'touching' if truth else 'not touching'} the {node.args['whom']}"
         return Told(truth, said, now.wanted, metrics)
 
-    # ------------------------------------------------------------ the end
+    # ------------------------------------------------------------ the tree
 
-    def noted(self, node: Node) -> _Answer | None:
-        return self._answers.get(id(node))
+    def ask(self, node: Node, when: str = "") -> _Answer:
+        """The answer of a node, its ``when`` included in what it says."""
+        if node.as_given and self.drawn:
+            return _Answer(True)
+        known = self._answers.get(id(node))
+        if known is not None:
+            return known
+        if node.after is not None:
+            when = self._before(node.after, node) or when
+        if node.kind in PREDICATES:
+            return self._leaf(node, when)
+        if node.kind == "not":
+            return self._not(node, when)
+        return self._all(node, when) if node.kind == "all" else self._any(node, when)
+
+    def _told(self, node: Node) -> Told:
+        found = told(self.asked, node)
+        if found.truth is not None and (node.ever is not None or node.always is not None):
+            found = self._windowed(node, found)
+        metrics = list(found.metrics.items())
+        if node.metric and metrics:
+            metrics[0] = node.metric, metrics[0][1]
+        self.metrics.update(metrics)
+        return found
+
+    def _leaf(self, node: Node, when: str) -> _Answer:
+        found = self._told(node)
+        code = Code[node.code] if node.code else PREDICATES[node.kind].code
+        say = (node.say or f"it does not hold that {leaf_words(node)}") + when
+        if found.truth is None:
+            return _Answer(None, code, untold=(found.wanted,))
+        measured = {(node.kind, node.args.get("what", "")): found.measured} if found.measured else {}
+        return _Answer(found.truth, code, say, found.wanted, measured)
+
+    def _state(self, node: Node) -> dict[tuple[str, str], str]:
+        """What the plain leaves of a group measure, all of them: a failure is said with what was around it."""
+        result = {}
+        for child in node.of:
+            if child.as_given and self.drawn:
+                continue
+            if child.after is not None or (child.kind in PREDICATES and "trying" in PREDICATES[child.kind].needs):
+                continue
+            if child.kind in PREDICATES:
+                found = self._told(child)
+                if found.measured and child.kind != "touching_only":  # said where it is the fault
+                    result[child.kind, child.args.get("what", "")] = found.measured
+            elif child.kind == "any":
+                result |= self._state(child)
+        return result
+
+    def _all(self, node: Node, when: str) -> _Answer:
+        measured = self._state(node)
+        truth: bool | None = True
+        untold: tuple[str, ...] = ()
+        if node.metric:
+            self.metrics[node.metric] = 0.0
+        for child in node.of:
+            found = self.ask(child, when)
+            if found.truth is False:
+                if not found.message:
+                    found = replace(found, say=node.say + when if node.say else found.say, measured={**measured, **found.measured})
+                return replace(found, code=Code[node.code] if node.code else found.code, message=found.failure())
+            truth = truth if found.truth else None
+            untold += found.untold
+            measured |= found.measured
+        if node.metric and truth:
+            self.metrics[node.metric] = 1.0
+        return _Answer(truth, measured=measured, untold=untold)
+
+    def _any(self, node: Node, when: str) -> _Answer:
+        found = []
+        for child in node.of:
+            found.append(self.ask(child, when))
+            if found[-1].truth:
+                break
+        measured = {key: text for answer in found for key, text in answer.measured.items()}
+        truth = True if found[-1].truth else (None if any(a.truth is None for a in found) else False)
+        if node.metric:
+            self.metrics[node.metric] = float(bool(truth))
+        code = Code[node.code] if node.code else found[0].code
+        say = node.say + when if node.say else found[0].say or found[0].message
+        wanted = " or ".join(dict.fromkeys(a.wanted for a in found if a.wanted)).replace(" or needed: ", " or ")
+        untold = tuple(text for answer in found for text in answer.untold) if truth is None else ()
+        return _Answer(truth, code, say, wanted, measured, untold=untold)
+
+    def _not(self, node: Node, when: str) -> _Answer:
+        (child,) = node.of
+        found = self.ask(child, when)
+        truth = None if found.truth is None else not found.truth
+        if node.metric:
+            self.metrics[node.metric] = float(bool(truth))
+        code = Code[node.code] if node.code else Code.GOAL_NOT_REACHED
+        say = (node.say or f"it holds that {node_words(child)}") + when
+        return _Answer(truth, code, say, "needed: that it does not", found.measured, untold=found.untold)
+
+    # ------------------------------------------------------------ the end
 
     def judge(self, go_on: GoOn) -> Judgement:
         """After the last step; ``go_on`` steps the run further."""
@@ -413,9 +363,8 @@ class Watch(_Tree):
             return Judgement(Code.NOT_VERIFIABLE, f"the goal cannot be told in simulation, {told_of}: {'; '.join(found.untold)}", metrics)
         return Judgement(found.code, found.failure(), metrics)
 
-    def before(self, node: Node) -> str:
-        moment = node.after
-        assert moment is not None
+    def _before(self, moment: Moment, node: Node) -> str:
+        """Make the moment of a node: what to say of it."""
         if moment.kind == "rest":
             return self._rest(node, moment.args)
         if moment.kind == "push":
@@ -486,46 +435,3 @@ def around(strategy: Strategy) -> float:
     """How far (m) from the target bodies of the test's own may stand."""
     row = strategy.goal.resolved().trial.get("row")
     return 0.0 if row is None else float(np.ceil(row["others"] / 2) * row["spacing"])
-
-
-# ------------------------------------------------------------------------------------------------ over what cameras see
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What perceived poses say of a goal: reached, not reached, or ``None`` where it cannot be told, though nothing speaks against it;
-    the code of what does not hold (OK where nothing does), a sentence, what was measured, and what could not be told."""
-
-    truth: bool | None
-    code: Code
-    message: str
-    metrics: dict[str, float]
-    untold: tuple[str, ...]
-
-
-class _SightedTree(_Tree):
-    def before(self, node: Node) -> str | None:
-        assert node.after is not None
-        return None if node.after.kind in TRIES else ""
-
-    def windowed(self, node: Node, now: Told) -> Told:
-        return Told(None, wanted=leaf_words(node))
-
-
-def seen(
-    strategy: Strategy,
-    before: Mapping[str, SceneObject],
-    after: Sequence[tuple[float, Mapping[str, NDArray[np.float64]]]],
-    table: NDArray[np.float64],
-) -> Sight:
-    """Ask a strategy's goal of what cameras saw; see the module.
-
-    before: objects as the motion began, by ``tool`` and ``target``; after: looks when it was over, in their order (seconds, world_from_object
-    (4, 4) by the same names); table (4,): plane, unit normal up.  Raises ``UNKNOWN_GOAL``, ``BAD_STRATEGY``, ``BAD_REQUEST``.
-    """
-    tree = _SightedTree(Asked(strategy, Sighted(before, after, np.asarray(table, dtype=float))), drawn=False)
-    found = tree.ask(strategy.goal.tree)
-    if found.truth is False:
-        return Sight(False, found.code, found.failure(), tree.metrics, ())
-    said = "the goal is reached" if found.truth else "nothing that was seen speaks against the goal"
-    return Sight(found.truth, Code.OK, f"{said}{': ' + found.state if found.state else ''}", tree.metrics, found.untold)

@@ -1,12 +1,12 @@
 """What the predicates of a goal's tree say of a state: whether they hold, what was measured, and what was wanted.
 
-A :class:`State` is a simulated run (:class:`Simulated`) or what cameras saw before and after a motion (:class:`Sighted`).  Each
-predicate says in :data:`magic_core.goal.PREDICATES` what it needs to be told; of a state that lacks it the answer is neither yes nor no.
+They are asked of a :class:`State`, which is a simulated run (:class:`Simulated`).  What physics does not tell is answered with neither yes
+nor no: a contact between two bodies that it does not move.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.goal import NEEDS, PREDICATES, Node, leaf_words
-from magic_core.scene import SceneObject
+from magic_core.goal import Node, leaf_words
 from magic_core.strategy import Strategy
 from magic_verifier.enclosing import STRONGER, enclosure
 from magic_verifier.floating import TARGET, TOOL, phase_start
@@ -44,10 +43,6 @@ class Told:
 
 class State(Protocol):
     """What predicates ask of a scene.  Bodies go by ``tool``, ``target``, what a trial put beside it, and ids."""
-
-    @property
-    def has(self) -> frozenset[str]:
-        """Of :data:`magic_core.goal.NEEDS` what it can tell."""
 
     def row(self) -> tuple[str, ...]:
         """The target and what stands beside it."""
@@ -79,8 +74,6 @@ class State(Protocol):
 
 class Simulated:
     """The state of a run: a floating or an arm run (``world``, ``time``, ``phases``, ``setup``, ``released``, ``hand_has_left``)."""
-
-    has = frozenset(NEEDS)
 
     def __init__(self, run: Any, beside: tuple[str, ...] = ()) -> None:
         self.run = run
@@ -126,57 +119,6 @@ class Simulated:
         if name in self._row:
             return self.run.setup.target_kind == DYNAMIC
         return name in (ARM, FINGERS)
-
-
-class Sighted:
-    """What cameras saw: ``before`` the objects as they stood when the motion began, by ``tool`` and ``target`` (one of them may be
-    missing); ``after`` looks at them when it was over, (seconds, world_from_object (4, 4) by the same names).  Two looks or more tell how fast they are."""
-
-    def __init__(self, before: Mapping[str, SceneObject], after: Sequence[tuple[float, Mapping[str, Array]]], table: Array) -> None:
-        if not after or not all(np.all(np.isfinite(pose)) for _, poses in after for pose in poses.values()):
-            raise MagicError(Code.BAD_REQUEST, "looks after the motion", len(after), "one or more, with finite poses")
-        self._before = before
-        self._after = after
-        self._table = table
-
-    @property
-    def has(self) -> frozenset[str]:
-        return frozenset(("poses", "speeds") if len(self._after) > 1 and self._after[-1][0] > self._after[0][0] else ("poses",))
-
-    def sees(self, name: str) -> bool:
-        """Whether a body was seen before and in each look after."""
-        return name in self._before and all(name in poses for _, poses in self._after)
-
-    def row(self) -> tuple[str, ...]:
-        return (TARGET,)
-
-    def pose(self, name: str) -> Array:
-        return np.asarray(self._after[-1][1][name], dtype=float)
-
-    def start(self, name: str) -> Array:
-        return np.asarray(self._before[name].world_from_object, dtype=float)
-
-    def centre(self, name: str) -> Array:
-        return self._before[name].mesh.bounds.mean(axis=0)
-
-    def corners(self, name: str) -> Array:
-        return np.asarray(self._before[name].mesh.vertices, dtype=float)
-
-    def table_height(self, point: Array) -> float:
-        a, b, c, d = (float(v) for v in self._table)
-        return -(a * float(point[0]) + b * float(point[1]) + d) / c
-
-    def speeds(self, name: str) -> tuple[float, float]:
-        (first, then), (last, now) = self._after[0], self._after[-1]
-        seconds, a, b = last - first, np.asarray(then[name], dtype=float), np.asarray(now[name], dtype=float)
-        middles = [transforms.apply(pose, self.centre(name)) for pose in (a, b)]
-        return float(np.linalg.norm(middles[1] - middles[0])) / seconds, transforms.rotation_angle(a, b) / seconds
-
-    def touched_by(self, name: str) -> tuple[str, ...]:
-        raise NotImplementedError("cameras tell of no contacts")
-
-    def feels(self, name: str, other: str = "") -> bool:
-        return False
 
 
 class Asked:
@@ -472,16 +414,8 @@ DECIDED: dict[str, Callable[..., Told]] = {
 
 def told(asked: Asked, node: Node) -> Told:
     """What a predicate says now; of what the state cannot tell, nothing."""
-    state, bodies = asked.state, asked.bodies(node.args.get("what", TARGET))
-    missing = set(PREDICATES[node.kind].needs) - state.has
-    measured_by = (TARGET,) if node.args.get("of") in ("radius", "start") else ()
-    unseen = isinstance(state, Sighted) and not all(state.sees(name) for name in (*bodies, *measured_by))
     # Whether it touches one other body may be told by that one; whether it touches nothing else, by itself alone.
     other = node.args.get("whom", "") if node.kind == "touching" else ""
-    unfelt = "whom" in node.args and not missing and not all(state.feels(name, other) for name in bodies)
-    if missing or unseen or unfelt:
+    if "whom" in node.args and not all(asked.state.feels(name, other) for name in asked.bodies(node.args["what"])):
         return Told(None, wanted=leaf_words(node))
-    found = DECIDED[node.kind](asked, **node.args)
-    if found.truth and isinstance(state, Sighted) and node.args.get("what") == "row" and "row" in asked.strategy.goal.resolved().trial:
-        return Told(None, found.measured, leaf_words(node), found.metrics)  # of what stands beside the target nothing was looked at
-    return found
+    return DECIDED[node.kind](asked, **node.args)

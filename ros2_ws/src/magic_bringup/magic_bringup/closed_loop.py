@@ -120,6 +120,8 @@ class ClosedLoop:
         self.notes: list[str] = []
         self.executed = False
         self._held: Held | None = None
+        #: Where the hand (3,) let the tool go, in the base's frame.
+        self._let_go: NDArray[np.float64] | None = None
         self._touched = self._may_touch = False
         self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
         self._simulated = bool(server.get_parameter("use_sim_time").value)
@@ -161,7 +163,7 @@ class ClosedLoop:
         self.notes.append(f"{error.code.name}: {error.message}")
 
     def _carry_out(self, job: Job) -> str:
-        self._held, self._touched, self._may_touch = job.held, False, False
+        self._held, self._touched, self._may_touch, self._let_go = job.held, False, False, None
         self.executed = False
         self._arm.execute(job.outcome.plan, self._token, self._say, self, job.held is not None, self._settings.look)
         self.executed = True
@@ -244,6 +246,8 @@ class ClosedLoop:
     def opened(self) -> None:
         """The fingers are about to open: what was in the hand is where it was let go."""
         self._touched = self._touched or self._may_touch
+        if self._held is not None:
+            self._let_go = self._server.hand()[:3, 3]
         self._held = None
 
     def look(self, point: int) -> None:
@@ -430,8 +434,11 @@ class ClosedLoop:
         outcome = job.outcome
         names = {"tool": outcome.tool_id, "target": outcome.target_id}
         table = conversions.plane_from_msg(first.table)
-        looks = [self._sight(scene, scene is not job.stages.scene) for scene in (job.stages.scene, first, second)]
-        seen = seen_goal.judge(self._strategy, names, *looks, table, self._held is None, self._settings.accuracy)
+        looks = self._sight(job.stages.scene, False), self._sight(first, True), self._sight(second, True)
+        away = None if self._let_go is None else float(np.linalg.norm(self._server.hand()[:3, 3] - self._let_go))
+        hand = seen_goal.Hand(self._held is None, away)
+        phases = [phase.name for phase in outcome.plan.phases]
+        seen = seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
         if seen.met is None:
             raise MagicError(Code.GOAL_UNSEEN, f"carried out, but whether the goal is met cannot be told by what is seen: {seen.message}")
         if not seen.met:

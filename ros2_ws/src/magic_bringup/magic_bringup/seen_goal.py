@@ -2,15 +2,20 @@
 
 The goal is the tree that simulation decides as well (:mod:`magic_core.goal`); here it is asked of where things are before the
 motion and in two looks after it.  An answer is yes, no, or that it cannot be told: where a thing is not seen, where it is
-nearer to a bound than its place is known, and of how it is turned (the frame of a reconstructed thing is another one with each look).
-What touches what is told by how near their surfaces are.  What only a simulation can try (pushes, pulls to the side, other draws), and masses and
-impulses, are not asked: they were when the motion was verified.
+nearer to a bound than its place is known, of how it is turned (the frame of a reconstructed thing is another one with each look), and of
+what was to be looked at earlier than the looks are: the end of a phase is asked of them where the tool does nothing after it.
+What touches what is told by how near their surfaces are, and where the hand is by the arm's joints.
+
+What only a simulation can try (pushes, pulls to the side), and masses and impulses, no look tells; they were asked when the motion was
+verified.  In a plain 'all' they are left out, and the answer says so; below an 'any' or a 'not' they cannot be told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.goal import PREDICATES, Node, leaf_words
+from magic_core.goal import PREDICATES, Node, leaf_words, moment_words, node_words
 from magic_core.mesh import Mesh
 from magic_core.strategy import Strategy
 
@@ -32,6 +37,8 @@ UNASKED = frozenset({"masses", "history", "trying"})
 SURFACE = 1000
 #: The gripper, by the names that goals have for it.
 HAND = ("hand", "arm", "fingers")
+#: After these phases' beginning the tool acts no more.
+ENDING = ("retreat",)
 
 
 @dataclass(frozen=True)
@@ -78,47 +85,68 @@ class _Told:
     text: str
 
 
+@dataclass(frozen=True)
+class Hand:
+    """The hand when the motion was over: whether it has let the tool go, and how far (m) it is from where it did, ``None`` where that is
+    not known."""
+
+    released: bool
+    away: float | None = None
+
+
 def judge(
-    strategy: Strategy, names: Mapping[str, str], before: Sight, first: Sight, second: Sight, table: Array, released: bool, accuracy: float
+    strategy: Strategy,
+    names: Mapping[str, str],
+    phases: Sequence[str],
+    looks: tuple[Sight, Sight, Sight],
+    table: Array,
+    hand: Hand,
+    accuracy: float,
 ) -> SeenGoal:
     """Ask a strategy's goal of what was seen.
 
-    names: the ids of ``tool`` and ``target``.  first, second: two looks after the motion.  table (4,): plane, unit normal up.
-    released: the fingers have let the tool go.  accuracy: m to which the middle of a thing is known that is seen twice.
+    names: the ids of ``tool`` and ``target``.  phases: names of the motion's, in their order.  looks: one before the motion and two after
+    it.  table (4,): plane, unit normal up.  accuracy: m to which the middle of a thing is known that is seen twice.
     """
-    asked = _Asked(strategy, names, before, first, second, table, released, accuracy)
-    found = asked.node(strategy.goal.tree)
+    asked = _Asked(strategy, names, phases, *looks, table, hand, accuracy)
+    found = asked.node(strategy.goal.tree, True)
     if found is None:
         return SeenGoal(None, "none of it shows")
-    return SeenGoal(found.truth, found.text)
+    unasked = dict.fromkeys(asked.unasked) if found.truth else ()
+    return SeenGoal(found.truth, "; ".join(filter(None, (found.text, f"not looked at: {', '.join(unasked)}" if unasked else ""))))
 
 
+@dataclass
 class _Asked:
-    def __init__(
-        self,
-        strategy: Strategy,
-        names: Mapping[str, str],
-        before: Sight,
-        first: Sight,
-        second: Sight,
-        table: Array,
-        released: bool,
-        accuracy: float,
-    ) -> None:
-        self.strategy, self.names, self.table, self.released, self.accuracy = strategy, names, table, released, accuracy
-        self.before, self.first, self.now = before, first, second
+    strategy: Strategy
+    names: Mapping[str, str]
+    phases: Sequence[str]
+    before: Sight
+    first: Sight
+    now: Sight
+    table: Array
+    hand: Hand
+    accuracy: float
+    #: What was left out, in words.
+    unasked: list[str] = field(default_factory=list)
 
     # ------------------------------------------------------------ the tree
 
-    def node(self, node: Node) -> _Told | None:
-        """The answer of a node; ``None`` where it is not to be asked."""
-        if node.after is not None and node.after.kind == "push":
+    def node(self, node: Node, plain: bool) -> _Told | None:
+        """The answer of a node; ``None`` where it is left out.  plain: there is no 'any' or 'not' above, so that it may be."""
+        moment = node.after
+        if (moment is not None and moment.kind == "push") or (node.kind in PREDICATES and UNASKED & set(PREDICATES[node.kind].needs)):
+            if not plain:
+                return _Told(None, f"that {node_words(node)}: no look tells")
+            # What is asked after a push is in its group.
+            self.unasked.append(f"how it is {moment_words(moment)}" if moment is not None and node.of else f"that {node_words(node)}")
             return None
+        if moment is not None and moment.kind == "phase" and not self.at_the_end(moment.args["phase"]):
+            return _Told(None, f"that {node_words(node)}: it was not looked at then")
         if node.kind in PREDICATES:
-            if UNASKED & set(PREDICATES[node.kind].needs):
-                return None
-            return self.leaf(node)
-        found = [answer for child in node.of if (answer := self.node(child)) is not None]
+            return self.leaf(node, plain)
+        plain = plain and node.kind == "all"
+        found = [answer for child in node.of if (answer := self.node(child, plain)) is not None]
         if not found:
             return None
         if node.kind == "not":
@@ -132,19 +160,42 @@ class _Asked:
             return _Told(None, "; ".join(dict.fromkeys(answer.text for answer in untold)))
         return _Told(not decisive, "; ".join(dict.fromkeys(answer.text for answer in found if answer.text)))
 
-    def leaf(self, node: Node) -> _Told:
+    def at_the_end(self, phase: str) -> bool:
+        """Whether what holds at a phase's end is what is looked at: it is the last one in which the tool acts.  The goal that no phase is
+        named after ends with the motion, as in simulation."""
+        acting = [name for name in self.phases if name not in ENDING]
+        return (phase == "goal" and phase not in self.phases) or (bool(acting) and acting[-1] == phase)
+
+    def leaf(self, node: Node, plain: bool) -> _Told:
         """The answer of a predicate."""
         decide = getattr(self, f"_{node.kind}", None)
-        if decide is None or "row" in node.args.values():
+        if decide is None:
             return _Told(None, f"that {leaf_words(node)}: no camera tells")
+        window = node.ever or node.always
+        if window is not None and window["phase"] and not self.at_the_end(window["phase"]):
+            return _Told(None, f"that {leaf_words(node)}: it was not looked at then")
+        row = node.args.get("what") == "row"
         try:
-            found = decide(**node.args)
-            # What is seen afterwards may have been otherwise meanwhile.
-            if (node.ever is not None and found.truth is False) or (node.always is not None and found.truth):
-                return _Told(None, f"that {leaf_words(node)}: it is not watched all the time")
-            return found
+            found = decide(**{**node.args, "what": "target"} if row else node.args)
         except LookupError as error:
             return _Told(None, f"that {leaf_words(node)}: {error.args[0]} is not seen")
+        # What is seen afterwards may have been otherwise meanwhile.
+        if (node.ever is not None and found.truth is False) or (node.always is not None and found.truth):
+            return _Told(None, f"that {leaf_words(node)}: it is not watched all the time")
+        # It holds of all in the row or of none: that it does not of the target is enough.
+        if row and self.beside and found.truth:
+            return _Told(None, f"that {leaf_words(node)}: of what stands beside the target nothing is looked at")
+        if found.truth and math.isfinite(node.args.get("turning", math.inf)):
+            turns = f"how fast the {node.args['what']} turns"
+            if not plain:
+                return _Told(None, f"{turns}: no camera tells")
+            self.unasked.append(turns)
+        return found
+
+    @cached_property
+    def beside(self) -> bool:
+        """Whether the test puts others beside the target."""
+        return "row" in self.strategy.goal.resolved().trial
 
     # ------------------------------------------------------------ what is seen
 
@@ -228,10 +279,15 @@ class _Asked:
         return _Told(True, text) if way <= self.accuracy else self.at_least(-way, -below * seconds, self.accuracy, text)
 
     def _released(self) -> _Told:
-        return _Told(self.released, "the tool was let go" if self.released else "the tool is in the hand")
+        return _Told(self.hand.released, "the tool was let go" if self.hand.released else "the tool is in the hand")
 
     def _hand_away(self, by: float) -> _Told:
-        return _Told(self.released, "the hand has gone away" if self.released else "the tool is in the hand")
+        if not self.hand.released:
+            return _Told(False, "the tool is in the hand")
+        if self.hand.away is None:
+            return _Told(None, "how far the hand has gone away is not known")
+        text = f"the hand is {1000 * self.hand.away:.0f} mm from where it let go, needed {1000 * by:g}"
+        return _Told(self.hand.away >= by, text)
 
     def gap(self, what: str, whom: str) -> float:
         """How near the surfaces of two bodies are, m."""
@@ -242,7 +298,7 @@ class _Asked:
 
     def _touching(self, what: str, whom: str) -> _Told:
         if whom in HAND:
-            held = what == "tool" and not self.released
+            held = what == "tool" and not self.hand.released
             return _Told(True if held else None, "the tool is in the hand" if held else f"whether the hand touches the {what} is not seen")
         gap = self.gap(what, whom)
         # Surfaces are known to the accuracy of both, and between their points is room.
@@ -253,7 +309,7 @@ class _Asked:
         own = {self.names.get(what, what), self.names.get(whom, whom)}
         others = [name for name in ("table", *self.now.things) if name != whom and name not in own]
         found = [self._touching(what, other) for other in others]
-        if what == "tool" and not self.released and whom not in HAND:
+        if what == "tool" and not self.hand.released and whom not in HAND:
             return _Told(False, "the tool is in the hand")
         near = [answer for answer in found if answer.truth is not False]
         if near:  # what looks like a touch may be none: nobody knows

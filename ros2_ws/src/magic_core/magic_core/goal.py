@@ -640,6 +640,17 @@ def leaf_words(node: Node) -> str:
     return PREDICATES[node.kind].words.format(**{name: _Said(value, node.args) for name, value in node.args.items()})
 
 
+def node_words(node: Node) -> str:
+    """A node in one line."""
+    if node.kind in PREDICATES:
+        said = leaf_words(node)
+    elif node.kind == "not":
+        said = f"not: {node_words(node.of[0])}"
+    else:
+        said = f" {'and' if node.kind == 'all' else 'or'} ".join(node_words(child) for child in node.of)
+    return said if node.after is None else f"{moment_words(node.after)}, {said}"
+
+
 def moment_words(moment: Moment) -> str:
     """When a node is asked."""
     args = moment.args
