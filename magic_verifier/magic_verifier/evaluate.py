@@ -70,7 +70,7 @@ def tested(options: Options, tool: str = "") -> dict[str, float]:
     """The goal's numbers that the evaluation sets for a tool: those of the strategy's folder, and the noise that was asked for."""
     values = evaluated(options).numbers(tool.rpartition("//")[2])
     if options.noise is not None:
-        if "noise" not in strategy_for(options).goal.values:
+        if "noise" not in strategy_for(options).goal.numbers:
             raise MagicError(Code.BAD_REQUEST, f"noise for {options.task}", options.noise, "none: its goal names no such number")
         values["noise"] = options.noise
     return values

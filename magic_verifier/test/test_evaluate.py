@@ -17,6 +17,7 @@ from magic_core import shapes, transforms
 from magic_core import strategy as strategies
 from magic_core.decomposition import convex_pieces
 from magic_core.errors import Code, MagicError
+from magic_core.goal import Goal
 from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
 from magic_core.shapes import make
@@ -129,6 +130,17 @@ def test_hooking_is_judged_by_the_released_codes_own_test():
     assert "by 0.5 of its radius" in ev.summarise(replace(hooking, noise=0.5), [])["test"]
     with pytest.raises(MagicError, match="its goal names no such number"):
         ev.tested(replace(OPTIONS, noise=1.0))
+
+
+def test_the_noise_of_a_named_tree_may_be_set(monkeypatch):
+    hooking = replace(OPTIONS, task="hooking")
+    own = ev.strategy_for(hooking)
+    monkeypatch.setattr(ev, "strategy_for", lambda _options: replace(own, goal=Goal("hook")))
+    values = ev.tested(replace(hooking, noise=0.5))
+    assert Goal("hook", values).resolved().trial["kicked"]["radii"] == values["noise"] == 0.5
+    monkeypatch.setattr(ev, "strategy_for", lambda _options: replace(own, goal=Goal("push")))
+    with pytest.raises(MagicError, match="its goal names no such number"):
+        ev.tested(replace(hooking, noise=0.5))
 
 
 def test_a_strategy_is_evaluated_by_its_folder_and_no_task_is_known_by_name(tmp_path):

@@ -23,7 +23,8 @@ metric      a name for what it measures, of a group: 1 where it holds.
 as_given    true: asked in the scene as given only, not where things were drawn at random.
 throughout  true: in a node after a push, looked at between the pushes as well.
 
-``all`` is asked in its order and ends with the first that does not hold.  Numbers are in SI units, angles in degrees; where
+``all`` is asked in its order and ends with the first that does not hold; phases and settling times come before the tries, which change
+the scene.  Numbers are in SI units, angles in degrees; where
 a number is wanted a name of ``values`` may stand.  Bodies are ``tool``, ``target``, ``row`` (the target and what the trial has put beside
 it), ``table``, ``arm``, ``fingers`` and the ids of fixtures.  Directions are ``pull`` (level, against the target's normal, on which the
 tool acts), ``left`` of it, ``press`` (against the normal as it is), ``up``, ``down``, or three numbers in the world.
@@ -301,6 +302,11 @@ class Goal:
         assert isinstance(written, Node)
         return written
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All numbers that the tree names; of a shipped tree those that are set, and its own for the others.  Raises ``UNKNOWN_GOAL``."""
+        return {**named(self.test).values, **self.values} if isinstance(self.test, str) else dict(self.values)
+
     def with_values(self, values: dict[str, float]) -> Goal:
         """The goal with other numbers; names that it does not know are refused by :meth:`resolved`."""
         return replace(self, values={**self.values, **values})
@@ -318,8 +324,7 @@ class Goal:
         Raises ``UNKNOWN_GOAL`` for a name of no tree, ``BAD_STRATEGY`` for numbers that it does not name or that are out of bounds.
         """
         if isinstance(self.test, str):
-            shipped = named(self.test)
-            full = replace(shipped, values={**shipped.values, **self.values})
+            full = replace(named(self.test), values=self.numbers)
         else:
             full = self
         used = {value for node in full.test.nodes() for value in _names(node)}  # type: ignore[union-attr]
@@ -373,6 +378,7 @@ def from_data(data: Any, path: str = "goal") -> Goal:
     _keys(trial, tuple(TRIALS), f"{path}.trial")
     trials = {name: _args(TRIALS[name], args, f"{path}.trial.{name}", numbers) for name, args in trial.items()}
     goal = Goal(_node(data["test"], f"{path}.test", numbers, tries=True), numbers, trials)
+    _in_order(goal.written, f"{path}.test")
     goal.resolved(path)
     return goal
 
@@ -458,6 +464,20 @@ def _node(data: Any, path: str, values: dict[str, float], tries: bool, plain: bo
     if not isinstance(data[kind], list) or not data[kind]:
         raise _bad(inner, data[kind], "a list of nodes")
     return Node(kind, of=tuple(_node(item, f"{inner}[{k}]", values, tries, plain, timed) for k, item in enumerate(data[kind])), **beside)
+
+
+def _in_order(node: Node, path: str, tried: str = "") -> str:
+    """Refuse a phase or a settling time after a try in the order of the tree, where it would be asked of the changed scene; ``tried``: the
+    try before the node.  Returns the last one up to its end."""
+    if node.after is not None and node.after.kind in TRIES:
+        tried = node.after.kind
+    elif node.after is not None and tried:
+        raise _bad(
+            f"{path}.after", node.after.kind, f"rest or push here: after the {tried} before it the scene is another one; put it first"
+        )
+    for k, child in enumerate(node.of):
+        tried = _in_order(child, f"{path}.{node.kind}" if node.kind == "not" else f"{path}.{node.kind}[{k}]", tried)
+    return tried
 
 
 def _moment(data: Any, path: str, values: dict[str, float]) -> Moment:

@@ -27,6 +27,11 @@ TREE = {
 }
 
 
+AT_REST = {"at_rest": {"what": "target", "below": 0.05}}
+TRIED = {"after": {"push": {"what": "target", "speed": 0.1}}, "all": [{"moved": {"what": "target", "along": "pull", "by": "distance"}}]}
+RESTED = {"after": {"rest": {"what": "target", "below": 0.02}}, "all": [AT_REST]}
+
+
 @pytest.mark.parametrize("name", names())
 def test_the_trees_that_ship_come_back_and_have_words(name):
     goal = named(name)
@@ -92,6 +97,12 @@ ITEM = ("test", "all")
         ((*ITEM, 1, "any", 0, "as_given"), True, r"goal.test.all\[1\].any\[0\].as_given: True \(allowed: only in 'all'"),
         ((*ITEM, 0, "throughout"), True, r"goal.test.all\[0\].throughout: True \(allowed: only in a group after a push"),
         ((*ITEM, 2, "ever"), {"seconds": 0.1}, r"goal.test.all\[2\]: 'ever after a try'"),
+        (ITEM, [TRIED, AT_REST], None),
+        (ITEM, [TRIED, {**AT_REST, "after": {"settle": 1.0}}], r"goal.test.all\[1\].after: 'settle' \(allowed: rest or push here: after the push"),
+        (ITEM, [TRIED, {**AT_REST, "after": {"phase": "goal"}}], r"goal.test.all\[1\].after: 'phase' \(allowed: rest or push here"),
+        (ITEM, [{"all": [RESTED]}, {"any": [{"not": {**AT_REST, "after": {"settle": 1.0}}}]}],
+         r"goal.test.all\[1\].any\[0\].not.after: 'settle' \(allowed: rest or push here: after the rest"),
+        (ITEM, [{**AT_REST, "after": {"settle": 1.0}}, RESTED, TRIED], None),
         ((*ITEM, 1), {"after": {"settle": 1.0}, "all": [{"above": {"what": "tool", "height": 0}, "after": {"phase": "goal"}}]},
          r"goal.test.all\[1\].all\[0\].after: 'phase' \(allowed: nothing here: it is asked when what it is in is, after settle"),
         ((*ITEM, 2, "code"), "SAD", r"goal.test.all\[2\].code: 'SAD' \(allowed: PRE_CONTACT_COLLISION"),
@@ -110,6 +121,14 @@ def test_what_is_wrong_is_said_with_its_path(path, value, says):
     with pytest.raises(MagicError, match=says) as error:
         from_data(data)
     assert error.value.code == Code.BAD_STRATEGY
+
+
+def test_the_numbers_of_a_named_tree_are_its_own_and_those_that_are_set():
+    assert Goal("hook").numbers == named("hook").values
+    assert Goal("hook", {"noise": 0.0}).numbers == {**named("hook").values, "noise": 0.0}
+    assert from_data(copy.deepcopy(TREE)).numbers == TREE["values"]
+    with pytest.raises(MagicError, match="juggle"):
+        Goal("juggle").numbers  # noqa: B018
 
 
 def test_names_of_no_tree_and_numbers_that_it_does_not_name():
