@@ -206,7 +206,7 @@ class Watch:
     def disturb(self) -> None:
         """Before each step."""
         world = self.run.world
-        if self._kick > 0 and self._kicked_from <= self.run.time < self._to:
+        if self.kicks and self.run.time < self._to:
             world.set_velocity(TARGET, world.velocity(TARGET) + self.rng.normal(0, self._kick) * self.asked.direction("left"))
         if self._slowing > 0:
             along = self.asked.direction(self._trial["resists"]["along"])
@@ -216,8 +216,9 @@ class Watch:
                 world.set_velocity(TARGET, velocity - np.sign(speed) * min(abs(speed), self._slowing) * along)
 
     @property
-    def _kicked_from(self) -> float:
-        return phase_start(self.run.phases, ("contact", "goal")) or 0.0
+    def kicks(self) -> bool:
+        """Whether the test itself has begun to move the target."""
+        return self._kick > 0 and self.run.time >= (phase_start(self.run.phases, ("contact", "goal")) or 0.0)
 
     def observe(self) -> None:
         """After each step."""

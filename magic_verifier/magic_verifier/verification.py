@@ -65,7 +65,8 @@ class Limits:
     in a fixed target when it is let go (reconstructions are that uncertain, and a touch is an
     overlap of about nothing), and in the table at any time; press: the same for other static
     things after the contact phase has begun, where the tool may well slide along them; nudge
-    (m): how far the target may be pushed before the contact phase; early_force (N): how hard a
+    (m): how far the target may be pushed before the contact phase; stray (m): how far it may move along the table by itself,
+    before anything touches it; early_force (N): how hard a
     held tool may touch fixed things before it; slip (m) and slip_angle (rad): how far the tool
     may move in the gripper between lift and release; tracking (rad), tracking_slide (m): how far a
     turning and a sliding joint may lag behind.
@@ -84,6 +85,7 @@ class Limits:
     overlap: float = 0.0015
     press: float = 0.01
     nudge: float = 0.002
+    stray: float = 0.005
     early_force: float = 5.0
     slip: float = 0.02
     slip_angle: float = 0.35
@@ -257,6 +259,41 @@ def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
         )
 
 
+class _Untouched:
+    """Refuses a target that moves by itself, topples or rolls off, before anything touches it that the motion moves: what comes of it would
+    be put down to the tool."""
+
+    #: A target that is slower than this (m/s) is not being pushed: its contacts are not looked at.
+    STILL = 0.001
+
+    def __init__(self, run: Any, limits: Limits) -> None:
+        self._run, self._limits = run, limits
+        self._fixed = {TABLE, *(o.id for o in run.setup.obstacles)}
+        self._over = run.setup.target_kind != DYNAMIC
+        self._stood = self._middle(run.setup.target.world_from_object)
+
+    def _middle(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        return transforms.apply(pose, self._run.setup.target.centre)
+
+    def check(self, kicked: bool) -> None:
+        """After each step; ``kicked``: the test itself moves the target from now on."""
+        world, limits = self._run.world, self._limits
+        self._over = self._over or kicked
+        if self._over or np.linalg.norm(world.velocity(TARGET)) < self.STILL:
+            return
+        self._over = not self._fixed.issuperset(world.touched_by(TARGET, goals.TOUCH))
+        way = self._middle(world.pose(TARGET)) - self._stood
+        normal = self._run.setup.table[:3]
+        moved = float(np.linalg.norm(way - (way @ normal) * normal))
+        if not self._over and moved > limits.stray:
+            raise MagicError(
+                Code.UNSTABLE,
+                f"the target moves by itself at {self._run.time:.2f} s, before anything touches it",
+                f"moved {moved * 1000:.1f} mm",
+                f"up to {limits.stray * 1000:.1f} mm",
+            )
+
+
 @dataclass(frozen=True)
 class Task:
     """Everything that a rollout is a function of, beside its number: it may be sent to another process.
@@ -332,6 +369,8 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
         watched = [TARGET] if setup.target_kind == DYNAMIC or plan.variant == "arm" else []
         watched += [o.id for o in setup.obstacles] if plan.variant == "arm" else []
         names = (TOOL, TARGET) if setup.target_kind == DYNAMIC else (TOOL,)
+        # A thing that was seen to stand may roll off where its centre of mass or its shape was drawn otherwise.
+        untouched = _Untouched(run, limits) if drawn is None else None
 
         def advance(step: int) -> None:
             run.advance()
@@ -349,6 +388,8 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
                 break
             goal.disturb()
             advance(step)
+            if untouched is not None:
+                untouched.check(goal.kicks)
             goal.observe()
             if held is None and drawn is None and plan.variant == "arm" and run.time >= task.start:
                 held = run.held()

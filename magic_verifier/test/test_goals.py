@@ -161,3 +161,46 @@ def test_a_strategy_may_ask_less():
     board = scenes.item("tool", [scenes.block((0, 0.02), (-0.1, 0.1), (0.001, 0.05))])
     easy = replace(strategy, goal=replace(strategy.goal, values={**strategy.goal.values, "hold": 0.0}))
     assert judge(easy, board, target, motion).success
+
+
+# ------------------------------------------------------------ what moves by itself
+
+BLOCK = scenes.block((-0.02, 0.02), (-0.03, 0.03), (-0.05, 0.05))
+#: Tilted by so much (rad) the block's middle is above its lower edge.
+BALANCED = float(np.arctan(0.02 / 0.05))
+
+
+def untouched(test, target, obstacles=(), values=None, contact=1.0, friction=0.5):
+    """The verdict on a tool that moves far from the target and never touches it."""
+    strategy = scenes.strategy(test, values, Physics(friction, 600.0, 300.0))
+    start = transforms.make(translation=[0.5, 0.5, 0.3])
+    aside = transforms.make(translation=[0, 0.05, 0]) @ start
+    motion = scenes.plan([(start, "", 0), (start, "approach", contact), (aside, "contact", 0.5), (aside, "goal", 2.0)])
+    tool = scenes.item("tool", [scenes.block((-0.01, 0.01), (-0.01, 0.01), (-0.1, 0.1))])
+    return judge(strategy, tool, target, motion, obstacles)
+
+
+def leaning(tilt):
+    return scenes.item("target", [BLOCK], transforms.from_rpy(0, -tilt, 0, [0.5, 0, 0.07]))
+
+
+@pytest.mark.parametrize("beyond, contact", [(0.3, 1.0), (0.003, 0.1)])
+def test_a_block_that_topples_by_itself_was_not_tipped(beyond, contact):
+    verdict = untouched("tip", leaning(BALANCED + beyond), values={"angle": 45.0}, contact=contact)
+    assert (verdict.success, verdict.code) == (False, Code.UNSTABLE), verdict.message
+    assert verdict.message.startswith("the target moves by itself at") and "(allowed: up to 5.0 mm)" in verdict.message
+    fallen = verdict.recording.times[-1]
+    assert fallen < 1.0 if contact == 1.0 else fallen > contact, "later it is no less by itself"
+
+
+def test_a_ball_that_rolls_off_by_itself_was_not_pushed():
+    ramp = scenes.item("ramp", [scenes.hull([(x, y, z) for x, z in ((0.3, 0.0), (0.6, 0.0), (0.6, 0.06)) for y in (-0.1, 0.1)])])
+    verdict = untouched("push", ball(0.02, [0.5, 0, 0.0606]), [ramp], {"upright": 180.0})
+    assert verdict.code == Code.UNSTABLE and verdict.message.startswith("the target moves by itself"), verdict.message
+
+
+def test_what_stands_still_does_not_move_by_itself():
+    verdict = untouched("push", scenes.item("target", [BLOCK], transforms.make(translation=[0.5, 0, 0.05])))
+    assert verdict.code == Code.GOAL_NOT_REACHED and "not pushed far enough" in verdict.message
+    # It drops upright, and stands.
+    assert "not pushed far enough" in untouched("push", scenes.item("target", [BLOCK], transforms.make(translation=[0.5, 0, 0.06]))).message
