@@ -10,7 +10,7 @@ import trimesh
 from test_execution import ACTIONS, folder  # noqa: F401  a fixture
 from test_strategy_server import Bench
 
-from magic_bringup import fakes
+from magic_bringup import fakes, seen_goal
 from magic_core import conversions, shapes, transforms
 from magic_core.errors import Code
 from magic_core.robot import Description
@@ -323,3 +323,28 @@ def test_a_goal_that_cannot_be_told_is_not_said_to_be_met(bench):
     result = run(bench, Code.GOAL_UNSEEN)
     assert "object_2 is not seen" in result.message and "met: " not in result.message
     assert len(asked(bench, "plan_motion")) == 1
+
+
+def test_a_goal_is_asked_with_the_motions_phases_and_the_hand_as_it_is(bench, monkeypatch):
+    """The arm turns by 0.1 rad at every joint after it has let the tool go."""
+    heard = []
+
+    def judge(_strategy, names, phases, looks, _table, hand, accuracy):
+        heard.append((names, phases, looks, hand, accuracy))
+        return seen_goal.SeenGoal(True, "as it should be")
+
+    def letting_go(goal, _canceled):
+        plan = fakes.plan("arm", release=True)
+        plan.arm_motion.positions[-1] += 0.1
+        return PlanMotion.Result(message="planned", plan=conversions.plan_to_msg(plan, goal.tool.id))
+
+    monkeypatch.setattr(seen_goal, "judge", judge)
+    bench.fakes.on_plan = letting_go
+    bench.server._loop = replace(bench.usual, judge=True, watch=False, look=False)
+    assert "as it should be" in run(bench).message
+    ((names, phases, (before, first, second), hand, accuracy),) = heard
+    assert names == {"tool": "object_1", "target": "object_2"} and accuracy == bench.usual.accuracy
+    assert phases == ["grasp", "transfer", "goal"]
+    assert before.stamp < first.stamp < second.stamp and set(second.things) == {"object_1", "object_2"}
+    let_go, gone = (ROBOT.forward(np.full(7, angle))[0][:3, 3] for angle in (0.2, 0.3))
+    assert hand.released and hand.away == pytest.approx(np.linalg.norm(gone - let_go), abs=1e-6)
