@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.goal import Node, leaf_words
+from magic_core.goal import Node, direction_of, leaf_words
 from magic_core.strategy import Strategy
 from magic_verifier.enclosing import STRONGER, enclosure
 from magic_verifier.floating import TARGET, TOOL, phase_start
@@ -132,23 +132,7 @@ class Asked:
 
     def direction(self, along: Any) -> Array:
         """The unit vector (3,) of a direction's name or numbers; raises ``BAD_STRATEGY`` for a level one of an upright normal."""
-        if not isinstance(along, str):
-            return transforms.unit(np.asarray(along, dtype=float))
-        if along in ("up", "down"):
-            return np.array([0.0, 0.0, 1.0 if along == "up" else -1.0])
-        inwards = -np.asarray(self.strategy.target_normal, dtype=float)
-        if along == "press":
-            return transforms.unit(inwards)
-        level = inwards * [1.0, 1.0, 0.0]
-        if np.linalg.norm(level) < 1e-6:
-            raise MagicError(
-                Code.BAD_STRATEGY,
-                f"target_normal of a strategy with the direction '{along}'",
-                self.strategy.target_normal,
-                "a direction along the table",
-            )
-        level = transforms.unit(level)
-        return level if along == "pull" else np.cross([0, 0, 1.0], level)
+        return direction_of(along, self.strategy.target_normal)
 
     def radius(self, along: Array) -> float:
         """Half of what the target measured across a direction when the motion began, m."""

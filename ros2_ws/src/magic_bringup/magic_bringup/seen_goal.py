@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from magic_core import transforms
-from magic_core.errors import Code, MagicError
-from magic_core.goal import PREDICATES, Node, leaf_words, moment_words, node_words
+from magic_core.goal import PREDICATES, Node, direction_of, leaf_words, moment_words, node_words
 from magic_core.mesh import Mesh
 from magic_core.strategy import Strategy
 
@@ -219,18 +218,7 @@ class _Asked:
 
     def direction(self, along: Any) -> Array:
         """The unit vector (3,) of a direction's name or numbers."""
-        if not isinstance(along, str):
-            return transforms.unit(np.asarray(along, dtype=float))
-        if along in ("up", "down"):
-            return np.array([0.0, 0.0, 1.0 if along == "up" else -1.0])
-        inwards = -np.asarray(self.strategy.target_normal, dtype=float)
-        if along == "press":
-            return transforms.unit(inwards)
-        level = inwards * [1.0, 1.0, 0.0]
-        if np.linalg.norm(level) < 1e-6:
-            raise MagicError(Code.BAD_STRATEGY, f"target_normal of a strategy with the direction {along}", inwards, "along the table")
-        level = transforms.unit(level)
-        return level if along == "pull" else np.cross([0, 0, 1.0], level)
+        return direction_of(along, self.strategy.target_normal)
 
     def at_least(self, value: float, bound: float, exact: float, text: str) -> _Told:
         """Whether a value is at least a bound, where it is known so exactly."""

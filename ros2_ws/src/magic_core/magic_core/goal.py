@@ -42,8 +42,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
+from magic_core import transforms
 from magic_core.errors import Code, MagicError
 
 #: The trees that ship.
@@ -720,3 +723,23 @@ def _lines(node: Node, indent: str) -> list[str]:
         return [line for child in node.of for line in _lines(child, indent)]
     head = {"all": "all of", "any": "one of", "not": "not"}[node.kind]
     return [f"{indent}{said + ', ' if said else ''}{head}:", *(line for child in node.of for line in _lines(child, indent + "  "))]
+
+
+def direction_of(along: Any, target_normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The unit vector (3,) of a direction's name (:data:`DIRECTIONS`) or numbers, in the world.
+
+    target_normal (3,) is the strategy's, in the world.  Raises ``BAD_STRATEGY`` for a level direction of an upright normal.
+    """
+    if not isinstance(along, str):
+        return transforms.unit(np.asarray(along, dtype=float))
+    if along in ("up", "down"):
+        return np.array([0.0, 0.0, 1.0 if along == "up" else -1.0])
+    inwards = -np.asarray(target_normal, dtype=float)
+    if along == "press":
+        return transforms.unit(inwards)
+    level = inwards * [1.0, 1.0, 0.0]
+    if np.linalg.norm(level) < 1e-6:
+        what = f"target_normal of a strategy with the direction '{along}'"
+        raise MagicError(Code.BAD_STRATEGY, what, target_normal, "a direction along the table")
+    level = transforms.unit(level)
+    return level if along == "pull" else np.cross([0.0, 0.0, 1.0], level)
