@@ -18,8 +18,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from magic_bags.recording import Recording
 from magic_bringup import make_strategies
-from magic_bringup.recording import Recording
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh

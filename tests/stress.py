@@ -42,13 +42,14 @@ from typing import Any
 
 import numpy as np
 
-from magic_bringup import bag_file, fakes
+from magic_bags import bag_file
 from magic_bringup.demo import Options
-from magic_bringup.domain import isolated
 from magic_bringup.graph import NODES, Graph
 from magic_bringup.testing import Bench, Feed, camera_messages, feeding, first_messages, started, until
 from magic_core import conversions, shapes, transforms
+from magic_core.domain import isolated
 from magic_core.errors import Code, MagicError
+from magic_server.testing import fakes
 
 ROOT = Path(__file__).resolve().parents[1]
 #: How many cases each part has.

@@ -7,11 +7,13 @@ import time
 import numpy as np
 import pytest
 
-from magic_bringup import bag_file, demo, fakes, record
+from magic_bags import bag_file
+from magic_bringup import demo, record
 from magic_bringup.testing import DEADLINE, Bench, camera_messages, feeding, started, until
 from magic_core import conversions, shapes, transforms
 from magic_core.errors import Code
 from magic_core.executor import ThreadedExecutor
+from magic_server.testing import fakes
 
 DEPTH, COLOR, INFO = "/aligned_depth_to_color/image_raw", "/color/image_raw", "/color/camera_info"
 

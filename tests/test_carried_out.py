@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from magic_bringup import fakes
 from magic_bringup.testing import ONCE, feeding, first_messages, started, until
 from magic_core.errors import Code
 from magic_core.executor import ThreadedExecutor
+from magic_server.testing import fakes
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "hanging"
 HOME = [0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4]

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magic_bringup import execution, reference
+from magic_bringup import reference
 from magic_bringup.graph import NODES
 from magic_bringup.testing import ONCE, Bench, started, until
 from magic_core import conversions
 from magic_core.errors import Code
+from magic_server import execution
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 

@@ -12,9 +12,9 @@ import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
 
-from magic_bringup.domain import isolated
 from magic_bringup.graph import NODES, Process, executable
 from magic_bringup.testing import DEADLINE, until
+from magic_core.domain import isolated
 
 LAUNCH = Path(__file__).resolve().parents[1] / "ros2_ws/src/magic_bringup/launch"
 

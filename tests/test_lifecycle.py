@@ -9,9 +9,9 @@ import pytest
 import yaml
 from ament_index_python.packages import get_package_share_directory
 
-from magic_bringup.domain import free_domain, isolated
 from magic_bringup.graph import NODES, Graph, Process
 from magic_bringup.testing import DEADLINE, until
+from magic_core.domain import free_domain, isolated
 
 
 def test_every_node_starts_alone_ends_cleanly_and_starts_again_with_what_was_dumped(tmp_path):

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from magic_bringup import fakes
 from magic_bringup.demo import Options
 from magic_bringup.graph import NODES
 from magic_bringup.testing import DEADLINE, started, until
 from magic_core.errors import Code
 from magic_core.executor import ThreadedExecutor
+from magic_server.testing import fakes
 
 SERVER = {
     "execute": True,

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from magic_bringup.domain import free_domain
+from magic_core.domain import free_domain
 
 os.environ["ROS_DOMAIN_ID"] = str(free_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

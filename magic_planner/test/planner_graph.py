@@ -22,8 +22,8 @@ def planner(folder, **parameters) -> Iterator:
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
-    from magic_bringup.domain import free_domain
     from magic_core.actions import ActionClient
+    from magic_core.domain import free_domain
     from magic_interfaces.action import PlanMotion
     from magic_planner.node import PlannerNode
 

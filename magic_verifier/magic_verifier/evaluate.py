@@ -185,7 +185,7 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     """Match, plan and verify one case; the answer is plain data for ``results.json``."""
     import torch
 
-    from magic_bringup.pipeline import Agenda
+    from magic_server.pipeline import Agenda
 
     _ready(options.variant)
     torch.set_num_threads(1)

@@ -65,7 +65,7 @@ class Recorded:
     """The messages of a bag that a demonstration is read from, by topic."""
 
     def __init__(self, path: Path) -> None:
-        from magic_bringup import bag_file, bag_messages
+        from magic_bags import bag_file, bag_messages
 
         self.path = path
         self.types = {topic.name: topic.type_name for topic in bag_file.info(path).topics}

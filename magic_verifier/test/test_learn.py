@@ -14,7 +14,7 @@ import scenes
 from demonstrations import ring_pulling
 
 pytest.importorskip("magic_perception.pipeline")
-pytest.importorskip("magic_bringup.bag_file")
+pytest.importorskip("magic_bags.bag_file")
 
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage

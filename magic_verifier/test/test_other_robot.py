@@ -263,7 +263,7 @@ def test_an_arm_that_cannot_be_loaded_ends_the_start(config, change, words):
     rclpy = pytest.importorskip("rclpy")
     from rclpy.parameter import Parameter
 
-    from magic_bringup.domain import free_domain
+    from magic_core.domain import free_domain
     from magic_verifier.node import VerifierNode
 
     parameters = {**given(config), "arm.stiffness": [3000.0], "arm.damping": [100.0], **change}

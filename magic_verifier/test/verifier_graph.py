@@ -36,8 +36,8 @@ def verifier(folder, **parameters) -> Iterator:
     from rclpy.executors import MultiThreadedExecutor
     from rclpy.parameter import Parameter
 
-    from magic_bringup.domain import free_domain
     from magic_core.actions import ActionClient
+    from magic_core.domain import free_domain
     from magic_interfaces.action import VerifyMotion
     from magic_verifier.node import VerifierNode
 

@@ -26,7 +26,7 @@ setup(
         # A file of its own instead of a console script: it starts faster, and bin is put on PATH by colcon.
         ("bin", ["scripts/ros2"]),
     ],
-    install_requires=["numpy<2", "PyYAML", beside("magic_core"), beside("magic_bringup")],
+    install_requires=["numpy<2", "PyYAML", beside("magic_core"), beside("magic_bags")],
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

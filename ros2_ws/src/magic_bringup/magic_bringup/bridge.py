@@ -8,11 +8,11 @@ from typing import Any
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory
 
-from magic_bringup import interop
 from magic_core import qos
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, run
 from magic_interfaces.msg import SceneObjectArray
+from magic_server import interop
 
 
 def messages_of(package: str) -> Any:

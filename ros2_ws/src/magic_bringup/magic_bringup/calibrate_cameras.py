@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from magic_bringup import bag_messages
+from magic_bags import bag_messages
 from magic_bringup.record import CAMERA_TOPIC, raw_topic, shown
 from magic_core import conversions, transforms
 from magic_core.errors import Code, MagicError

@@ -28,9 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CompressedImage, Image
 
 from magic_bringup.doctor import examine
-from magic_bringup.pipeline import split_metrics
 from magic_bringup.record import IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
-from magic_bringup.remote import RemoteAction, RemoteService, Token
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
 from magic_core.arguments import split
@@ -42,6 +40,8 @@ from magic_core.remedies import REMEDIES
 from magic_interfaces.action import RunStrategy
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
+from magic_server.pipeline import split_metrics
+from magic_server.remote import RemoteAction, RemoteService, Token
 
 #: What is waited beyond a run's own time for its answer, s.
 GRACE = 30.0

@@ -20,15 +20,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, peak_memory
-from magic_bringup.pipeline import split_metrics
 from magic_bringup.record import CAMERA_TOPIC, IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
 from magic_core import environment
 from magic_core import strategy as strategies
+from magic_core.domain import isolated
 from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.motion import VARIANTS
+from magic_server.pipeline import split_metrics
 
 #: How long the nodes may take to come up, s; the first start after a boot reads gigabytes of libraries.
 START_TIMEOUT = 120.0
@@ -82,7 +82,7 @@ def look_into(bag: Path, topics: Sequence[tuple[str, str]] = (), cameras: Sequen
     topics: recorded name and the name that it is played under.  Raises BAD_BAG for what is no bag, an empty one, one without such a
     topic or without a topic of one of these cameras.
     """
-    from magic_bringup import bag_file
+    from magic_bags import bag_file
 
     info = bag_file.info(bag)
     if info.count == 0:
@@ -103,7 +103,7 @@ def look_into(bag: Path, topics: Sequence[tuple[str, str]] = (), cameras: Sequen
 
 def first_images(bag: Path, topics: Sequence[tuple[str, str]] = ()) -> dict[str, Any]:
     """The first image of each camera topic of a bag, by the name that it is played under, as messages: what the report shows.  Raises BAD_BAG."""
-    from magic_bringup import bag_messages
+    from magic_bags import bag_messages
 
     renamed = dict(topics)
     found: dict[str, Any] = {}

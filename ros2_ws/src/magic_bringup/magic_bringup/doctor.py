@@ -22,7 +22,6 @@ from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from magic_bringup.graph import NODES
-from magic_bringup.remote import servers_of
 from magic_core import conversions, qos
 from magic_core.entry import version
 from magic_core.errors import Code, MagicError
@@ -32,6 +31,7 @@ from magic_core.tf import TransformBuffer
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.srv import MatchContact
+from magic_server.remote import servers_of
 
 if TYPE_CHECKING:
     from magic_bringup.client import Client

@@ -21,7 +21,7 @@ NODES: dict[str, tuple[str, str]] = {
     "matcher": ("magic_matcher", "matcher"),
     "planner": ("magic_planner", "planner"),
     "verifier": ("magic_verifier", "verifier"),
-    "strategy_server": ("magic_bringup", "strategy_server"),
+    "strategy_server": ("magic_server", "strategy_server"),
 }
 
 #: What the process of a launch file is called.

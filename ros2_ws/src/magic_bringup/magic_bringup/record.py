@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magic_bringup.pipeline import split_metrics
 from magic_core.entry import version
 from magic_core.errors import Code
+from magic_server.pipeline import split_metrics
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 STAGES = ("perceive", "match", "plan", "verify", "total")

@@ -126,8 +126,8 @@ def gather() -> tuple[dict[str, list[Row]], dict[str, dict[str, list[tuple[str, 
     """Parameters and endpoints of the five nodes, started for it in a domain of their own."""
     import os
 
-    from magic_bringup.domain import isolated
     from magic_bringup.graph import Graph
+    from magic_core.domain import isolated
 
     env = isolated()
     os.environ.update({k: env[k] for k in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})

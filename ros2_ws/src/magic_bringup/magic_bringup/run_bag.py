@@ -28,8 +28,8 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
+from magic_bags.recording import Recording
 from magic_bringup.record import Record
-from magic_bringup.recording import Recording
 from magic_bringup.robot_model import link_frames, shown
 from magic_core import conversions
 from magic_core.robot import Description

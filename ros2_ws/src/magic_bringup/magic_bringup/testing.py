@@ -15,11 +15,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from magic_bringup import bag_messages
+from magic_bags import bag_messages
 from magic_bringup.demo import Options, Watcher, look_into
-from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph
 from magic_core import qos
+from magic_core.domain import isolated
 
 #: Longest wait for anything in these tests, s; a machine with two busy cores starts the graph in less than half of it.
 DEADLINE = 90.0

@@ -4,7 +4,7 @@ import os
 import sys
 from pathlib import Path
 
-from magic_bringup.domain import free_domain
+from magic_core.domain import free_domain
 
 # Where one test file uses another's bench.
 sys.path.insert(0, str(Path(__file__).parent))

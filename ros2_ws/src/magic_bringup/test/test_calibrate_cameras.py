@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import yaml
 
+from magic_bags.recording import READY, Recording
 from magic_bringup import calibrate_cameras
 from magic_bringup.calibrate_cameras import main, rests
-from magic_bringup.recording import READY, Recording
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.robot import Description

@@ -7,15 +7,16 @@ import threading
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
-from test_strategy_server import Bench
 
-from magic_bringup import client, fakes, report
+from magic_bringup import client, report
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
 from magic_core.errors import Code
 from magic_core.remedies import REMEDIES
 from magic_interfaces.action import VerifyMotion
 from magic_interfaces.msg import SceneObjectArray
+from magic_server.testing import fakes
+from magic_server.testing.bench import Bench
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +174,7 @@ def test_the_doctor_names_what_is_missing_and_how_to_start_it(magic, bench):
 
 
 def test_the_doctor_of_an_empty_domain(capsys, monkeypatch):
-    from magic_bringup.domain import free_domain
+    from magic_core.domain import free_domain
 
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain()))
     assert client.main(["doctor", "--timeout", "0"]) == 1

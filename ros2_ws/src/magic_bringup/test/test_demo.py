@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from rclpy.task import Future
 
+from magic_bags.recording import Recording
 from magic_bringup.demo import Pending, first_images, look_into, parse, perceive_seconds
-from magic_bringup.recording import Recording
 from magic_core import conversions
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
-from magic_bringup import bag_messages
-from magic_bringup.bag_file import info as read_info
+from magic_bags import bag_messages
+from magic_bags.bag_file import info as read_info
 from magic_core import conversions as convert
 from magic_core import transforms
 from magic_core.shapes import make

@@ -6,13 +6,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from magic_bringup import fakes, report
+from magic_bringup import report
 from magic_bringup.record import Record, empty_summary, take, write_summary
 from magic_core import conversions
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import RunStrategy
 from magic_interfaces.msg import CandidateReport
+from magic_server.testing import fakes
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory
 
-from magic_bringup import fakes
 from magic_bringup.robot_model import GHOST, PAUSE, RobotModel, link_frames, played, shown
 from magic_core import conversions, qos
 from magic_core.robot import Description
+from magic_server.testing import fakes
 
 ROBOT = Description()
 

@@ -12,17 +12,17 @@ import yaml
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
-from magic_bringup import settings
 from magic_core.node import robot_parameters
 from magic_core.presets import PRESETS
 from magic_core.robot import RobotConfig
+from magic_server import settings
 
 SHARE = Path(__file__).resolve().parents[1]
 
 
 def test_the_gripper_is_told_the_force_that_was_planned_and_verified_with():
     """A motion that was verified with a firmer grip than the hand is told would slip."""
-    from magic_bringup.arm import ArmSettings
+    from magic_server.arm import ArmSettings
 
     root = SHARE.parents[2]
     planner = yaml.safe_load((root / "magic_planner/config/planner.param.yaml").read_text())["/**"]["ros__parameters"]

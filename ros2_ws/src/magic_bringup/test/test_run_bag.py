@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magic_bringup import bag_messages, fakes, run_bag
-from magic_bringup.bag_file import info
+from magic_bags import bag_messages
+from magic_bags.bag_file import info
+from magic_bringup import run_bag
 from magic_bringup.record import Record, empty_summary
 from magic_core import conversions
 from magic_core.robot import Description
 from magic_interfaces.action import RunStrategy
 from magic_interfaces.msg import CandidateReport
+from magic_server.testing import fakes
 
 
 def record(variant, verified=True):

@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_bringup.demo import START_TIMEOUT, Options, Watcher
-from magic_bringup.domain import isolated
 from magic_bringup.graph import Graph, Process
-from magic_bringup.pipeline import split_metrics
 from magic_core import environment
+from magic_core.domain import isolated
 from magic_core.errors import Code, MagicError
 from magic_lab.judge import Track, judge, middle, nearest
 from magic_lab.scenarios import SCENARIOS, Scenario, Scene, case_of, draw, scenario_of
+from magic_server.pipeline import split_metrics
 from magic_verifier.verification import wilson
 
 Image = NDArray[np.uint8]

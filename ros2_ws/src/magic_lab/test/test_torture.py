@@ -17,12 +17,10 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 import magic_lab.node
-from magic_bringup import fakes
-from magic_bringup.domain import free_domain
-from magic_bringup.strategy_server import StrategyServer
 from magic_core import conversions, qos
 from magic_core import strategy as strategies
 from magic_core.actions import ActionClient
+from magic_core.domain import free_domain
 from magic_core.errors import Code
 from magic_core.executor import ThreadedExecutor
 from magic_core.motion import ArmMotion, MotionPlan
@@ -30,6 +28,8 @@ from magic_core.scene import Scene
 from magic_interfaces.action import PlanMotion, RunStrategy
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
+from magic_server.strategy_server import StrategyServer
+from magic_server.testing import fakes
 
 DEADLINE = 60.0
 

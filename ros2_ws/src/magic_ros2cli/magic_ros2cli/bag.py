@@ -1,4 +1,4 @@
-"""``ros2 bag`` info, play and record: the tools of magic_bringup under ros2cli's names."""
+"""``ros2 bag`` info, play and record: the tools of magic_bags under ros2cli's names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def bag_info(arguments: list[str]) -> int:
     parser.add_argument("bag_path", help="bag to describe: a rosbag2 folder, or an .mcap or .db3 file")
     parser.add_argument("-t", "--topic-name", action="store_true", help="only display topic names")
     parsed = parser.parse_args(arguments)
-    from magic_bringup.bag_file import info
+    from magic_bags.bag_file import info
     from magic_core.errors import MagicError
 
     try:
@@ -27,13 +27,13 @@ def bag_info(arguments: list[str]) -> int:
 
 
 def bag_play(arguments: list[str]) -> int:
-    from magic_bringup.bag_player import main
+    from magic_bags.bag_player import main
 
     return _status(main, arguments)
 
 
 def bag_record(arguments: list[str]) -> int:
-    from magic_bringup.bag_recorder import main
+    from magic_bags.bag_recorder import main
 
     return _status(main, arguments)
 

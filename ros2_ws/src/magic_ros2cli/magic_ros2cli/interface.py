@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from magic_bringup.bag_file import nested_type
+from magic_bags.bag_file import nested_type
 from magic_ros2cli import packages
 from magic_ros2cli.errors import CommandError
 

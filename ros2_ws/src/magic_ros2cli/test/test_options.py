@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from magic_bringup.domain import free_domain
+from magic_core.domain import free_domain
 from magic_ros2cli import main
 
 HERE = Path(__file__).parent
@@ -139,7 +139,7 @@ def write_bag(path: Path) -> None:
     from rclpy.serialization import serialize_message
     from std_msgs.msg import String
 
-    from magic_bringup.bag_file import BagWriter
+    from magic_bags.bag_file import BagWriter
 
     writer = BagWriter(path)
     writer.add_topic("/recorded", "std_msgs/msg/String")
@@ -189,7 +189,7 @@ def test_what_a_command_with_these_options_says(outputs: dict[str, str], line: s
 
 
 def test_what_was_recorded_with_options_is_in_the_bags(outputs: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> None:
-    from magic_bringup import bag_file
+    from magic_bags import bag_file
 
     folder = next(p for p in tmp_path_factory.getbasetemp().glob("options*") if (p / "a").is_dir())
     infos = {name: bag_file.info(folder / name) for name in "abc"}

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from magic_bringup.domain import free_domain
+from magic_core.domain import free_domain
 
 HERE = Path(__file__).parent
 ENVIRONMENT = {

@@ -1,0 +1,46 @@
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "magic_bags"
+HERE = Path(__file__).resolve().parent
+VERSION = ElementTree.parse(HERE / "package.xml").getroot().findtext("version")
+
+
+def beside(name: str) -> str:
+    """A package of this repository as pip is told where it lies; by its name alone where it does not lie beside this one."""
+    for folder in (HERE.parent / name, HERE.parents[2] / name):
+        if (folder / "setup.py").is_file():
+            return f"{name} @ {folder.resolve().as_uri()}"
+    return name
+
+
+setup(
+    name=PACKAGE,
+    version=VERSION,
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=[
+        "numpy<2",
+        "opencv-python-headless",
+        "rosbags",
+        beside("magic_core"),
+        beside("magic_perception"),
+    ],
+    zip_safe=False,
+    maintainer="MAGIC developers",
+    maintainer_email="maintainers@magic-robotics.org",
+    description="Bags without rosbag2: player, recorder, and what makes a bag of a scene or of a picture.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            f"bag_player = {PACKAGE}.programs:bag_player",
+            f"bag_recorder = {PACKAGE}.programs:bag_recorder",
+            f"rgbd_to_bag = {PACKAGE}.programs:rgbd_to_bag",
+        ]
+    },
+)

@@ -1,0 +1,471 @@
+"""A goal carried out with open eyes: what is looked at while arm and gripper move, and what follows.
+
+The states, each left by a step that was looked at or by a failure with a code::
+
+    carried out ----------------------------------------> judged --met--> the end, OK
+     |   |   |                                              |  `--cannot be told--> the end, GOAL_UNSEEN
+     |   |   |                                              `--missed--> next candidate
+     |   |   `--a thing has moved--> stopped, at rest --> perceived and planned anew, or with the tool in the hand from there
+     |   `--the tool is off in the hand--> planned anew from its pose as it is, or given up (TOOL_SLIPPED)
+     `--the grasp failed--> next grasp or candidate
+
+Whatever is planned anew is verified anew, and moves only by its own verdict: each beginning of the arm asks
+:func:`magic_server.permission.permit`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import conversions, transforms
+from magic_core.errors import Code, MagicError
+from magic_core.scene import UNSEEN
+from magic_core.strategy import Strategy
+from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
+from magic_server import execution, in_hand, pipeline, scene_change, seen_goal
+from magic_server.arm import Arm
+from magic_server.held import Held, HeldStages
+from magic_server.joints import STANDSTILL
+from magic_server.permission import Claim, Limits, Look, NotYet, Purpose, World, permit
+from magic_server.remote import Token
+from magic_server.scene_change import Changed
+from magic_server.settings import LoopSettings
+from magic_server.stages import Server, Stages, hull_of
+from magic_server.watch import Bounds, SceneWatch
+
+#: A picture shows what was there so many seconds before its stamp, too: several are averaged.
+SETTLED = 0.3
+#: An arm is at rest where no joint has moved by more than so many rad in so many seconds.
+STILL, STILL_FOR = 0.003, 0.1
+#: A simulation is given so many times the wall's time.
+SLOWEST = 20.0
+#: joint_states that are silent for so much longer than ``state_age`` while the arm moves stop it, s: a busy machine delivers late.
+SILENT = 1.0
+#: Failures after which the next candidate is tried, from the state as it is then.
+RETRIED = frozenset({Code.GRASP_FAILED, Code.GOAL_MISSED})
+#: Two contacts of one tool that are nearer than this are the same, m.
+SAME_CONTACT = 0.015
+#: The phases of a motion in which the tool is meant to touch the target.
+CONTACT_PHASES = ("contact", "goal")
+
+
+class Robot(Server, Protocol):
+    """What the loop needs of the strategy server, a node."""
+
+    def look(self) -> Look | None: ...
+
+    def world(self, claim: Claim) -> World: ...
+
+    def get_clock(self) -> Any: ...
+
+    def get_parameter(self, name: str) -> Any: ...
+
+
+class Off(Exception):
+    """The tool is off in the hand: ``held`` as it is."""
+
+    def __init__(self, held: Held, deviation: in_hand.Deviation) -> None:
+        super().__init__(str(deviation))
+        self.held, self.deviation = held, deviation
+
+
+@dataclass(frozen=True)
+class Job:
+    """A planned motion that is to be carried out: what came of planning it, by which stages, and what the rule is to know of it;
+    ``held``: the tool is in the hand where it begins."""
+
+    outcome: pipeline.Outcome
+    stages: Stages
+    claim: Claim
+    held: Held | None = None
+
+
+class ClosedLoop:
+    """Carries one goal out, looks, and goes on from what there is; :meth:`execute` raises what it ends with, unless that is success.
+
+    work(request, stages, reflections, spent): a run of the pipeline.  claim_of(outcome, stages): what the rule is to know of it.
+    allowed(ask): what ``ask`` returns, once that is allowed.  Afterwards ``jobs`` holds what was carried out, the last one last,
+    ``tried`` all outcomes of planning, ``executed`` whether the last was carried out to its end, and ``notes`` what is to be told.
+    """
+
+    def __init__(
+        self,
+        server: Robot,
+        arm: Arm,
+        settings: LoopSettings,
+        limits: Limits,
+        strategy: Strategy,
+        request: pipeline.Request,
+        token: Token,
+        first: Job,
+        run: str,
+        work: Callable[[pipeline.Request, Stages, Sequence[str], Callable[[Any], int]], pipeline.Outcome],
+        claim_of: Callable[[pipeline.Outcome, Stages], Claim],
+        allowed: Callable[[Callable[[], Any]], Any],
+        begun: Callable[[], None],
+        tell: Callable[[Job, str], None],
+    ) -> None:
+        self._server, self._arm, self._settings, self._limits = server, arm, settings, limits
+        self._strategy, self._request, self._token, self._run = strategy, request, token, run
+        self._work, self._claim_of, self._allowed, self._begun, self._tell = work, claim_of, allowed, begun, tell
+        self.jobs, self.tried = [first], [first.outcome]
+        self.notes: list[str] = []
+        self.executed = False
+        self._held: Held | None = None
+        #: Where the hand (3,) let the tool go, in the base's frame.
+        self._let_go: NDArray[np.float64] | None = None
+        self._touched = self._may_touch = False
+        self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
+        self._simulated = bool(server.get_parameter("use_sim_time").value)
+        self._bounds = Bounds(settings.executions, settings.replans, time.monotonic() + settings.seconds)
+
+    # ------------------------------------------------------------ the loop
+
+    def execute(self) -> str:
+        """Carry out, look, and go on until the goal is met; returns what was seen of it in a sentence.  Raises how else it ends."""
+        while True:
+            job = self.jobs[-1]
+            try:
+                return self._carry_out(job)
+            except Off as off:
+                error = MagicError(Code.TOOL_SLIPPED, f"the tool is off in the hand by {off.deviation}")
+                self._follow(error, lambda error=error: self._bounds.elsewhere(error, error.code, time.monotonic()))
+                following = self._corrected(job, off.held)
+            except Changed as change:
+                error = MagicError(Code.SCENE_CHANGED, change.message)
+                self._follow(error, lambda error=error: self._bounds.elsewhere(error, error.code, time.monotonic()))
+                following = self._anew()
+            except MagicError as failure:
+                error = failure
+                if error.code not in RETRIED:
+                    raise
+                self._follow(error, lambda error=error: self._bounds.fail(error, time.monotonic()))
+                self._spend(job, error.code)
+                following = self._anew()
+            self.tried.append(following.outcome)
+            if following.outcome.code != Code.OK:
+                raise MagicError(error.code, f"{error.message}; planned again from there: {following.outcome.message}")
+            self.jobs.append(following)
+
+    def _follow(self, error: MagicError, count: Callable[[], None]) -> None:
+        """See that the arm stands and that there is another try."""
+        self._at_rest(error)
+        count()
+        self._say(f"{error.code.name}: {error.message}; planning again from the state as it is")
+        self.notes.append(f"{error.code.name}: {error.message}")
+
+    def _carry_out(self, job: Job) -> str:
+        self._held, self._touched, self._may_touch, self._let_go = job.held, False, False, None
+        self.executed = False
+        self._arm.execute(job.outcome.plan, self._token, self._say, self, job.held is not None, self._settings.look)
+        self.executed = True
+        return self._judge(job) if self._settings.judge else ""
+
+    def _say(self, text: str) -> None:
+        self._tell(self.jobs[-1], text)
+
+    # ------------------------------------------------------------ what the arm asks (magic_server.arm.Guard)
+
+    def ask(self, point: int) -> None:
+        """Ask the rule whether the arm may begin to move from a point of its trajectory."""
+        self._touched = self._touched or self._may_touch
+        job = self.jobs[-1]
+        outcome = job.outcome
+        positions = tuple(outcome.plan.arm_trajectory.points[point].positions)
+        meant = {outcome.tool_id} if self._held is not None or self._touched else set()
+        meant |= {outcome.target_id} if self._touched else set()
+        carried = None if self._held is None else self._held.hull(self._server.robot.forward(np.array(positions))[0])
+        asked = replace(job.claim, start=positions, meant=frozenset(meant), carried=carried)
+
+        def allowed() -> None:
+            world = self._server.world(asked)
+            permit(asked, replace(world, servers={**world.servers, **self._arm.servers()}), self._limits, Purpose.MOVE)
+
+        self._allowed(allowed)
+        self._begun()
+
+    def watch(self, move: execution.Move, speed: float) -> Callable[[], None]:
+        """Look at the scene while the arm moves."""
+        job, server = self.jobs[-1], self._server
+        times = [conversions.time_from_msg(p.time_from_start) for p in job.outcome.plan.arm_trajectory.points]
+        contact = contact_time(job.outcome.plan) if self._held is not None else math.inf
+        self._may_touch = times[move.last] > contact
+        if not self._settings.watch:
+            return lambda: None
+        began = self._now()
+        meant = {job.outcome.tool_id} if self._held is not None or self._touched else set()
+        meant |= {job.outcome.target_id} if self._touched else set()
+        until = (contact - times[move.first]) / speed
+        watching = SceneWatch(
+            job.claim.scene, meant, job.outcome.target_id, until, self._settings.watch_tolerance, self._limits.objects_age
+        )
+
+        newest: list[Look | None] = [None]
+
+        def check() -> None:
+            try:
+                with suppress(NotYet):  # what cannot be told in the base's frame yet has not come yet
+                    newest[0] = server.look()
+                # Of a simulation that is slower than the wall's clock only its own clock tells how old a thing is.
+                now = newest[0].came if self._simulated and newest[0] is not None else time.monotonic()
+                watching.take(newest[0], began, self._now(), now, server.hand()[:3, 3])
+                self._heard()
+            except MagicError:
+                raise
+            except Exception as error:  # what cannot be looked at is not moved among: the arm has to be stopped
+                raise MagicError(Code.INTERNAL, f"watching the scene: {type(error).__name__}: {error}") from error
+
+        return check
+
+    def _heard(self) -> None:
+        joints = [joint for name, joint in self._server.joints.all().items() if name in self._server.robot.names]
+        if self._simulated:
+            silent = self._now() - min((joint.stamp for joint in joints), default=-math.inf)
+        else:
+            silent = time.monotonic() - min((joint.came for joint in joints), default=-math.inf)
+        allowed = self._limits.state_age + SILENT
+        if not silent <= allowed:
+            raise MagicError(
+                Code.STALE_DATA, "joint_states are silent while the arm moves, for s", round(silent, 2), f"at most {allowed:g}"
+            )
+
+    def closed(self) -> None:
+        """The fingers have closed on the tool."""
+        job = self.jobs[-1]
+        tool = next(o for o in job.stages.scene.objects if o.id == job.outcome.tool_id)
+        self._held = Held(tool, conversions.pose_from_msg(job.outcome.plan.tool_from_tcp))
+
+    def opened(self) -> None:
+        """The fingers are about to open: what was in the hand is where it was let go."""
+        self._touched = self._touched or self._may_touch
+        if self._held is not None:
+            self._let_go = self._server.hand()[:3, 3]
+        self._held = None
+
+    def look(self, point: int) -> None:
+        """Look at the tool in the hand; raises :class:`Off`, GRASP_FAILED where it lies where it lay, TOOL_SLIPPED."""
+        held, settings = self._held, self._settings
+        assert held is not None
+        scene = self._fresh()
+        if scene is None:
+            self._unseen("no picture came")
+            return
+        hand = self._server.hand()
+        expected = held.pose(hand)
+        job = self.jobs[-1]
+        axis = "xy".index(self._server.robot.config.closing_axis)
+        found = in_hand.locate(held.mesh, expected, self._points(scene, job), hand[:3, axis])
+        if found is None:
+            lying = next((o for o in scene.objects if self._lies(o, job)), None)
+            if lying is not None:
+                self._held = None
+                raise MagicError(Code.GRASP_FAILED, f"{job.outcome.tool_id} was not taken along: it lies where it lay, seen as", lying.id)
+            self._unseen("the hand hides it, or too little of it is seen")
+            return
+        off = in_hand.Deviation.of(held.mesh, expected, found.world_from_tool)
+        if off.within(settings.tool_shift, settings.tool_turn):
+            self._say(f"the tool is in the hand as planned, off by {off}")
+            return
+        if not off.within(settings.slip_shift, settings.slip_turn):
+            limit = f"at most {1000 * settings.slip_shift:g} mm and {np.degrees(settings.slip_turn):.0f} degrees"
+            raise MagicError(Code.TOOL_SLIPPED, "the tool has slipped in the hand by", str(off), limit)
+        self._held = Held(held.tool, transforms.inverse(found.world_from_tool) @ hand)
+        raise Off(self._held, off)
+
+    def _unseen(self, why: str) -> None:
+        self._say(f"the tool in the hand was not seen ({why}): it is carried on as it was grasped")
+        self.notes.append(f"the tool in the hand was not seen: {why}")
+
+    def _points(self, scene: SceneObjectArray, job: Job) -> NDArray[np.float64]:
+        """What cameras see and what is not one of the things that stand where they stood."""
+        stood = job.claim.scene.objects
+        points = [np.zeros((0, 3))]
+        for item in scene.objects:
+            if item.source != SceneObject.CAMERA or UNSEEN in item.cut_off:
+                continue
+            before = stood.get(item.id) if item.id != job.outcome.tool_id else None
+            if before is None or scene_change.gap(before, hull_of(item), True) > self._limits.object_tolerance:
+                points.append(conversions.cloud_from_msg(item.cloud)[0])
+        return np.concatenate(points)
+
+    def _lies(self, item: SceneObject, job: Job) -> bool:
+        """Whether an object is the tool, where it was before it was grasped, and seen there."""
+        before = job.claim.scene.objects.get(job.outcome.tool_id)
+        if before is None:  # it was in the hand already
+            return False
+        seen = item.source == SceneObject.CAMERA and not {SceneObject.ROBOT, UNSEEN} & set(item.cut_off)
+        return seen and scene_change.distance(before, hull_of(item)) <= self._limits.object_tolerance
+
+    # ------------------------------------------------------------ what is looked at, and when
+
+    def _now(self) -> float:
+        return float(self._server.get_clock().now().nanoseconds * 1e-9)
+
+    def _wait(self, done: Callable[[], bool], seconds: float) -> bool:
+        """Wait until ``done()``, at most so many seconds by the clock of the stamps, which in a simulation may be slow; returns it."""
+        end, patience = self._now() + seconds, SLOWEST * seconds if self._simulated else seconds
+        over = (lambda: self._now() >= end) if self._simulated else (lambda: False)
+        self._token.wait(lambda: done() or over(), time.monotonic() + patience, alive=lambda: None)
+        return done()
+
+    def _fresh(self, since: float | None = None) -> SceneObjectArray | None:
+        """The objects as a picture shows them that was taken from now on; ``None`` where none comes in time."""
+        server, since = self._server, self._now() + SETTLED if since is None else since
+
+        def came() -> bool:
+            scene = server.scene
+            return scene is not None and conversions.time_from_msg(scene.header.stamp) >= since
+
+        if not self._wait(came, self._settings.look_time):
+            return None
+        try:
+            return server.in_base(server.scene)
+        except NotYet:
+            return None
+
+    def _at_rest(self, error: MagicError) -> None:
+        """Wait until the arm stands that an error has stopped; raises ARM_NOT_AT_REST, also where nobody says where it is."""
+        server = self._server
+        names = server.robot.names
+        first: dict[str, Any] = {}
+        begin = time.monotonic()
+
+        def stands() -> bool:
+            joints = server.joints.all()
+            if any(name not in joints or joints[name].came <= begin for name in names):
+                return False
+            moving = any(
+                name not in first
+                or abs(joints[name].position - first[name].position) > STILL
+                or abs(joints[name].velocity) > STANDSTILL  # not told: not a number, and not larger
+                for name in names
+            )
+            if moving:
+                first.update({name: joints[name] for name in names})
+                return False
+            return all(joints[name].stamp - first[name].stamp >= STILL_FOR for name in names)
+
+        if not self._wait(stands, self._settings.rest_time):
+            raise MagicError(
+                Code.ARM_NOT_AT_REST, f"{error.message}; the arm is not known to stand {self._settings.rest_time:g} s after it was to stop"
+            )
+
+    # ------------------------------------------------------------ planning again
+
+    def _left(self) -> pipeline.Request:
+        """The request with the time that is left of the whole."""
+        left = max(1.0, min(self._request.timeout, self._bounds.end - time.monotonic()))
+        return replace(self._request, timeout=left)
+
+    def _corrected(self, job: Job, held: Held) -> Job:
+        """The rest of the motion, planned anew from the tool's pose as it is: the same contact first."""
+        trial = job.outcome.reports[-1].trial
+        stages = self._in_hand(held, job.stages)
+        others = [r for r in self._strategy.reflections if r != trial.reflection]
+        worse = {id(c): index for index, c in enumerate(job.stages.matches.candidates)}
+        outcome = self._work(
+            replace(self._left(), tool_id=job.outcome.tool_id, target_id=job.outcome.target_id),
+            stages,
+            [trial.reflection, *others],
+            # What was better than this one has failed already.
+            lambda candidate: 1 if worse[id(candidate)] < trial.index else self._made(candidate),
+        )
+        return Job(outcome, stages, self._claim(outcome, stages), held)
+
+    def _anew(self) -> Job:
+        """A motion from the state as it is: everything looked at and planned again."""
+        held, request, last = self._held, self._left(), self.jobs[-1].outcome
+        needs = self._strategy.simulatable
+        since = self._now() + SETTLED
+        if held is None:
+            stages = Stages(self._server, self._token, self._run, needs, heatmap=False, since=since)
+        else:
+            request = replace(request, tool_id=last.tool_id, target_id=last.target_id)
+            known = self.jobs[-1].claim.scene.objects
+            stages = HeldStages(self._server, self._token, self._run, needs, held, known, since)
+        outcome = self._work(request, stages, self._strategy.reflections, self._made)
+        return Job(outcome, stages, self._claim(outcome, stages), held)
+
+    def _in_hand(self, held: Held, before: Stages) -> HeldStages:
+        return HeldStages(
+            self._server, self._token, self._run, self._strategy.simulatable, held, self.jobs[-1].claim.scene.objects, -math.inf, before
+        )
+
+    def _claim(self, outcome: pipeline.Outcome, stages: Stages) -> Claim:
+        return self._claim_of(outcome, stages) if outcome.code == Code.OK else self.jobs[-1].claim
+
+    def _spend(self, job: Job, code: Code) -> None:
+        """Remember what has failed: a grasp, or where the task was not done a contact with all its grasps."""
+        trial = job.outcome.reports[-1].trial
+        attempts = trial.attempt + 1 if code == Code.GRASP_FAILED else math.inf
+        candidate = trial.candidate
+        self._spent.append((candidate.tool_id, *_places(candidate), attempts))
+
+    def _made(self, candidate: Any) -> int:
+        """How many attempts were made with a candidate's contact, by its place on the tool or in the world."""
+        made = 0
+        for tool_id, on_tool, in_world, attempts in self._spent:
+            if tool_id == candidate.tool_id:
+                here = _places(candidate)
+                # Not a number, where it is not told, is near nothing.
+                if min(np.nan_to_num(np.linalg.norm(a - b), nan=np.inf) for a, b in zip(here, (on_tool, in_world))) < SAME_CONTACT:
+                    made = max(made, attempts)
+        return made
+
+    # ------------------------------------------------------------ the goal
+
+    def _judge(self, job: Job) -> str:
+        """Look whether the goal is met, twice, so that what moves is seen to move; raises GOAL_MISSED, GOAL_UNSEEN."""
+        self._say("looking whether the goal is met")
+        first = self._fresh()
+        second = None if first is None else self._fresh(math.nextafter(conversions.time_from_msg(first.header.stamp), math.inf))
+        if first is None or second is None:
+            raise MagicError(
+                Code.GOAL_UNSEEN, f"carried out, but no picture came within {self._settings.look_time:g} s that shows what came of it"
+            )
+        outcome = job.outcome
+        names = {"tool": outcome.tool_id, "target": outcome.target_id}
+        table = conversions.plane_from_msg(first.table)
+        looks = self._sight(job.stages.scene, False), self._sight(first, True), self._sight(second, True)
+        away = None if self._let_go is None else float(np.linalg.norm(self._server.hand()[:3, 3] - self._let_go))
+        hand = seen_goal.Hand(self._held is None, away)
+        phases = [phase.name for phase in outcome.plan.phases]
+        seen = seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
+        if seen.met is None:
+            raise MagicError(Code.GOAL_UNSEEN, f"carried out, but whether the goal is met cannot be told by what is seen: {seen.message}")
+        if not seen.met:
+            raise MagicError(Code.GOAL_MISSED, f"carried out, but the goal is not met by what is seen: {seen.message}")
+        return seen.message
+
+    def _sight(self, scene: SceneObjectArray, after: bool) -> seen_goal.Sight:
+        """Things where they were seen; after the motion a tool in the hand is where the hand has it."""
+        held, hand = self._held, self._server.hand()
+        things = {}
+        for item in scene.objects:
+            if after and UNSEEN in item.cut_off:
+                continue  # remembered from before the motion: what came of it is not known
+            if not after or held is None or not held.sees(item, hand, self.jobs[-1].claim.scene.objects):
+                things[item.id] = seen_goal.Thing.of(conversions.mesh_from_msg(item.mesh), conversions.pose_from_msg(item.pose))
+        if after and held is not None:
+            things[held.tool.id] = seen_goal.Thing.of(held.mesh, held.pose(hand))
+        return seen_goal.Sight(things, conversions.time_from_msg(scene.header.stamp))
+
+
+def contact_time(plan: MotionPlan) -> float:
+    """When the tool may first touch the target, s of the plan: as soon as it is in the hand where no phase says."""
+    starts = [p.start for p in plan.phases if p.name in CONTACT_PHASES]
+    return min(starts, default=plan.grasp_time)
+
+
+def _places(candidate: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A contact's place (3,) on the tool and in the world, m; not a number where it is not told."""
+    on_tool = conversions.pose_from_msg(candidate.tool.object_from_contact)[:3, 3]
+    return on_tool, np.array([candidate.point.x, candidate.point.y, candidate.point.z])

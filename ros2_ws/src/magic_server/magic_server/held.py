@@ -1,0 +1,154 @@
+"""A tool in the hand, and the stages of a run that goes on with it."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2
+
+from magic_core import conversions, transforms
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_interfaces.msg import SceneObject, SceneObjectArray
+from magic_interfaces.srv import MatchContact
+from magic_server import pipeline, scene_change
+from magic_server.remote import Token
+from magic_server.stages import Server, Stages, code_of, hull_of
+
+
+@dataclass(frozen=True)
+class Held:
+    """A tool in the hand: the object as it was seen before it was grasped, and tool_from_tcp (4, 4), how it is held."""
+
+    tool: SceneObject
+    tool_from_tcp: NDArray[np.float64]
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its shape, in its own frame."""
+        return conversions.mesh_from_msg(self.tool.mesh)
+
+    def pose(self, world_from_tcp: NDArray[np.float64]) -> NDArray[np.float64]:
+        """world_from_tool (4, 4) with the hand at a pose."""
+        return np.asarray(world_from_tcp @ transforms.inverse(self.tool_from_tcp))
+
+    def hull(self, world_from_tcp: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Its hull (see :mod:`magic_server.scene_change`) with the hand at a pose."""
+        return scene_change.hull(transforms.apply(self.pose(world_from_tcp), self.mesh.vertices))
+
+    def sees(self, item: SceneObject, world_from_tcp: NDArray[np.float64], known: Collection[str]) -> bool:
+        """Whether an object, as it is seen, is this tool in the hand, whatever its id; ``known``: ids of other things, which are none."""
+        if item.id == self.tool.id:
+            return True
+        return item.id not in known and scene_change.contained(hull_of(item), self.hull(world_from_tcp), scene_change.ABOUT)
+
+    def at(self, world_from_tcp: NDArray[np.float64]) -> SceneObject:
+        """The object with the hand at a pose; the points seen of it before are left out."""
+        item, pose = copy.copy(self.tool), self.pose(world_from_tcp)
+        moved = pose @ transforms.inverse(conversions.pose_from_msg(item.pose))
+        item.pose = conversions.pose_to_msg(pose)
+        item.box_pose = conversions.pose_to_msg(moved @ conversions.pose_from_msg(item.box_pose))
+        item.cloud = PointCloud2(header=item.cloud.header)
+        item.hanging = True
+        return item
+
+
+class HeldStages(Stages):
+    """The stages of a run with the tool in the hand: nothing is grasped, and the tool is matched by its view from before.
+
+    ``known``: ids of the other things.  ``before``: whose contacts are kept, for a scene that is as it was; else the target is looked at
+    and matched anew.
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        token: Token,
+        run: str,
+        needs_verifier: bool,
+        held: Held,
+        known: Collection[str],
+        since: float,
+        before: Stages | None = None,
+    ) -> None:
+        super().__init__(server, token, run, needs_verifier, heatmap=False, since=since)
+        self.held, self._known = held, frozenset(known)
+        self._kept = before
+        self._tool = held.tool
+
+    def perceive(self, request: pipeline.Request, timeout: float) -> tuple[pipeline.Request, str]:
+        """Take the objects there are, the tool where the hand has it."""
+        if self._kept is None:
+            super().perceive(request, timeout)
+        else:
+            self.scene, self._seen, self.strategy, self._minds = self._kept.scene, self._kept._seen, request.strategy, self._kept._minds
+        self._tool = self.held.at(self._server.hand())
+        self.scene = self._without_tool(self.scene)
+        return request, ""
+
+    def _named(self, request: pipeline.Request) -> tuple[pipeline.Request, str]:
+        return request, ""  # both are known by their ids
+
+    def _without_tool(self, scene: SceneObjectArray) -> SceneObjectArray:
+        """The scene without what is in the hand, whatever its id."""
+        hand = self._server.hand()
+        rest = copy.copy(scene)
+        rest.objects = [o for o in scene.objects if not self.held.sees(o, hand, self._known)]
+        return rest
+
+    def _enough(self, scene: SceneObjectArray, request: pipeline.Request) -> bool:
+        return any(o.id == request.target_id for o in scene.objects)
+
+    def _unknown(self, scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
+        return None  # a target that is hidden may come in sight
+
+    def _tool_of(self, trial: pipeline.Trial) -> SceneObject:
+        return self._tool
+
+    def _obstacles(self, trial: pipeline.Trial, matches: pipeline.Matches) -> list[SceneObject]:
+        return [o for o in self.scene.objects if o.id != matches.target_id]
+
+    def match(self, request: pipeline.Request, timeout: float) -> pipeline.Matches:
+        """The contacts kept, or those of the tool's view and the target that is seen now."""
+        if self._kept is not None:
+            known = self._kept.matches
+            candidates = [c for c in known.candidates if c.tool_id == self.held.tool.id]
+            sentence = f"{len(candidates)} candidates for {known.target_id}, the tool is in the hand"
+            self.matches = pipeline.Matches(candidates, known.target_id, known.features, None, sentence, known.doubts)
+            return self.matches
+        server = self._server
+        message = MatchContact.Request(
+            strategy=request.strategy, tool_views=[self.held.tool.view], target_id=request.target_id, top_k=request.top_k
+        )
+        deadline = time.monotonic() + min(timeout, server.settings.match)
+        with self._minding(server.planner, *self._verifier()):
+            answer = server.matcher.call(message, max(0.0, deadline - time.monotonic()), self._token, server.settings.presence)
+        if answer.code != Code.OK or not answer.candidates:
+            raise MagicError(code_of(answer.code or Code.NO_MATCH), answer.message or "no contact was found")
+        self._same_target(request.target_id)
+        for candidate in answer.candidates:
+            candidate.tool_id = self.held.tool.id
+            point = transforms.apply(
+                conversions.pose_from_msg(self._tool.pose), conversions.pose_from_msg(candidate.tool.object_from_contact)[:3, 3]
+            )
+            candidate.point.x, candidate.point.y, candidate.point.z = map(float, point)
+        sentence = f"{len(answer.candidates)} candidates for {request.target_id}, the tool is in the hand, {answer.features} features"
+        self.matches = pipeline.Matches(answer.candidates, request.target_id, answer.features, None, sentence)
+        return self.matches
+
+    def _same_target(self, target_id: str) -> None:
+        """The contact on the target is told in its own frame, which the matcher may have from a newer scene than this run's: take that
+        one where the frame is another; raises STALE_DATA where the target is gone from it."""
+        newest = self._server.scene
+        if newest is None or newest is self._seen:
+            return
+        found = next((o for o in newest.objects if o.id == target_id), None)
+        if found is None:
+            raise MagicError(Code.STALE_DATA, f"{target_id} has gone while its contact was looked for")
+        self._take(newest, time.monotonic())
+        self.scene = self._without_tool(self.scene)

@@ -1,0 +1,60 @@
+"""Whether objects have moved, whatever frame and mesh another look gave them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magic_core import shapes, transforms
+from magic_core.errors import Code, MagicError
+from magic_server import scene_change
+from magic_server.testing import fakes
+
+
+def placed(world_from_object, mesh=None):
+    item = fakes.scene().objects[0]
+    return replace(item, mesh=mesh or item.mesh, world_from_object=world_from_object)
+
+
+def moved(before, after):
+    return scene_change.distance(*(scene_change.hulls([item])[item.id] for item in (before, after)))
+
+
+def test_a_shift_is_measured_as_it_is():
+    pose = transforms.make(translation=[0.4, 0.1, 0.025])
+    for shift in ([0.03, 0, 0], [0, -0.02, 0.01], [0.001, 0.001, 0]):
+        found = moved(placed(pose), placed(transforms.make(translation=shift) @ pose))
+        # To within the spacing of 200 directions on the sphere: about 14 degrees between neighbours.
+        assert found == pytest.approx(np.linalg.norm(shift), rel=0.02)
+
+
+def test_another_frame_of_the_same_thing_is_no_move():
+    mesh = shapes.make("l_hook", 1).mesh
+    pose = transforms.make(translation=[0.4, 0.1, 0.0])
+    turned = transforms.from_rpy(0.0, 0.0, np.pi)
+    same = placed(pose @ transforms.inverse(turned), mesh.transformed(turned))
+    assert moved(placed(pose, mesh), same) < 1e-12
+
+
+def test_a_turn_of_a_long_thing_is_a_move():
+    mesh = shapes.make("l_hook", 1).mesh
+    pose = transforms.make(translation=[0.4, 0.1, 0.0])
+    assert moved(placed(pose, mesh), placed(pose @ transforms.from_rpy(0.0, 0.0, 0.2), mesh)) > 0.02
+
+
+def test_a_scene_that_is_no_longer_is_refused():
+    before = scene_change.hulls(fakes.scene().objects)
+    scene_change.check(before, before, 0.0)
+    only_one = scene_change.hulls(fakes.scene(("object_1",)).objects)
+    three = scene_change.hulls(fakes.scene(("object_1", "object_2", "object_3")).objects)
+    nowhere = scene_change.hulls([placed(np.full((4, 4), np.nan))])
+    for old, new, says in (
+        (before, only_one, "gone since the plan: 'object_2'"),
+        (before, three, "come since the plan: 'object_3'"),
+        (only_one, nowhere, "object_1 has moved since the plan, in mm: nan"),
+    ):
+        with pytest.raises(MagicError) as caught:
+            scene_change.check(old, new, 1.0)
+        assert caught.value.code == Code.STALE_DATA
+        assert says in caught.value.message
+    scene_change.check(before, only_one, 0.0, meant={"object_2"})

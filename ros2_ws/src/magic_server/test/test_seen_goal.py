@@ -1,0 +1,257 @@
+"""Goals asked of what cameras see: yes, no, or that it cannot be told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from magic_core import goal, transforms
+from magic_core.mesh import from_trimesh
+from magic_server.seen_goal import Hand, Sight, Thing, judge
+from magic_server.testing import fakes
+
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+NAMES = {"tool": "object_1", "target": "object_2"}
+CYLINDER = from_trimesh(trimesh.creation.cylinder(0.03, 0.06))
+RING = from_trimesh(trimesh.creation.annulus(0.03, 0.035, 0.02))
+UPRIGHT = RING.transformed(transforms.from_rpy(0.0, np.pi / 2, 0.0))
+
+
+def at(x, y=0.0, z=0.03, mesh=CYLINDER):
+    return Thing.of(mesh, transforms.make(translation=[x, y, z]))
+
+
+#: The phases of a pull.
+PULL = ("approach", "contact", "goal", "retreat")
+#: A hand that has let go, and gone away.
+AWAY = Hand(True, 0.08)
+
+
+def asked(test, before, now, hand=Hand(False), then=None, seconds=1.0, strategy=None, phases=PULL, accuracy=0.005):
+    strategy = strategy or fakes.strategy()
+    strategy = replace(strategy, goal=goal.shipped(test) if isinstance(test, str) else test)
+    looks = Sight(before, 90.0), Sight(now if then is None else then, 100.0), Sight(now, 100.0 + seconds)
+    return judge(strategy, NAMES, phases, looks, TABLE, hand, accuracy)
+
+
+def tree(data, **beside):
+    return goal.from_data({"test": data, **beside})
+
+
+BESIDE = {"object_1": at(0.3, 0.2), "object_2": at(0.5)}
+
+
+@pytest.mark.parametrize(
+    "place, met, says",
+    [
+        ((0.29, 0.002), True, "moved 210 mm of 200"),
+        ((0.35, 0.002), False, "moved 150 mm of 200"),
+        ((0.298, 0.002), None, "moved 202 mm of 200, known to 5 mm"),
+        ((0.29, 0.03), False, "drifted 30 mm sideways, allowed 15"),
+        ((0.29, 0.012), None, "drifted 12 mm sideways, allowed 15, known to 5 mm"),
+    ],
+)
+def test_a_pull_is_seen(place, met, says):
+    found = asked("hook", BESIDE, {**BESIDE, "object_2": at(*place)})
+    assert found.met is met and says in found.message, found.message
+
+
+def test_what_is_not_seen_any_more_is_not_said_to_be_met_or_missed():
+    found = asked("hook", BESIDE, {"object_1": at(0.3, 0.2)})
+    assert found.met is None and "object_2 is not seen" in found.message
+
+
+def test_what_is_seen_in_part_is_known_less_well():
+    half = replace(at(0.27), points=at(0.27).points[at(0.27).points[:, 0] > 0.27])
+    found = asked("hook", BESIDE, {**BESIDE, "object_2": half})
+    assert found.met is None and "known to 20 mm" in found.message
+
+
+def test_what_rolls_on_is_seen_to_roll():
+    found = asked("hook", BESIDE, {**BESIDE, "object_2": at(0.2)}, then={**BESIDE, "object_2": at(0.28)}, seconds=0.1)
+    assert found.met is False and "moved 80 mm in 0.1 s" in found.message
+
+
+ROD = from_trimesh(trimesh.creation.box([0.2, 0.012, 0.012]))
+STAND = {"object_1": at(0.3, 0.2, 0.01, RING), "object_2": at(0.5, 0.0, 0.4, ROD)}
+
+
+@pytest.mark.parametrize(
+    "where, hand, met, says",
+    [
+        ((0.5, 0.0, 0.376), AWAY, True, "let go"),
+        ((0.5, 0.0, 0.376), AWAY, True, "the hand is 80 mm from where it let go, needed 30"),
+        ((0.5, 0.0, 0.376), Hand(True, 0.01), False, "the hand is 10 mm from where it let go, needed 30"),
+        ((0.5, 0.0, 0.376), Hand(True), None, "how far the hand has gone away is not known"),
+        ((0.5, 0.0, 0.376), Hand(False), False, "in the hand"),
+        ((0.5, 0.05, 0.01), AWAY, False, "10 mm above the table"),
+        # High up, with nothing near that could hold it: something is wrong with what is seen.
+        ((0.5, 0.2, 0.3), AWAY, False, "mm from the target"),
+    ],
+)
+def test_a_ring_on_a_rod_is_seen_to_hang(where, hand, met, says):
+    phases = ("grasp", "transfer", "contact", "release", "retreat")
+    found = asked("hang", STAND, {**STAND, "object_1": at(*where, UPRIGHT)}, hand, phases=phases)
+    assert found.met is met and says in found.message, found.message
+
+
+def test_what_hangs_beside_something_else_may_hang_on_that():
+    now = {**STAND, "object_1": at(0.5, 0.0, 0.376, UPRIGHT), "object_3": at(0.5, 0.0, 0.31)}
+    found = asked("hang", STAND, now, AWAY)
+    assert found.met is None and "from the object_3" in found.message
+
+
+def test_what_no_camera_tells_is_said():
+    found = asked(tree({"upright": {"what": "target"}}), BESIDE, BESIDE)
+    assert found.met is None and "no camera tells" in found.message
+    assert asked("drive", BESIDE, {**BESIDE, "object_2": at(0.495)}).met is None  # 5 mm are not seen
+
+
+def test_of_a_row_the_target_alone_is_seen():
+    gone = {**BESIDE, "object_2": at(0.35)}
+    assert asked("sweep", BESIDE, BESIDE).met is False  # of the row it is one, and did not go along
+    found = asked("sweep", BESIDE, gone)
+    assert found.met is None and "of what stands beside the target nothing is looked at" in found.message
+    row = {"moved": {"what": "row", "along": "pull", "by": 0.1}}
+    assert asked(tree(row), BESIDE, gone).met is True, "where nothing is put beside it, it is the row"
+    assert asked(tree({"not": row}, trial={"row": {"others": 1}}), BESIDE, gone).met is None
+
+
+STILL = {"stayed": {"what": "target", "within": 0.02}}
+MOVED = {"moved": {"what": "target", "along": "up", "by": 0.1}}
+UNKNOWN = {"upright": {"what": "target"}}
+ENCLOSES = {"encloses": {"along": "pull"}}
+TURNS = {"at_rest": {"what": "target", "below": 0.05, "turning": 0.1}}
+
+
+@pytest.mark.parametrize(
+    "data, met",
+    [
+        ({"all": [STILL, MOVED]}, False),
+        ({"all": [STILL, UNKNOWN]}, None),
+        ({"all": [UNKNOWN, STILL]}, None),
+        ({"all": [MOVED, UNKNOWN]}, False),
+        ({"all": [UNKNOWN, MOVED]}, False),
+        ({"any": [STILL, UNKNOWN]}, True),
+        ({"any": [UNKNOWN, STILL]}, True),
+        ({"any": [MOVED, UNKNOWN]}, None),
+        ({"not": MOVED}, True),
+        ({"not": UNKNOWN}, None),
+        ({"all": [{"any": [STILL, UNKNOWN]}, STILL]}, True),
+        ({"inside": {"what": "target", "low": [0.4, -0.1, 0.0], "high": [0.6, 0.1, 0.1], "of": "world"}}, True),
+        # What only a simulation tries decides neither an 'any' nor a 'not', wherever below it stands.
+        (ENCLOSES, None),
+        ({"any": [ENCLOSES, MOVED]}, None),
+        ({"any": [ENCLOSES, STILL]}, True),
+        ({"any": [{"all": [ENCLOSES, STILL]}, MOVED]}, None),
+        ({"any": [{"all": [ENCLOSES, MOVED]}, MOVED]}, False),
+        ({"any": [ENCLOSES]}, None),
+        ({"all": [{"any": [ENCLOSES]}, STILL]}, None),
+        ({"not": ENCLOSES}, None),
+        ({"not": {"all": [STILL, ENCLOSES]}}, None),
+        ({"not": {"all": [MOVED, ENCLOSES]}}, True),
+        ({"all": [STILL, TURNS]}, True),
+        ({"not": TURNS}, None),
+        ({"any": [TURNS, MOVED]}, None),
+    ],
+)
+def test_groups_and_their_opposites(data, met):
+    found = asked(tree(data), BESIDE, BESIDE)
+    assert found.met is met, found.message
+
+
+def test_what_is_left_out_of_an_all_is_said():
+    push = {"after": {"push": {"what": "target", "speed": 0.1}}, "all": [STILL]}
+    found = asked(tree({"all": [STILL, TURNS, ENCLOSES, push]}), BESIDE, BESIDE)
+    assert found.met is True
+    said = found.message.partition("not looked at: ")[2]
+    for words in ("how fast the target turns", "that pulled on along the pull", "how it is after the target was pushed from all sides"):
+        assert words in said, found.message
+    assert "not looked at" not in asked(tree({"all": [ENCLOSES, MOVED]}), BESIDE, BESIDE).message
+    assert asked(tree(push), BESIDE, BESIDE).met is None
+
+
+FAR = {"moved": {"what": "target", "along": "pull", "by": 0.1}}
+TOUCHES = {"touching": {"what": "target", "whom": "tool"}}
+
+
+@pytest.mark.parametrize(
+    "phase, phases, met",
+    [
+        ("goal", PULL, True),
+        ("contact", PULL, None),
+        ("approach", PULL, None),
+        ("retreat", PULL, None),
+        ("goal", ("grasp", "transfer", "contact", "goal", "release", "retreat"), None),
+        ("release", ("grasp", "transfer", "contact", "goal", "release", "retreat"), True),
+        # The goal that no phase has is the motion's end.
+        ("goal", ("approach", "contact"), True),
+        ("contact", ("approach", "contact"), True),
+        ("goal", (), True),
+    ],
+)
+def test_of_phases_the_end_of_the_last_in_which_the_tool_acts_is_looked_at(phase, phases, met):
+    gone = {**BESIDE, "object_2": at(0.35)}
+    test = {**FAR, "after": {"phase": phase}}
+    assert asked(tree(test), BESIDE, gone, phases=phases).met is met
+    assert asked(tree({"not": test}), BESIDE, gone, phases=phases).met is (None if met is None else False)
+    assert asked(tree({"all": [test, MOVED]}), BESIDE, gone, phases=phases).met is False
+    # So are parts of phases.
+    touched = {"object_1": at(0.35 + 0.06), "object_2": at(0.35)}
+    assert asked(tree({**TOUCHES, "ever": {"phase": phase}}), BESIDE, touched, phases=phases).met is met
+
+
+def test_what_is_seen_afterwards_may_have_been_otherwise_before():
+    for often in ("ever", "always"):
+        apart, close = ({"object_1": at(x), "object_2": at(0.35)} for x in (0.6, 0.41))
+        test = tree({**TOUCHES, often: {"phase": "goal"}})
+        assert asked(test, BESIDE, apart).met is (None if often == "ever" else False)
+        assert asked(test, BESIDE, close).met is (True if often == "ever" else None)
+
+
+@pytest.mark.parametrize(
+    "leaf, place, yes",
+    [
+        ({"moved": {"what": "target", "along": "pull", "by": 0.1}}, (0.39,), True),
+        ({"moved": {"what": "target", "along": "pull", "by": 0.1}}, (0.41,), False),
+        ({"moved": {"what": "target", "along": "left", "by": 0.1}}, (0.5, -0.11), True),
+        ({"moved": {"what": "target", "along": [0, 0, 2], "by": 0.1}}, (0.5, 0.0, 0.14), True),
+        ({"stayed": {"what": "target", "within": 0.01}}, (0.5, 0.009), True),
+        ({"stayed": {"what": "target", "within": 0.01}}, (0.5, 0.011), False),
+        ({"drift": {"what": "target", "along": "pull", "below": 0.02}}, (0.3, 0.019), True),
+        ({"drift": {"what": "target", "along": "pull", "below": 0.02}}, (0.3, -0.021), False),
+        ({"drift": {"what": "target", "along": "pull", "below": 0.5, "of": "radius"}}, (0.3, 0.0149), True),
+        ({"drift": {"what": "target", "along": "pull", "below": 0.5, "of": "radius"}}, (0.3, 0.0151), False),
+        ({"drift": {"what": "target", "along": "down", "below": 0.02}}, (0.485, 0.015), False),
+        ({"above": {"what": "target", "height": 0.2}}, (0.5, 0.0, 0.21), True),
+        ({"above": {"what": "target", "height": 0.2}}, (0.5, 0.0, 0.19), False),
+        ({"inside": {"what": "target", "low": [-0.2, -0.1, -1], "high": [0, 0.1, 1]}}, (0.35, 0.05), True),
+        ({"inside": {"what": "target", "low": [-0.2, -0.1, -1], "high": [0, 0.1, 1]}}, (0.35, 0.15), False),
+        ({"inside": {"what": "target", "low": [0.3, -0.1, 0], "high": [0.4, 0.1, 1], "of": "world"}}, (0.35, 0.05), True),
+    ],
+)
+def test_places_tell_what_they_tell(leaf, place, yes):
+    now = {**BESIDE, "object_2": at(*place)}
+    found = asked(tree(leaf), BESIDE, now, accuracy=1e-5)
+    assert found.met is yes, found.message
+    assert asked(tree({"not": leaf}), BESIDE, now, accuracy=1e-5).met is not yes
+    assert asked(tree(leaf), BESIDE, now, accuracy=1.0).met is None, "nearer to the bound than it is known"
+
+
+def test_two_looks_tell_how_fast_things_are():
+    rest = tree({"at_rest": {"what": "target", "below": 0.01}})
+    for place, met in ((0.502, True), (0.504, True), (0.506, False)):
+        found = asked(rest, BESIDE, {**BESIDE, "object_2": at(place)}, then=BESIDE, seconds=0.5, accuracy=1e-5)
+        assert found.met is met, found.message
+
+
+def test_what_is_measured_by_the_target_asks_that_it_was_seen():
+    before = {"object_1": BESIDE["object_1"]}
+    for test in (
+        FAR,
+        {"drift": {"what": "tool", "along": "left", "below": 0.5, "of": "radius"}},
+        {"inside": {"what": "tool", "low": [-1, -1, -1], "high": [1, 1, 1], "of": "start"}},
+    ):
+        found = asked(tree(test), before, BESIDE)
+        assert found.met is None and "object_2 is not seen" in found.message

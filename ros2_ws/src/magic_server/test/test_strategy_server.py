@@ -1,0 +1,801 @@
+"""The strategy server against stand-ins of the other nodes."""
+
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.action.client import ClientGoalHandle
+from rclpy.task import Future
+from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory
+
+from magic_bringup.graph import Process, executable
+from magic_core import conversions, qos, transforms
+from magic_core import strategy as strategies
+from magic_core.errors import Code, MagicError
+from magic_interfaces.action import PlanMotion, VerifyMotion
+from magic_interfaces.srv import MatchContact
+from magic_server import pipeline, remote
+from magic_server.permission import ARM_UNKNOWN
+from magic_server.remote import Token
+from magic_server.strategy_server import complaint_code
+from magic_server.testing import fakes
+from magic_server.testing.bench import DEADLINE, Bench
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("strategies")
+    strategies.save(fakes.strategy("fake"), root / "fake")
+    strategies.save(fakes.strategy("dynamic", simulatable=False), root / "dynamic")
+    return root
+
+
+@pytest.fixture(scope="module")
+def shared(folder):
+    bench = Bench(folder)
+    bench.fakes.publish(fakes.scene())
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def bench(shared):
+    shared.fakes.clear()
+    shared.feedback.clear()
+    for messages in shared.messages.values():
+        messages.clear()
+    return shared
+
+
+def test_a_verified_tool_trajectory_is_published(bench):
+    result, status = bench.run()
+    assert (result.code, result.verified, status) == (0, True, GoalStatus.STATUS_SUCCEEDED), result.message
+    assert (result.tool_id, result.target_id, result.features, result.simulations) == ("object_1", "object_2", "fake", 1)
+    assert [r.code for r in result.candidates] == [0]
+    assert result.times.total > 0
+    bench.wait(lambda: bench.messages["tool"] and bench.messages["markers"] and bench.messages["frames"])
+    frames = {(t.header.frame_id, t.child_frame_id) for t in bench.messages["frames"][-1].transforms}
+    assert frames == {("panda_link0", "object_1/contact"), ("panda_link0", "object_2/contact")}
+    assert bench.messages["tool"][0].joint_names == ["object_1"]
+    assert not bench.messages["arm"]
+    assert {f.stage for f in bench.feedback} == {"perceive", "match", "plan", "verify"}
+
+
+def test_a_verified_arm_trajectory_is_published(bench):
+    result, _ = bench.run(variant="arm")
+    assert result.code == 0, result.message
+    bench.wait(lambda: bench.messages["arm"])
+    assert len(bench.messages["arm"][0].points) == len(fakes.plan("arm").arm_motion.times)
+    assert not bench.messages["tool"]
+
+
+def test_what_fails_with_a_doubtful_reconstruction_says_so(bench):
+    scene = fakes.scene()
+    doubtful = replace(scene.objects[0], confidence=0.03, seen_share=0.41)
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+    assert "doubtful" not in bench.run()[0].message
+    bench.fakes.publish(replace(scene, objects=(doubtful, *scene.objects[1:])))
+    bench.wait(lambda: bench.server.scene is not None and bench.server.scene.objects[0].confidence < 0.1)
+    message = bench.run()[0].message
+    assert "; object_1 is a doubtful reconstruction (confidence 0.03, 41 % of its surface seen)" in message
+    assert "object_2 is" not in message
+
+
+def test_nothing_unverified_is_published(bench):
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+    result, status = bench.run()
+    assert (result.code, result.verified, status) == (Code.NO_CANDIDATE_SUCCEEDED, False, GoalStatus.STATUS_ABORTED)
+    # The mirrored second candidate is tried both ways.
+    assert [(r.reflection, r.code, r.message) for r in result.candidates] == [("keep", Code.DRIFT, "it drifted")] * 2 + [
+        ("turn", Code.DRIFT, "it drifted"),
+        ("keep", Code.DRIFT, "it drifted"),
+    ]
+    bench.wait(lambda: bench.messages["markers"])
+    texts = [m.text for m in bench.messages["markers"][-1].markers if m.ns == "reasons"]
+    assert len(texts) == 3
+    assert all("DRIFT" in t for t in texts)
+    assert not bench.messages["tool"]
+    assert not bench.messages["arm"]
+
+
+def test_what_stands_published_says_what_it_rests_on(bench):
+    handle = bench.send(variant="arm")
+    result = bench.result(handle.get_result_async()).result
+    assert (result.success_rate, result.rate_low, result.rate_high, result.rollouts) == (1.0, 0.86, 1.0, 1)
+    assert (result.candidates[-1].rate_low, result.candidates[-1].rollouts) == (0.86, 1)
+    assert result.notes == [ARM_UNKNOWN]  # nobody tells joint_states here
+    assert ARM_UNKNOWN in result.message
+    bench.wait(lambda: bench.valid["arm"] and bench.messages["state"] and bench.messages["state"][-1].valid)
+    state, trajectory = bench.messages["state"][-1], bench.valid["arm"]
+    assert state.run_id == bytes(handle.goal_id.uuid).hex()
+    assert state.stamp == trajectory.header.stamp
+    assert trajectory.header.stamp.sec > 0
+    assert trajectory.header.frame_id == state.header.frame_id == "panda_link0"
+    assert (state.strategy, state.variant, state.tool_id, state.target_id) == ("fake", "arm", "object_1", "object_2")
+    assert (state.rate_low, state.rollouts, state.notes, state.reason) == (0.86, 1, [ARM_UNKNOWN], "")
+    # It is said again and again: who hears nothing any more knows that the server has gone.
+    count = len(bench.messages["state"])
+    bench.wait(lambda: len(bench.messages["state"]) > count + 1)
+    assert bench.messages["state"][-1].header.stamp != state.header.stamp
+
+
+def elsewhere(scene, by):
+    """The scene with its first object moved along x, m."""
+    first = scene.objects[0]
+    pose = transforms.make(translation=[by, 0.0, 0.0]) @ first.world_from_object
+    return replace(scene, objects=(replace(first, world_from_object=pose), *scene.objects[1:]))
+
+
+def sees(bench, scene):
+    """Wait until the server has heard of a scene."""
+    came = bench.server.scene_came
+    bench.fakes.publish(scene)
+    bench.until(lambda: bench.server.scene_came > came)
+
+
+@pytest.mark.parametrize(
+    "now, says",
+    [
+        (lambda bench: sees(bench, elsewhere(fakes.scene(), 0.4)), "object_1 has moved since the plan, in mm: 39"),
+        (lambda bench: sees(bench, fakes.scene(("object_2",))), "objects gone since the plan: 'object_1'"),
+        (lambda bench: setattr(bench.server.scene.header.stamp, "sec", 10**9), "age of the objects in s, by stamp"),
+        (lambda bench: setattr(bench.server.scene.header.stamp, "sec", 2 * 10**9), "age of the objects in s, by stamp: -"),
+        (lambda bench: setattr(bench.server, "scene_came", bench.server.scene_came - 700.0), "age of the objects in s, by arrival"),
+    ],
+    ids=["moved", "gone", "of 2001", "of the future", "not seen any more"],
+)
+def test_a_scene_that_is_another_one_by_then_is_not_published_for(bench, now, says):
+    def verify(goal, canceled):
+        now(bench)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    sees(bench, fakes.scene())
+    bench.fakes.on_verify = verify
+    try:
+        result, status = bench.run()
+        assert (result.code, result.verified, status) == (Code.STALE_DATA, False, GoalStatus.STATUS_ABORTED), result.message
+        assert result.message.startswith("verified (passed), but not published: ")
+        assert says in result.message
+        assert not bench.valid["tool"]
+    finally:
+        bench.fakes.clear()
+        sees(bench, fakes.scene())
+    bench.run()  # proves that the channel works and that nothing came before it
+    bench.wait(lambda: bench.messages["tool"])
+    assert len(bench.messages["tool"]) == 1
+
+
+def test_what_stands_published_is_taken_back_when_the_scene_is_another_one(bench):
+    sees(bench, fakes.scene())
+    try:
+        bench.run()
+        bench.wait(lambda: bench.valid["tool"])
+        sees(bench, elsewhere(fakes.scene(), 0.01))
+        assert bench.server.publication.standing is not None
+        sees(bench, elsewhere(fakes.scene(), 0.05))
+        bench.wait(lambda: not bench.valid["tool"] and not bench.messages["state"][-1].valid)
+        assert "object_1 has moved" in bench.messages["state"][-1].reason
+    finally:
+        sees(bench, fakes.scene())
+
+
+@pytest.mark.parametrize("service", ["match", "plan", "verify"])
+def test_of_two_servers_nobody_knows_whose_answer_comes(bench, service):
+    """Published nine times of ten against the true verifier's no, it was."""
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+    other = fakes.FakeServers("other", services=(service,), context=bench.context)
+    bench.executor.add_node(other)
+    name = {"match": "matcher", "plan": "planner", "verify": "verifier"}[service]
+    try:
+        bench.until(lambda: len(bench.server.servers()[name]) == 2)
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NOT_ALONE, False)
+        assert "servers of /" in result.message
+        assert "2 (allowed: 1)" in result.message
+        assert not bench.fakes.goals
+        assert not bench.messages["tool"]
+    finally:
+        bench.executor.remove_node(other)
+        other.destroy_node()
+        bench.until(lambda: len(bench.server.servers()[name]) == 1)
+
+
+def test_a_second_verifier_that_comes_meanwhile_ends_the_run(bench):
+    others = []
+
+    def verify(goal, canceled):
+        others.append(fakes.FakeServers("other", services=("verify",), context=bench.context))
+        bench.until(lambda: len(bench.server.servers()["verifier"]) == 2)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    try:
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NOT_ALONE, False), result.message
+        assert not bench.messages["tool"]
+    finally:
+        for other in others:
+            other.destroy_node()
+        bench.until(lambda: len(bench.server.servers()["verifier"]) == 1)
+
+
+def test_a_verifier_that_was_replaced_since_is_not_the_one_that_judged(bench, monkeypatch):
+    execute = pipeline.Run.execute
+
+    def replaced_afterwards(run):
+        outcome = execute(run)
+        return replace(outcome, verdict=replace(outcome.verdict, server=b"another"))
+
+    monkeypatch.setattr(pipeline.Run, "execute", replaced_afterwards)
+    result, _ = bench.run()
+    assert (result.code, result.verified) == (Code.NOT_ALONE, False), result.message
+    assert not bench.messages["tool"]
+
+
+def test_an_arm_that_starts_in_a_collision_is_not_tried_again(bench):
+    bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(code=int(Code.START_IN_COLLISION), message="hand in the table")
+    result, _ = bench.run(variant="arm")
+    assert (result.code, result.message) == (Code.START_IN_COLLISION, "hand in the table")
+    assert len(result.candidates) == 1
+
+
+def test_an_arm_beyond_its_own_limits_is_not_tried_again(folder):
+    from sensor_msgs.msg import JointState
+
+    bench = Bench(folder)
+    states = bench.node.create_publisher(JointState, "joint_states", qos.RELIABLE)
+    try:
+        bench.fakes.publish(fakes.scene())
+        bench.until(lambda: states.get_subscription_count() > 0)
+        states.publish(JointState(name=list(fakes.JOINTS), position=[0.0] * 3 + [0.5] + [0.0] * 3))
+        bench.until(lambda: bench.server.joints.all())
+        bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(code=int(Code.JOINT_LIMIT), message="start, panda_joint4")
+        result, _ = bench.run(variant="arm")
+        assert (result.code, len(result.candidates)) == (Code.JOINT_LIMIT, 1)
+        assert "panda_joint4 at: 0.5 (allowed: -3.0718 to -0.0698)" in result.message
+    finally:
+        bench.close()
+
+
+def test_a_success_rate_below_the_required_one_is_not_published(folder):
+    bench = Bench(folder, required_rate=0.9)
+    try:
+        bench.fakes.publish(fakes.scene())
+        result, _ = bench.run()
+        assert (result.code, result.verified, result.rate_low) == (Code.NOT_SURE_ENOUGH, False, 0.86)
+        assert "0.86" in result.message
+        assert not bench.messages["tool"]
+    finally:
+        bench.close()
+
+
+def told(bench, world_from_base):
+    """Whether the server has heard of a transform."""
+    try:
+        found = bench.server._transforms.buffer.lookup("world", "panda_link0")
+    except MagicError:
+        return False
+    return np.allclose(found, world_from_base, atol=1e-9)
+
+
+def test_objects_in_another_frame_are_carried_into_the_robots_base(folder):
+    from geometry_msgs.msg import TransformStamped
+
+    bench = Bench(folder)
+    static = bench.node.create_publisher(TFMessage, "/tf_static", qos.STATIC_TF)
+    turned, world_from_base = (transforms.from_rpy(0.0, 0.0, np.deg2rad(a), [0.05, -0.06, 0.0]) for a in (10.0, 0.5))
+    seen = fakes.scene()
+    there = [replace(o, world_from_object=world_from_base @ o.world_from_object) for o in seen.objects]
+    # The table of the objects' own frame lies 20 mm lower there; only a turn about z, so that its normal stays.
+    in_world = replace(seen, objects=tuple(there), table=np.array([0.0, 0.0, 1.0, 0.02]), frame_id="world")
+
+    def match(request):
+        found = conversions.candidate_to_msg(fakes.candidate(), there[0].world_from_object)  # the matcher sees them as they come
+        return MatchContact.Response(candidates=[found], target_id="object_2", features="fake")
+
+    try:
+        bench.fakes.on_match = match
+        bench.fakes.publish(in_world)
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NO_TRANSFORM, False)
+        assert "'world'" in result.message
+        assert "'panda_link0'" in result.message
+        for frame, told_pose, code in (
+            ("", turned, Code.BAD_REQUEST),
+            ("world", turned, Code.BAD_REQUEST),
+            ("world", world_from_base, Code.OK),
+        ):
+            head = conversions.header("world")
+            pose = conversions.transform_to_msg(told_pose)
+            static.publish(TFMessage(transforms=[TransformStamped(header=head, child_frame_id="panda_link0", transform=pose)]))
+            bench.until(lambda: told(bench, told_pose))
+            sees(bench, replace(in_world, frame_id=frame))
+            bench.fakes.goals.clear()
+            result, _ = bench.run()
+            assert result.code == code, result.message
+        goal = next(goal for name, goal in bench.fakes.goals if name == "verify_motion")
+        for message, item in zip((goal.tool, goal.target), seen.objects):
+            np.testing.assert_allclose(conversions.pose_from_msg(message.pose), item.world_from_object, atol=1e-9)
+            assert message.cloud.header.frame_id == "panda_link0"
+        np.testing.assert_allclose(goal.table.coef, [0.0, 0.0, 1.0, 0.02], atol=1e-12)
+        contact = seen.objects[0].world_from_object @ fakes.candidate().tool.object_from_contact
+        np.testing.assert_allclose([goal.candidate.point.x, goal.candidate.point.y, goal.candidate.point.z], contact[:3, 3], atol=1e-9)
+        bench.wait(lambda: bench.valid["tool"])
+        assert bench.valid["tool"].header.frame_id == "panda_link0"
+    finally:
+        bench.close()
+
+
+def test_a_killed_server_takes_back_what_it_published_when_it_starts_again(folder, tmp_path):
+    """Until then its silence says so, and who comes late gets nothing of it."""
+    bench = Bench(folder)
+    process = None
+    try:
+        # The server of the bench is put out of the way: the one at work here is a process, which can be killed.
+        bench.executor.remove_node(bench.server)
+        bench.server._server.destroy()
+        bench.server.destroy_node()
+        context = bench.context.get_domain_id()
+        env = {**os.environ, "ROS_DOMAIN_ID": str(context)}
+        command = [str(executable("magic_server", "strategy_server")), "--ros-args"]
+        command += ["-p", f"strategies:={folder}", "-p", "objects_age:=600.0"]
+
+        def start():
+            states = len(bench.messages["state"])
+            process = Process.start("strategy_server", command, tmp_path / "server.log", env)
+            bench.until(lambda: len(bench.messages["state"]) > states, 60.0)
+            # One that was killed seems to be there until its lease is over, and a goal sent to it alone is lost.
+            bench.until(lambda: bench.node.count_services("/run_strategy/_action/send_goal") == 1, 60.0)
+            bench.until(bench.client.server_is_ready, 60.0)
+            return process
+
+        process = start()
+        bench.fakes.publish(fakes.scene())
+        result, _ = bench.run()
+        assert result.verified, result.message
+        bench.wait(lambda: bench.valid["tool"] and bench.messages["state"][-1].valid)
+        process.signal(signal.SIGKILL)
+        assert process.wait(10.0) == -signal.SIGKILL
+        assert bench.valid["tool"]  # nobody has taken it back
+        process = start()
+        bench.wait(lambda: not bench.valid["tool"])
+        assert "has just started" in bench.messages["state"][-1].reason
+        # And at an orderly end it takes back itself.
+        bench.run()
+        bench.wait(lambda: bench.valid["tool"])
+        process.signal(signal.SIGINT)
+        bench.wait(lambda: not bench.valid["tool"])
+        assert process.wait(20.0) == 0
+    finally:
+        if process is not None:
+            process.signal(signal.SIGKILL)
+            process.wait(10.0)
+        bench.close()
+
+
+@pytest.mark.parametrize(
+    "second", [{"variant": "fg"}, {"variant": "arm"}, {"strategy": "juggling"}], ids=["verified", "not verified", "bad goal"]
+)
+def test_the_next_run_takes_the_last_trajectory_back(bench, second):
+    """Somebody who subscribes only now must not get the trajectory of a scene that is no more."""
+    bench.run(variant="arm")
+    bench.wait(lambda: bench.valid["arm"])
+    bench.fakes.on_verify = lambda goal, canceled: VerifyMotion.Result(
+        code=int(Code.OK if goal.plan.variant == "fg" else Code.DRIFT), success=True
+    )
+    bench.run(**second)
+    bench.wait(lambda: not bench.valid["arm"])
+    late = []
+    subscription = bench.node.create_subscription(JointTrajectory, "verified_trajectory", late.append, qos.LATCHED)
+    try:
+        bench.until(lambda: late)
+        assert not late[0].points
+    finally:
+        bench.node.destroy_subscription(subscription)
+
+
+def test_a_plan_in_another_frame_is_not_published(bench):
+    def plan(goal, canceled):
+        result = fakes.FakeServers.plan(goal, canceled)
+        result.plan.tool_trajectory.header.frame_id = "world"
+        return result
+
+    bench.fakes.on_plan = plan
+    result, _ = bench.run()
+    assert result.code == Code.BAD_REQUEST
+    assert "panda_link0" in result.message
+    assert "world" in result.message
+    assert not bench.messages["tool"]
+
+
+def test_a_plan_of_another_variant_is_not_published(bench):
+    bench.fakes.on_plan = lambda goal, canceled: PlanMotion.Result(plan=conversions.plan_to_msg(fakes.plan("arm"), goal.tool.id))
+    result, _ = bench.run(variant="fg")
+    assert (result.code, result.verified) == (Code.UNKNOWN_VARIANT, False)
+    assert not bench.messages["arm"]
+
+
+def test_what_is_canceled_when_it_has_just_been_verified_is_not_published(bench, monkeypatch):
+    execute = pipeline.Run.execute
+
+    def canceled_afterwards(run):
+        outcome = execute(run)
+        for token in bench.server._goals.values():
+            token.cancel()
+        return outcome
+
+    monkeypatch.setattr(pipeline.Run, "execute", canceled_afterwards)
+    result, _ = bench.run()
+    assert (result.code, result.verified) == (Code.CANCELED, False), result.message
+    monkeypatch.undo()
+    bench.run()
+    bench.wait(lambda: bench.messages["tool"])
+    assert len(bench.messages["tool"]) == 1
+
+
+def test_markers_that_cannot_be_drawn_change_nothing_else(bench, monkeypatch):
+    def broken(*_):
+        raise ValueError("a defect of the markers")
+
+    monkeypatch.setattr("magic_server.markers.run_markers", broken)
+    result, status = bench.run()
+    assert (result.code, result.verified, status) == (0, True, GoalStatus.STATUS_SUCCEEDED), result.message
+
+
+def test_the_contacts_belong_to_the_objects_that_are_planned_with(bench):
+    """Perception may have sent a new scene, in which an object's own frame is another one, when the matcher answers."""
+    first = fakes.scene().objects[0]
+    turned = transforms.from_rpy(0.0, 0.0, np.pi)
+    newer = replace(first, world_from_object=first.world_from_object @ turned)
+    scenes = {"older": fakes.scene(), "newer": replace(fakes.scene(), objects=(newer, fakes.scene().objects[1]))}
+    asked = []
+
+    def match(request):
+        # The matcher has not seen the newer scene yet when it is asked first; then it has.
+        seen = scenes["older" if not asked else "newer"]
+        if not asked:
+            came = bench.server.scene_came
+            bench.fakes.publish(scenes["newer"])
+            bench.until(lambda: bench.server.scene_came > came)
+        asked.append(request)
+        candidates = [conversions.candidate_to_msg(fakes.candidate(), seen.objects[0].world_from_object)]
+        return MatchContact.Response(candidates=candidates, target_id="object_2", features="fake")
+
+    bench.fakes.on_match = match
+    planned = []
+    bench.fakes.on_plan = lambda goal, canceled: planned.append(goal) or fakes.FakeServers.plan(goal, canceled)
+    try:
+        result, _ = bench.run()
+        assert result.code == 0, result.message
+        assert len(asked) == 1  # the older scene is this run's own
+        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), first.world_from_object, atol=1e-9)
+        # The matcher's objects are newer than those with which the run began: these are taken.
+        bench.fakes.publish(scenes["older"])
+        bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] > 0)
+
+        def ahead(request):
+            bench.fakes.publish(scenes["newer"])
+            bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] < 0)
+            return match(request)
+
+        bench.fakes.on_match = ahead
+        planned.clear()
+        result, _ = bench.run()
+        assert result.code == 0, result.message
+        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), newer.world_from_object, atol=1e-9)
+    finally:
+        bench.fakes.publish(fakes.scene())
+
+
+def test_goals_carry_what_the_servers_need(bench):
+    bench.run(variant="arm", seed=7)
+    names = [name for name, _ in bench.fakes.goals]
+    assert names == ["match", "plan_motion", "verify_motion"]
+    request, plan, verify = (goal for _, goal in bench.fakes.goals)
+    assert not request.want_heatmap  # pictures only on request
+    assert (plan.tool.id, plan.target.id, plan.variant, plan.seed, plan.reflection) == ("object_1", "object_2", "arm", 7, "keep")
+    assert verify.plan.arm_trajectory.points
+    assert 0 < plan.timeout <= 30.0
+
+
+@pytest.mark.parametrize(
+    "goal, code, says",
+    [
+        ({"strategy": "juggling"}, Code.UNKNOWN_STRATEGY, ("juggling", "dynamic", "fake")),
+        ({"target_id": "object_9"}, Code.UNKNOWN_OBJECT, ("object_9", "object_1", "object_2")),
+        ({"tool_id": "object_8"}, Code.UNKNOWN_OBJECT, ("object_8", "object_1")),
+        ({"variant": "legs"}, Code.UNKNOWN_VARIANT, ("legs", "fg", "arm")),
+        ({"timeout": -1.0}, Code.BAD_REQUEST, ("-1",)),
+        ({"tool_id": "object_2"}, Code.BAD_REQUEST, ("object_2",)),
+        ({"tool_id": "the box"}, Code.AMBIGUOUS_OBJECT, ("'the box'", "object_1", "object_2")),
+        ({"tool_id": "the ball"}, Code.UNKNOWN_OBJECT, ("'the ball'", "object_1", "object_2")),
+        ({"tool_id": "the leftmost box", "target_id": "object_2"}, Code.BAD_REQUEST, ("object_2",)),
+    ],
+)
+def test_bad_goals_are_answered_before_any_work(bench, goal, code, says):
+    result, status = bench.run(**goal)
+    assert (result.code, status) == (code, GoalStatus.STATUS_ABORTED), result.message
+    assert all(s in result.message for s in says), result.message
+    assert not bench.fakes.goals
+
+
+def test_objects_are_named_in_words(bench):
+    result, _ = bench.run(tool_id="the rightmost box", target_id="the box left of the rightmost box")
+    assert (result.code, result.tool_id, result.target_id) == (0, "object_1", "object_2"), result.message
+    assert any("'the rightmost box' is object_1" in m.message for m in bench.feedback)
+
+
+@pytest.mark.parametrize(
+    "allow, code, status",
+    [(False, Code.NOT_VERIFIABLE, GoalStatus.STATUS_ABORTED), (True, Code.OK, GoalStatus.STATUS_SUCCEEDED)],
+)
+def test_an_unverifiable_motion_is_returned_but_not_published(bench, allow, code, status):
+    result, ended = bench.run(strategy="dynamic", allow_unverified=allow)
+    assert (result.code, result.verified, result.simulations, ended) == (code, False, 0, status), result.message
+    assert len(result.plan.tool_trajectory.points) == 2
+    # A verified run afterwards proves that the channel works and that nothing came before it.
+    bench.run()
+    bench.wait(lambda: bench.messages["tool"])
+    assert len(bench.messages["tool"]) == 1
+
+
+def test_the_matchers_reason_is_passed_on(bench):
+    bench.fakes.on_match = lambda request: MatchContact.Response(code=int(Code.NO_MATCH), message="nothing like a hook")
+    result, _ = bench.run()
+    assert (result.code, result.message) == (Code.NO_MATCH, "nothing like a hook")
+
+
+def test_an_answer_that_is_lost_is_asked_for_again(bench, monkeypatch):
+    """Of the matcher, and of an action's result: the first answer to each never comes."""
+    monkeypatch.setattr(remote, "AGAIN", 0.2)
+    client, handles = bench.server.matcher._client, ClientGoalHandle.get_result_async
+    call, lost = client.call_async, []
+
+    def deaf(what, ask):
+        if what in lost:
+            return ask()
+        lost.append(what)
+        ask()
+        return Future()
+
+    monkeypatch.setattr(client, "call_async", lambda request: deaf("match", lambda: call(request)))
+    # The bench asks for its own goal's result in the same way: the server's is the one of the planner.
+    planning = bench.server.planner._client
+    monkeypatch.setattr(
+        ClientGoalHandle,
+        "get_result_async",
+        lambda handle: deaf("plan", lambda: handles(handle)) if handle._action_client is planning else handles(handle),
+    )
+    result, _ = bench.run()
+    assert result.verified and lost == ["match", "plan"], result.message
+
+
+def test_objects_may_reach_the_matcher_later(bench):
+    answers = [MatchContact.Response(code=int(Code.UNKNOWN_OBJECT), message="none received yet")] * 3
+
+    def late(request):
+        return answers.pop() if answers else fakes.FakeServers.match(request)
+
+    bench.fakes.on_match = late
+    result, _ = bench.run()
+    assert result.code == 0, result.message
+    assert not answers
+
+
+def test_a_second_goal_is_busy(bench):
+    bench.fakes.on_plan = fakes.FakeServers.until_canceled(PlanMotion.Result())
+    first = bench.send()
+    assert bench.fakes.started.wait(DEADLINE)
+    result, _ = bench.run()
+    assert result.code == Code.BUSY
+    bench.result(first.cancel_goal_async())
+    assert bench.result(first.get_result_async()).result.code == Code.CANCELED
+
+
+@pytest.mark.parametrize("stage", ["plan_motion", "verify_motion"])
+def test_cancel_inside_a_stage_reaches_its_server(bench, stage):
+    kind = PlanMotion if stage == "plan_motion" else VerifyMotion
+    setattr(bench.fakes, "on_" + stage.split("_")[0], fakes.FakeServers.until_canceled(kind.Result()))
+    handle = bench.send()
+    deadline = time.monotonic() + DEADLINE
+    while stage not in [name for name, _ in bench.fakes.goals]:
+        assert time.monotonic() < deadline
+        bench.fakes.started.wait(0.01)
+    begin = time.monotonic()
+    bench.result(handle.cancel_goal_async())
+    response = bench.result(handle.get_result_async())
+    assert (response.result.code, response.status) == (Code.CANCELED, GoalStatus.STATUS_CANCELED)
+    assert time.monotonic() - begin < 10.0
+    assert bench.fakes.canceled_goals == [stage]
+
+
+def test_cancel_while_matching(bench):
+    release, entered = threading.Event(), threading.Event()
+
+    def slow(request):
+        entered.set()
+        release.wait(DEADLINE)
+        return fakes.FakeServers.match(request)
+
+    bench.fakes.on_match = slow
+    handle = bench.send()
+    assert entered.wait(DEADLINE)
+    bench.result(handle.cancel_goal_async())
+    assert bench.result(handle.get_result_async()).result.code == Code.CANCELED
+    release.set()
+    result, _ = bench.run()
+    assert result.code == 0
+
+
+def test_a_handler_that_raises_drops_its_candidate(bench):
+    def broken(goal, canceled):
+        raise RuntimeError("a defect of the planner")
+
+    bench.fakes.on_plan = broken
+    result, _ = bench.run()
+    assert result.code == Code.NO_CANDIDATE_SUCCEEDED
+    assert {r.code for r in result.candidates} == {int(Code.INTERNAL)}
+
+
+def test_a_server_that_never_finishes(folder):
+    bench = Bench(folder, verify_timeout=0.5)
+    try:
+        bench.fakes.publish(fakes.scene())
+        bench.fakes.on_verify = fakes.FakeServers.until_canceled(VerifyMotion.Result())
+        begin = time.monotonic()
+        result, _ = bench.run()
+        assert result.code == Code.SERVER_TIMEOUT
+        assert "verifier" in result.message
+        assert time.monotonic() - begin < 15.0
+        assert bench.fakes.canceled_goals == ["verify_motion"]
+    finally:
+        bench.close()
+
+
+def test_the_film_is_made_after_the_trajectory_is_out(folder):
+    bench = Bench(folder)
+    try:
+        bench.fakes.publish(fakes.scene())
+        published = []
+
+        def verify(goal, canceled):
+            result = fakes.FakeServers.verify(goal, canceled)
+            if goal.want_film:
+                bench.wait(lambda: bench.messages["tool"])
+                published.append(True)
+                result.film = conversions.image_to_msg(np.zeros((4, 8, 3), np.uint8), "rgb8")
+            return result
+
+        bench.fakes.on_verify = verify
+        result, _ = bench.run(want_pictures=True)
+        assert (result.code, result.simulations, result.film.width) == (0, 1, 8)
+        assert published == [True]
+    finally:
+        bench.close()
+
+
+def test_missing_server_and_missing_objects(folder):
+    bench = Bench(folder, services=("match", "plan"))
+    try:
+        begin = time.monotonic()
+        result, _ = bench.run()
+        assert result.code == Code.SERVER_UNAVAILABLE
+        assert "verifier" in result.message
+        assert "/verify_motion" in result.message
+        assert time.monotonic() - begin < 15.0
+        late = fakes.FakeServers("late", services=("verify",), context=bench.context)
+        bench.executor.add_node(late)
+        result, _ = bench.run()
+        assert result.code == Code.NO_OBJECTS, result.message  # the stand-in has a publisher but has published nothing
+        assert "/objects" in result.message
+        bench.fakes.publish(fakes.scene(("object_1",)))
+        result, _ = bench.run(target_id="")
+        assert result.code == Code.NO_OBJECTS
+        assert "object_1" in result.message
+        status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="perception: left", message="no camera_info on /camera/left")
+        status.values = [KeyValue(key="code", value="101")]
+        bench.diagnostics.publish(DiagnosticArray(status=[status]))
+        deadline = time.monotonic() + DEADLINE
+        while bench.server.complaint() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        result, _ = bench.run(target_id="")
+        assert result.code == Code.NO_CAMERA_INFO
+        assert "no camera_info on /camera/left" in result.message
+    finally:
+        bench.close()
+
+
+@pytest.mark.parametrize("goes, at", [("plan", "match"), ("verify", "match"), ("verify", "plan")])
+def test_a_long_stage_is_not_waited_for_where_who_comes_after_it_has_gone(folder, goes, at):
+    bench = Bench(folder, services=tuple({"match", "plan", "verify"} - {goes}), server_timeout=10.0)
+    other = fakes.FakeServers("other", services=(goes,), context=bench.context)
+    bench.executor.add_node(other)
+    try:
+        bench.fakes.publish(fakes.scene())
+        begun, over = threading.Event(), threading.Event()
+
+        def wait():
+            begun.set()
+            over.wait(DEADLINE)
+
+        bench.fakes.on_match = lambda request: (wait() if at == "match" else None, fakes.FakeServers.match(request))[1]
+        bench.fakes.on_plan = lambda goal, canceled: (wait() if at == "plan" else None, fakes.FakeServers.plan(goal, canceled))[1]
+        answer = bench.send().get_result_async()
+        assert begun.wait(DEADLINE)
+        bench.executor.remove_node(other)
+        other.destroy_node()
+        bench.until(answer.done)
+        result = answer.result().result
+        assert result.code == Code.SERVER_UNAVAILABLE, result.message
+        assert {"plan": "planner", "verify": "verifier"}[goes] in result.message and "has gone" in result.message
+    finally:
+        over.set()
+        bench.close()
+
+
+def test_another_namespaces_diagnostics_are_not_read(folder):
+    bench = Bench(folder)
+    try:
+        for name in ("robot_2/perception: left", "perception_2: left", "perception: left"):
+            status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name=name, message=name)
+            bench.diagnostics.publish(DiagnosticArray(status=[status]))
+        bench.until(lambda: bench.server.complaint() is not None)
+        assert set(bench.server._complaints) == {"perception: left"}
+    finally:
+        bench.close()
+
+
+def test_a_simulated_clock_that_is_silent_is_said_in_diagnostics_and_in_the_answer(folder):
+    bench = Bench(folder, use_sim_time=True)
+    try:
+        said = []
+        bench.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: said.extend(m.status), qos.RELIABLE)
+        result, _ = bench.run()
+        assert result.code == Code.NO_OBJECTS
+        assert "use_sim_time" in result.message and "/clock" in result.message
+        # By a timer of the wall clock: the node's own stands still.
+        bench.until(lambda: any(s.name == "strategy_server: clock" and s.level == DiagnosticStatus.ERROR for s in list(said)))
+        assert any(s.name == "strategy_server: readiness" and s.hardware_id == "/strategy_server" for s in list(said))
+    finally:
+        bench.close()
+
+
+def test_results_are_not_kept_for_long(shared):
+    # As rcl has it: with the 900 s of rclpy a server keeps hundreds of plans.
+    from magic_core.node import RESULT_TIMEOUT
+
+    assert RESULT_TIMEOUT <= 10
+    shared.fakes.clear()
+    assert shared.run()[0].code == Code.OK
+    kept = shared.server._server._goal_handles
+    shared.until(lambda: not kept, timeout=RESULT_TIMEOUT + DEADLINE)
+
+
+def test_complaint_codes():
+    def status(value):
+        return DiagnosticStatus(values=[KeyValue(key="code", value=value)])
+
+    assert complaint_code(status("NO_TABLE")) == Code.NO_TABLE
+    assert complaint_code(status("105")) == Code.NO_TABLE
+    assert complaint_code(status("0")) is None
+    assert complaint_code(status("7")) is None
+    assert complaint_code(status("gibberish")) is None
+    assert complaint_code(DiagnosticStatus()) is None
+
+
+def test_token_wakes_and_cancels():
+    token = Token()
+    threading.Timer(0.05, token.cancel).start()
+    with pytest.raises(MagicError) as error:
+        token.wait(lambda: False, time.monotonic() + DEADLINE)
+    assert error.value.code == Code.CANCELED
+    assert not Token().wait(lambda: False, time.monotonic() + 0.01)
+    assert Token().wait(lambda: True, time.monotonic())

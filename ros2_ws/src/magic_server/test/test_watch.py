@@ -1,0 +1,104 @@
+"""What a moving arm is stopped by, and how often a goal is tried anew."""
+
+import math
+
+import numpy as np
+import pytest
+
+from magic_core.errors import Code, MagicError
+from magic_server import scene_change
+from magic_server.permission import Look, NotYet
+from magic_server.scene_change import Changed
+from magic_server.watch import Bounds, SceneWatch
+
+CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
+BEGAN = 1000.0
+FAR = np.array([0.0, 0.0, 0.8])
+
+
+def look(places, after=0.0, came=0.0, partly=()):
+    """Cubes of 50 mm along x, as a picture shows them some seconds after the move began."""
+    hulls = {name: scene_change.hull(CORNERS + [x, 0, 0]) for name, x in places.items()}
+    return Look(hulls, "base", BEGAN + after, came, frozenset(partly))
+
+
+TABLE = {"tool": 0.0, "target": 0.2, "cup": 0.5}
+
+
+def watch(meant=("tool",), contact=math.inf):
+    return SceneWatch(look(TABLE), meant, "target", contact, 0.03, 5.0)
+
+
+def take(watching, places, after=1.0, partly=(), hand=FAR):
+    watching.take(look(places, after, came=after, partly=partly), BEGAN, BEGAN + after + 0.3, after + 0.1, hand)
+
+
+def test_what_stays_or_is_moved_on_purpose_stops_nothing():
+    watching = watch(contact=4.0)
+    take(watching, TABLE)
+    take(watching, {**TABLE, "tool": 0.4, "target": 0.22, "hand": 0.1}, 2.0)
+    take(watching, {"target": 0.2, "cup": 0.5}, 3.0)
+    take(watching, {"target": 0.9, "cup": 0.5}, 5.0)  # the tool has met it by then
+    take(watching, {"cup": 0.5}, 6.0)
+
+
+@pytest.mark.parametrize(
+    "places, says",
+    [({**TABLE, "target": 0.24}, "target has moved while the arm moved, in mm: 3"), ({**TABLE, "cup": 0.4}, "cup has moved")],
+)
+def test_what_moves_stops_the_arm(places, says):
+    with pytest.raises(Changed, match=says) as caught:
+        take(watch(), places)
+    assert caught.value.code == Code.SCENE_CHANGED
+
+
+def test_what_is_missed_in_one_picture_has_not_gone():
+    watching, without = watch(), {"tool": 0.0, "target": 0.2}
+    take(watching, without, 1.0)
+    take(watching, without, 1.0)  # the same picture again
+    take(watching, TABLE, 2.0)
+    take(watching, without, 3.0)
+    with pytest.raises(Changed, match="cup has gone"):
+        take(watching, without, 4.0)
+
+
+def test_what_the_hand_may_hide_has_not_gone():
+    watching = watch()
+    for number in range(1, 6):
+        take(watching, {"tool": 0.0, "target": 0.2}, float(number), hand=np.array([0.4, 0.1, 0.2]))  # the cup is at 0.5 m
+
+
+def test_of_what_the_arm_hides_in_part_only_what_sticks_out_counts():
+    half = look({"cup": 0.5}).objects["cup"]
+    corners = CORNERS[CORNERS[:, 0] > 0] + [0.5, 0, 0]  # the half of it that the arm leaves in sight
+    assert scene_change.distance(half, scene_change.hull(corners)) > 0.03
+    assert scene_change.gap(half, scene_change.hull(corners), True) == 0.0
+    watching = watch()
+    hidden = look(TABLE, 1.0, 1.0, ("cup",))
+    hidden.objects["cup"] = scene_change.hull(corners)
+    watching.take(hidden, BEGAN, BEGAN + 1.3, 1.1, FAR)
+    with pytest.raises(Changed, match="cup has moved"):
+        take(watch(), {**TABLE, "cup": 0.55}, partly=("cup",))
+
+
+@pytest.mark.parametrize("seen", [None, look(TABLE, after=-6.0, came=0.0), look(TABLE, after=0.0, came=-6.0), look(TABLE, after=math.nan)])
+def test_an_arm_is_not_moved_blindly(seen):
+    with pytest.raises(NotYet, match="not moved blindly"):
+        watch().take(seen, BEGAN, BEGAN + 0.3, 0.1, FAR)
+
+
+def test_tries_are_bounded_in_number_and_time():
+    error = MagicError(Code.GRASP_FAILED, "closed on nothing")
+    bounds = Bounds(executions=3, replans=1, end=10.0)
+    bounds.fail(error, 1.0)
+    bounds.fail(error, 2.0)
+    with pytest.raises(MagicError, match="3 executions are over") as caught:
+        bounds.fail(error, 3.0)
+    assert caught.value.code == Code.GRASP_FAILED
+    bounds.elsewhere(error, Code.SCENE_CHANGED, 3.0)
+    with pytest.raises(MagicError, match="planned anew 1 times") as caught:
+        bounds.elsewhere(error, Code.SCENE_CHANGED, 3.0)
+    assert caught.value.code == Code.SCENE_CHANGED
+    for late in (Bounds(3, 3, 10.0).fail, lambda e, now: Bounds(3, 3, 10.0).elsewhere(e, Code.SCENE_CHANGED, now)):
+        with pytest.raises(MagicError, match="the time for trying again is over"):
+            late(error, 10.0)
