@@ -29,7 +29,7 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_core.views import as_it_stands
 from magic_matcher import contour as contours
-from magic_matcher import curvature, features, score
+from magic_matcher import curvature, global_stage, score
 from magic_matcher.matching import SAME_PLACE, Target, to_contact
 
 #: Points of a cloud; the voxel of FPFH as a share of the reference's diagonal; RANSAC's draws.
@@ -149,7 +149,7 @@ def by_curvature(
     """Random contact points of the tools' outlines, ranked by the curvature score; ``seconds`` bound the search (the paper: 180)."""
     rng = np.random.default_rng(seed)
     deadline = clock() + seconds
-    reference = features.from_strategy(strategy)
+    reference = global_stage.from_strategy(strategy)
     flat = not np.isfinite(strategy.target_contact.radius) or not np.isfinite(target.contact.radius) or target.contact.concave
     of_reference = reference.contour.size * reference.view.metres_per_pixel if flat else strategy.target_contact.radius
     ratio = reference.radius * reference.view.metres_per_pixel / of_reference
@@ -174,7 +174,7 @@ def by_curvature(
                 mine.append(_candidate(tool.id, contact, target, carried, 0.0, s_curv, s_curv))
         if mine:
             points = np.array([c.tool.pixel for c in mine])
-            kept = features.suppress(points, np.array([c.score for c in mine]), SAME_PLACE * contour.size, top_k)
+            kept = global_stage.suppress(points, np.array([c.score for c in mine]), SAME_PLACE * contour.size, top_k)
             found += [mine[k] for k in kept]
     if not found:
         raise MagicError(Code.NO_MATCH, "contact points of the reference's convexity", 0, "a tool that has some")

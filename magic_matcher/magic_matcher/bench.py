@@ -42,10 +42,10 @@ from numpy.typing import NDArray
 from magic_core.contact import Contact
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
-from magic_matcher import backends, drawing, embedded, jobs, matching, plain, score, speed
 from magic_matcher import contour as contours
+from magic_matcher import drawing, embedded, features, jobs, matching, plain, score, speed
 from magic_matcher.contour import Contour
-from magic_matcher.features import Reference, make_reference
+from magic_matcher.global_stage import Reference, make_reference
 
 #: First seeds of references and of tools; the fit uses 1000 to 1999 and 2000 to 4999.
 REFERENCES, TOOLS = 5000, 7000
@@ -132,8 +132,8 @@ def cases(count: int, seed: int = 0, only: str = "", tools: tuple[str, ...] = ()
 def variants(name: str, weights: str, family: str) -> dict[str, matching.Matcher | None]:
     """Matchers by variant for tools of a family; ``None``: the global stage alone, of ``full``."""
     if name == "dinov2":
-        full = backends.load("dinov2", weights)
-        single = backends.load("dinov2", weights, aggregation="none", components=None)
+        full = features.load("dinov2", weights)
+        single = features.load("dinov2", weights, aggregation="none", components=None)
         return {
             "full": matching.Matcher(full),
             "no patch, no PCA": matching.Matcher(single),
@@ -232,7 +232,7 @@ class Control:
 
 def controls(name: str = "embedded", weights: str = "", count: int = 6, seed: int = 0, only: str = "") -> list[Control]:
     """Refusals of plain things and of tools that no target of the drawn size fits, with the weights that ship."""
-    matcher = matching.Matcher(backends.load(name, weights))
+    matcher = matching.Matcher(features.load(name, weights))
     rows = []
     for job in jobs.JOBS.values():
         if only and job.name != only:

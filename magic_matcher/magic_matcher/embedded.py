@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from magic_core.scene import CanonicalView
 from magic_matcher import curvature, holding
 from magic_matcher.contour import Contour
-from magic_matcher.features import GlobalMatch, Proposal, Reference, rotation_between, suppress
+from magic_matcher.global_stage import GlobalMatch, Proposal, Reference, rotation_between, suppress
 
 SECTORS = 24
 WIDE_RADII = np.geomspace(0.03, 1.0, 7)

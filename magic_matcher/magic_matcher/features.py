@@ -1,184 +1,73 @@
-"""What a feature backend is: the global stage behind one interface.
+"""The feature backends there are, by name; what one is says :class:`magic_matcher.global_stage.Features`.
 
-A backend looks at the reference once (:meth:`Features.prepare`, cached by the caller)
-and then proposes contact points on any number of new tools.  Which there are says
-:mod:`magic_matcher.backends`.
+``embedded`` ships with the package; ``dinov2`` needs weights, ``dift`` and ``sd_dino`` (:mod:`magic_matcher.diffusion`) diffusers as well.  ``auto`` takes ``dinov2`` where weights are named and the
+embedded one everywhere else.  Another backend is added by an entry of :data:`MAKERS`.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from importlib import import_module
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from pathlib import Path
+from typing import Any
 
 from magic_core import devices
 from magic_core.errors import Code, MagicError
-from magic_core.scene import CanonicalView
-from magic_core.strategy import Strategy
-from magic_matcher import contour as contours
-from magic_matcher import curvature
-from magic_matcher.contour import Contour
+from magic_matcher.embedded import EmbeddedFeatures
+from magic_matcher.global_stage import Features, from_strategy, make_reference
 
 
-@dataclass(frozen=True)
-class Reference:
-    """The demonstration's contact as the backends see it.
-
-    pixel (2,) on the tool's contour in ``view``; normal (2,) unit, outward; concave: its
-    sign; target_radius: radius in pixels of ``view`` of the object touched there (the
-    target's curvature at p_O), ``None`` where it is unknown; contour: of view.mask.
-    """
-
-    view: CanonicalView
-    pixel: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    concave: bool
-    radius: float
-    target_radius: float | None
-    contour: Contour
-
-    def key(self) -> str:
-        """A name for everything in here that shapes features, for caches."""
-        digest = hashlib.sha256()
-        for array in (self.view.image, self.view.mask, self.pixel, self.normal):
-            digest.update(str(array.shape).encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
-        digest.update(f"{self.view.metres_per_pixel!r} {self.concave} {self.target_radius!r}".encode())
-        return digest.hexdigest()
+def _embedded(weights: str, device: str, **options: Any) -> Features:
+    return EmbeddedFeatures(**options)
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """A place on the new tool that looks like the reference contact.
+def _dinov2(weights: str, device: str, **options: Any) -> Features:
+    from magic_matcher.dinov2 import Dinov2Features
 
-    pixel (2,); rotation (radians, 0..2 pi) and flipped as in ContactCandidate: a picture
-    direction d of the reference view appears as R(rotation) F d, F mirroring u where
-    flipped, R turning u towards v; similarity is s_dino, 1 for the reference itself.
-    """
-
-    pixel: NDArray[np.float64]
-    rotation: float
-    flipped: bool
-    similarity: float
-
-
-@dataclass(frozen=True)
-class GlobalMatch:
-    """Proposals, best first and apart from each other; heatmap (H, W) float32 in 0..1, 0 off the object."""
-
-    proposals: tuple[Proposal, ...]
-    heatmap: NDArray[np.float32] | None = field(default=None)
-
-
-class Features(Protocol):
-    """The global stage of the matcher.
-
-    floor: the similarity below which a place is no analogy, 0 where the scale of the similarity is not known; clear: that from which on
-    a match in the view of a tool as it stands needs no other view to be looked at, ``inf`` where that is not known.
-    """
-
-    name: str
-    floor: float
-    clear: float
-
-    def key(self) -> str:
-        """A name for everything about this backend that shapes what it prepares, for caches."""
-        ...
-
-    def prepare(self, reference: Reference) -> Any:
-        """Whatever the backend wants to keep of the reference; picklable."""
-        ...
-
-    def propose(
-        self, prepared: Any, view: CanonicalView, contour: Contour, target_radius: float | None, count: int, heatmap: bool = False
-    ) -> GlobalMatch:
-        """The ``count`` best places on the tool of ``view``; target_radius in its pixels."""
-        ...
-
-
-def mirrored(direction: NDArray[np.float64], flipped: bool) -> NDArray[np.float64]:
-    """F d: picture vectors (..., 2) with u mirrored where flipped."""
-    return direction * np.array([-1.0, 1.0]) if flipped else direction
-
-
-def rotation_between(reference: NDArray[np.float64], found: NDArray[np.float64], flipped: bool) -> float:
-    """The rotation in 0..2 pi with found = R(rotation) F reference, for picture directions (2,)."""
-    u, v = mirrored(np.asarray(reference, dtype=float), flipped)
-    return float((np.arctan2(found[1], found[0]) - np.arctan2(v, u)) % (2 * np.pi))
-
-
-def suppress(points: NDArray[np.float64], scores: NDArray[np.float64], distance: float, count: int) -> list[int]:
-    """Indices of the best ``count`` points (N, 2) of which no two are nearer than ``distance``, best first."""
-    chosen: list[int] = []
-    scores = np.where(np.isfinite(scores), scores, -np.inf).copy()
-    while len(chosen) < count and len(scores):
-        best = int(np.argmax(scores))
-        if not np.isfinite(scores[best]):
-            break
-        chosen.append(best)
-        scores[np.hypot(*(points - points[best]).T) < distance] = -np.inf
-    return chosen
-
-
-def make_reference(
-    view: CanonicalView,
-    pixel: NDArray[np.float64],
-    normal: NDArray[np.float64] | None = None,
-    target_radius: float | None = None,
-    contour: Contour | None = None,
-) -> Reference:
-    """A reference from a view and a point on it; normal, sign and radius are measured there.
-
-    ``POINT_OUTSIDE`` where the point is off the picture or farther from the edge of the object than a tenth of its size.
-    """
-    contour = contours.extract(view.mask) if contour is None else contour
-    pixel = np.asarray(pixel, dtype=float)
-    height, width = view.mask.shape
-    if pixel.shape != (2,) or not np.all(np.isfinite(pixel)) or not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
-        raise MagicError(Code.POINT_OUTSIDE, "reference point", pixel.tolist(), f"u in 0..{width - 1}, v in 0..{height - 1}")
-    index = contour.nearest(pixel)
-    away = float(np.hypot(*(contour.points[index] - pixel)))
-    if away > 0.1 * contour.size:
+    if not weights:
         raise MagicError(
-            Code.POINT_OUTSIDE,
-            "distance of the reference point from the object's edge",
-            f"{away:.1f} px",
-            f"at most {0.1 * contour.size:.1f} px",
+            Code.FEATURE_WEIGHTS,
+            "weights",
+            weights,
+            "a hub name such as facebook/dinov2-base, or a folder with config.json and model.safetensors",
         )
-    found = curvature.estimate(contour, index)
-    return Reference(
-        view,
-        found.point,
-        found.normal if normal is None else np.asarray(normal, dtype=float),
-        found.concave,
-        found.radius,
-        target_radius,
-        contour,
-    )
+    folder = Path(weights).expanduser()
+    if folder.is_dir():
+        return Dinov2Features(str(folder), device, **options)
+    if weights.startswith(("/", ".", "~")) or weights.count("/") > 1:  # no hub name looks like this
+        raise MagicError(Code.FEATURE_WEIGHTS, "weights", weights, "a folder that exists, or a hub name such as facebook/dinov2-base")
+    return Dinov2Features(weights, device, **options)
 
 
-def from_strategy(strategy: Strategy) -> Reference:
-    """The reference of a strategy: its tool's view and contact, and the target's radius at p_O where it is round there."""
-    target = strategy.target_contact
-    radius = target.radius / strategy.tool_view.metres_per_pixel if np.isfinite(target.radius) and not target.concave else None
-    return make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
+def _diffusion(name: str) -> Any:
+    def made(weights: str, device: str, **options: Any) -> Features:
+        from magic_matcher import diffusion
+
+        if not weights:
+            raise MagicError(Code.FEATURE_WEIGHTS, "weights", weights, "a hub name or a folder of a Stable Diffusion pipeline")
+        found: Features = getattr(diffusion, name)(weights, device, **options)
+        return found
+
+    return made
 
 
-#: Makers of backends by name: weights (hub name or folder, may be empty), torch device, and options of their own.
-#: :mod:`magic_matcher.backends` puts in those there are; others may be added.
-MAKERS: dict[str, Callable[..., Features]] = {}
+#: Makers of backends by name: weights (hub name or folder, may be empty), torch device, and options of their own; others may be added.
+MAKERS: dict[str, Callable[..., Features]] = {
+    "embedded": _embedded,
+    "dinov2": _dinov2,
+    "dift": _diffusion("dift"),
+    "sd_dino": _diffusion("sd_dino"),
+}
+BACKENDS = ("auto", *MAKERS)
 
 
 def load(name: str = "auto", weights: str = "", device: str = devices.AUTO, **options: Any) -> Features:
     """A backend by name; raises ``UNKNOWN_FEATURES`` or ``FEATURE_WEIGHTS`` saying what was looked for."""
-    import_module("magic_matcher.backends")  # by its name: the backends are made of what this module defines
     if name == "auto":
         name = "dinov2" if weights else "embedded"
     if name not in MAKERS:
         raise MagicError(Code.UNKNOWN_FEATURES, "features", name, ("auto", *MAKERS))
     return MAKERS[name](weights, device, **options)
+
+
+#: With :func:`load`, what a match begins with.
+__all__ = ["BACKENDS", "MAKERS", "Features", "from_strategy", "load", "make_reference"]

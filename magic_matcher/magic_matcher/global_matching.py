@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
 from magic_matcher.contour import Contour
-from magic_matcher.features import GlobalMatch, Proposal, Reference, suppress
+from magic_matcher.global_stage import GlobalMatch, Proposal, Reference, suppress
 
 ROTATIONS = 12
 #: Side of the patch as a share of the token grid (13 of 60 in the authors' code), and d'.

@@ -33,8 +33,8 @@ import numpy as np
 from magic_core import devices
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
-from magic_matcher import backends, curvature, drawing, features, images, matching
 from magic_matcher import contour as contours
+from magic_matcher import curvature, drawing, features, global_stage, images, matching
 from magic_matcher.cache import Cache
 
 
@@ -42,7 +42,7 @@ def _number(value: float) -> float | None:
     return None if not math.isfinite(value) else float(value)
 
 
-def record(first: images.Picture, second: images.Picture, reference: features.Reference, candidate: ContactCandidate) -> dict[str, Any]:
+def record(first: images.Picture, second: images.Picture, reference: global_stage.Reference, candidate: ContactCandidate) -> dict[str, Any]:
     """One candidate as plain data, lengths in pixels of the files; straight edges have radius ``null``."""
     tool = candidate.tool
     pixel = second.on_edge(second.to_file(tool.pixel), tool.normal)
@@ -64,12 +64,12 @@ def record(first: images.Picture, second: images.Picture, reference: features.Re
     }
 
 
-def _contact_pixel(picture: images.Picture, reference: features.Reference) -> np.ndarray:
+def _contact_pixel(picture: images.Picture, reference: global_stage.Reference) -> np.ndarray:
     """The reference's contact (2,) in the file."""
     return picture.on_edge(picture.to_file(reference.pixel), reference.normal)
 
 
-def _reference(picture: images.Picture, point: np.ndarray) -> features.Reference:
+def _reference(picture: images.Picture, point: np.ndarray) -> global_stage.Reference:
     """The reference at a file's pixel (2,); errors in the file's pixels."""
     width, height = picture.size
     if not np.all(np.isfinite(point)) or not (-0.5 <= point[0] <= width - 0.5 and -0.5 <= point[1] <= height - 0.5):
@@ -84,7 +84,7 @@ def _reference(picture: images.Picture, point: np.ndarray) -> features.Reference
         raise MagicError(
             Code.POINT_OUTSIDE, "distance of the reference point from the object's edge", f"{away:.1f} px", f"at most {allowed:.1f} px"
         )
-    return features.make_reference(picture.view, at, contour=contour)
+    return global_stage.make_reference(picture.view, at, contour=contour)
 
 
 def run(given: argparse.Namespace) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     second = images.load(given.target, given.target_mask)
     reference = _reference(first, np.array(given.reference_point, dtype=float))
     matcher = matching.Matcher(
-        backends.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None
+        features.load(given.features, given.weights, given.device), cache=Cache(given.cache) if given.cache else None
     )
     contact = matching.to_contact(first.view, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
     result = matcher.match_views(reference, contact, [matching.Tool("target", second.view)], None, given.top, heatmap=True)
@@ -150,7 +150,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--reference-mask", metavar="M.png", help="its mask, 255 on the tool; without one the background must be plain")
     p.add_argument("--target", required=True, metavar="T.png", help="picture of the new tool")
     p.add_argument("--target-mask", metavar="M.png", help="its mask")
-    p.add_argument("--features", default="auto", choices=backends.BACKENDS, help="feature backend (default: auto)")
+    p.add_argument("--features", default="auto", choices=features.BACKENDS, help="feature backend (default: auto)")
     p.add_argument("--weights", default="", help="hub name or folder of weights, for dinov2")
     p.add_argument(
         "--device", default=devices.AUTO, help="torch device of the network; auto (default): cuda where there is a GPU, else cpu"

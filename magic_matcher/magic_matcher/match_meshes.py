@@ -36,8 +36,8 @@ from magic_core.contact import Contact
 from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
 from magic_core.views import find_view
-from magic_matcher import backends, curvature, drawing, features, jobs, matching
-from magic_matcher.features import Reference, make_reference
+from magic_matcher import curvature, drawing, features, global_stage, jobs, matching
+from magic_matcher.global_stage import Reference, make_reference
 from magic_matcher.match_images import _number
 
 #: Mesh files that are looked for in a folder.
@@ -81,7 +81,7 @@ def reference_of(given: argparse.Namespace) -> tuple[Reference, Contact, float, 
     """The reference, its contact, the radius (m) of its target, and the kind of view."""
     if given.strategy:
         found = strategies.find(given.strategy)
-        return features.from_strategy(found), found.tool_contact, found.target_contact.radius, found.view
+        return global_stage.from_strategy(found), found.tool_contact, found.target_contact.radius, found.view
     tool = draw(given.reference, given.kind, given.as_is)
     radius = given.reference_radius or given.radius
     reference = make_reference(tool.view, np.array(given.reference_point, dtype=float), None, radius / tool.view.metres_per_pixel)
@@ -92,7 +92,7 @@ def reference_of(given: argparse.Namespace) -> tuple[Reference, Contact, float, 
 def run(given: argparse.Namespace) -> tuple[dict[str, Any], NDArray[np.uint8]]:
     """What ``matches.json`` holds, and the sheet."""
     reference, contact, old, kind = reference_of(given)
-    matcher = matching.Matcher(backends.load(given.features, given.weights))
+    matcher = matching.Matcher(features.load(given.features, given.weights))
     target = jobs.disc_target(given.radius, kind)
     pictures, titles, rows = [drawing.draw_match(reference.view, contact)], ["reference"], []
     for path in files(given.tools):
@@ -139,7 +139,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--tools", nargs="+", required=True, metavar="MESH", help="mesh files, folders of them, or FAMILY:SEED of the generator")
     p.add_argument("--columns", type=int, default=0, metavar="N", help="pictures in a row (default: all in one)")
     p.add_argument("--as-is", action="store_true", help="do not lay the meshes on their broadest side")
-    p.add_argument("--features", default="auto", choices=backends.BACKENDS)
+    p.add_argument("--features", default="auto", choices=features.BACKENDS)
     p.add_argument("--weights", default="", help="hub name or folder, for dinov2")
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     return p

@@ -25,9 +25,9 @@ from magic_core.shapes import section_view
 from magic_core.strategy import Strategy
 from magic_core.views import as_it_stands, own_views, square_on
 from magic_matcher import contour as contours
-from magic_matcher import curvature, features, score
+from magic_matcher import curvature, global_stage, score
 from magic_matcher.contour import Contour
-from magic_matcher.features import Features, Proposal, Reference
+from magic_matcher.global_stage import Features, Proposal, Reference
 from magic_matcher.plausible import Demands, Refusal, demands, refusals
 
 #: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
@@ -292,7 +292,7 @@ class Matcher:
             met = Target(target.id, view, target_contact(strategy, view, target.world_from_object))
         elif target is not None:
             met = Target("", target, target_contact(strategy, target, np.eye(4)))
-        reference = features.from_strategy(strategy)
+        reference = global_stage.from_strategy(strategy)
         found = self.match_views(reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start)
         return replace(found, refused=(*found.refused, *(error.message for error in unseen)))
 
@@ -394,7 +394,7 @@ class Matcher:
             if candidates:
                 break
         points = np.array([c.tool.pixel for c in candidates]).reshape(-1, 2)
-        order = features.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, task.top_k)
+        order = global_stage.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, task.top_k)
         worst = max(refused, key=lambda r: r.similarity, default=None)
         return _Seen(view, [candidates[i] for i in order], worst, proposals.heatmap)
 
@@ -431,7 +431,7 @@ class Matcher:
                     tool_id=tool_id,
                     tool=contact,
                     target=target.contact if target is not None else None,
-                    rotation=features.rotation_between(reference.normal, contact.normal, proposal.flipped),
+                    rotation=global_stage.rotation_between(reference.normal, contact.normal, proposal.flipped),
                     flipped=proposal.flipped,
                     s_dino=proposal.similarity,
                     s_curv=s_curv,

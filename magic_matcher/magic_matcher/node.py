@@ -21,9 +21,9 @@ from magic_core.strategy import Strategy
 from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
-from magic_matcher import backends, features, matching
-from magic_matcher.backends import BACKENDS
+from magic_matcher import features, global_stage, matching
 from magic_matcher.cache import Cache
+from magic_matcher.features import BACKENDS
 
 
 class MatcherNode(Node):
@@ -57,7 +57,7 @@ class MatcherNode(Node):
         cache = nodes.parameter(
             self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True
         )
-        self._matcher = matching.Matcher(backends.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
+        self._matcher = matching.Matcher(features.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
         self._scene: Scene | None = None
         self._strategies: dict[str, tuple[int, Strategy]] = {}
         self._lock = threading.Lock()
@@ -85,7 +85,7 @@ class MatcherNode(Node):
         names = sorted(path.parent.name for path in root.glob("*/strategy.yaml"))
         for name in names:
             try:
-                self._matcher.prepare(features.from_strategy(self._strategy(name)))
+                self._matcher.prepare(global_stage.from_strategy(self._strategy(name)))
             except MagicError as error:
                 self.get_logger().warning(f"strategy {name} cannot be matched: {error}")
         try:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from magic_matcher import holding
 from magic_matcher.contour import Contour
-from magic_matcher.features import Reference
+from magic_matcher.global_stage import Reference
 
 #: How far from touching squarely, in its radii, a disc may have to stay: 0.41 in a right angle, 1 in one of 60 degrees.
 GAP, GAP_SHARE = 1.0, 1.5

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_matcher import backends, jobs, matching
-from magic_matcher.features import Reference, make_reference
+from magic_matcher import features, jobs, matching
+from magic_matcher.global_stage import Reference, make_reference
 
 
 def resident() -> float:
@@ -62,10 +62,10 @@ def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[s
     def match(matcher: matching.Matcher, tool: matching.Tool) -> None:
         matcher.match_views(reference, contact, [tool], target, 3, False, 0.025)
 
-    matcher = matching.Matcher(backends.load("embedded"))
+    matcher = matching.Matcher(features.load("embedded"))
     result: dict[str, Any] = {"embedded": {tool.id: timed(lambda tool=tool: match(matcher, tool), repeats) for tool in tools}}
     with tempfile.TemporaryDirectory() as folder:
-        backend = backends.load("dinov2", weights or random_vit_s(folder))
+        backend = features.load("dinov2", weights or random_vit_s(folder))
         network = matching.Matcher(backend)
         network.prepare(reference)
         picture = np.zeros((1, backend.size, backend.size, 3), np.uint8)

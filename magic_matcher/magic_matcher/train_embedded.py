@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from magic_matcher import jobs
 from magic_matcher.embedded import DISTANCES, EmbeddedFeatures, default_weights
-from magic_matcher.features import make_reference
+from magic_matcher.global_stage import make_reference
 
 #: By so much (rad) the local stage's normal, taken at a larger scale, may differ from the contour's.
 TILT = np.deg2rad(12.0)

@@ -9,7 +9,7 @@ pytest.importorskip("torch")
 
 from magic_core import shapes
 from magic_core.errors import Code, MagicError
-from magic_matcher import backends, features
+from magic_matcher import features, global_stage
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +44,13 @@ def reference():
     shape = shapes.make("l_hook", 3)
     view = shape.view()
     contact = shape.contact("inner", view)
-    return features.make_reference(view, contact.pixel, contact.normal)
+    return global_stage.make_reference(view, contact.pixel, contact.normal)
 
 
 def made(name, weights, size=256):
     paths = str(weights / "sd") if name == "dift" else f"{weights / 'sd'},{weights / 'dino'}"
     own = {"draws": 2} if name == "dift" else {"tokens": size // 16}
-    return backends.load(name, paths, size=size, rotations=2, **own)
+    return features.load(name, paths, size=size, rotations=2, **own)
 
 
 @pytest.mark.parametrize(("name", "width"), [("dift", 16), ("sd_dino", 16 + 16 + 8 + 32)])
@@ -79,15 +79,15 @@ def test_a_tool_is_found_on_itself(weights, reference, name):
 def test_weights_that_are_none_have_a_code(weights, tmp_path):
     for name, path in (("dift", str(tmp_path)), ("sd_dino", str(weights / "sd"))):
         with pytest.raises(MagicError) as error:
-            backends.load(name, path)
+            features.load(name, path)
         assert error.value.code == Code.FEATURE_WEIGHTS
     with pytest.raises(MagicError) as error:
-        backends.load("dift", str(weights / "sd"), size=100)
+        features.load("dift", str(weights / "sd"), size=100)
     assert error.value.code == Code.BAD_REQUEST
 
 
 @pytest.mark.parametrize("name", ["dift", "sd_dino"])
 def test_without_weights_it_is_said(name):
     with pytest.raises(MagicError) as error:
-        backends.load(name, "")
+        features.load(name, "")
     assert error.value.code == Code.FEATURE_WEIGHTS

@@ -9,7 +9,7 @@ import pytest
 from magic_core import shapes
 from magic_core.errors import Code, MagicError
 from magic_core.scene import CanonicalView
-from magic_matcher import backends, features
+from magic_matcher import features, global_stage
 from magic_matcher import global_matching as gm
 
 
@@ -60,8 +60,8 @@ def test_joint_pca_is_that_of_all_tokens():
 
 def test_suppression_gives_different_places():
     points = np.array([[0, 0], [1, 0], [50, 0], [51, 0], [100, 0]], float)
-    assert features.suppress(points, np.array([5.0, 4.9, 4.0, 4.8, 1.0]), 10, 3) == [0, 3, 4]
-    assert features.suppress(points, np.array([5.0, np.nan, -np.inf, 1.0, -np.inf]), 10, 9) == [0, 3]
+    assert global_stage.suppress(points, np.array([5.0, 4.9, 4.0, 4.8, 1.0]), 10, 3) == [0, 3, 4]
+    assert global_stage.suppress(points, np.array([5.0, np.nan, -np.inf, 1.0, -np.inf]), 10, 9) == [0, 3]
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def backend(weights):
-    return backends.load("dinov2", weights, tokens=14)
+    return features.load("dinov2", weights, tokens=14)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def reference():
     shape = shapes.make("l_hook", 3)
     view = shape.view()
     contact = shape.contact("inner", view)
-    return features.make_reference(view, contact.pixel, contact.normal)
+    return global_stage.make_reference(view, contact.pixel, contact.normal)
 
 
 @pytest.fixture(scope="module")
@@ -127,15 +127,15 @@ def test_every_aggregation_and_no_pca_run(backend, reference, prepared):
 @pytest.mark.parametrize("precision", ["bfloat16", "float16"])
 def test_half_precision_finds_the_same_place(weights, reference, precision):
     torch = pytest.importorskip("torch")
-    half = backends.load("dinov2", weights, tokens=14, rotations=4, precision=precision)
+    half = features.load("dinov2", weights, tokens=14, rotations=4, precision=precision)
     assert half._dtype == getattr(torch, precision) and next(half._model.parameters()).dtype == half._dtype
-    full = backends.load("dinov2", weights, tokens=14, rotations=4)
+    full = features.load("dinov2", weights, tokens=14, rotations=4)
     assert full._dtype == torch.float32 and full.key() != half.key()
     found, exact = (b.propose(b.prepare(reference), reference.view, None, None, 1).proposals[0] for b in (half, full))
     assert found.pixel == pytest.approx(exact.pixel) and found.similarity == pytest.approx(exact.similarity, abs=0.02)
     assert half.extract(np.zeros((1, half.size, half.size, 3), np.uint8)).dtype == np.float32
     with pytest.raises(MagicError) as caught:
-        backends.load("dinov2", weights, precision="int8")
+        features.load("dinov2", weights, precision="int8")
     assert caught.value.code == Code.BAD_REQUEST
 
 
@@ -147,7 +147,7 @@ def test_other_models_of_the_family_load(tmp_path, reference, kind):
     settings = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "image_size": 224, "num_register_tokens": 4}
     config = getattr(transformers, f"{kind}Config")(**settings, patch_size=14 if kind.startswith("Dinov2") else 16, intermediate_size=64)
     getattr(transformers, f"{kind}Model")(config).save_pretrained(tmp_path)
-    backend = backends.load("dinov2", str(tmp_path), tokens=12, rotations=2)
+    backend = features.load("dinov2", str(tmp_path), tokens=12, rotations=2)
     found = backend.propose(backend.prepare(reference), reference.view, reference.contour, None, 2).proposals
     token = reference.contour.size / 12
     assert np.hypot(*(found[0].pixel - reference.pixel)) < 1.5 * token and not found[0].flipped
@@ -161,13 +161,13 @@ def test_damaged_weights_and_absent_devices_have_codes(weights, tmp_path):
     cases = [(str(damaged), "cpu"), (weights, "nonsense")] + ([] if torch.cuda.is_available() else [(weights, "cuda")])
     for name, device in cases:
         with pytest.raises(MagicError) as caught:
-            backends.load("dinov2", name, device)
+            features.load("dinov2", name, device)
         assert caught.value.code == Code.FEATURE_WEIGHTS and device in caught.value.message
 
 
 def test_key_names_the_weights(weights, backend):
-    assert backend.key() == backends.load("dinov2", weights, tokens=14).key()
-    assert backend.key() != backends.load("dinov2", weights, tokens=12).key()
+    assert backend.key() == features.load("dinov2", weights, tokens=14).key()
+    assert backend.key() != features.load("dinov2", weights, tokens=12).key()
 
 
 def test_bad_weights_and_names_have_codes(tmp_path):
@@ -179,6 +179,6 @@ def test_bad_weights_and_names_have_codes(tmp_path):
         (("resnet", ""), Code.UNKNOWN_FEATURES),
     ):
         with pytest.raises(MagicError) as caught:
-            backends.load(*arguments)
+            features.load(*arguments)
         assert caught.value.code == code
-    assert backends.load("auto").name == "embedded"
+    assert features.load("auto").name == "embedded"

@@ -13,14 +13,14 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import from_trimesh
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.views import find_view, view_of_contact
-from magic_matcher import backends, contour, jobs, matching, plain, plausible
+from magic_matcher import contour, features, jobs, matching, plain, plausible
 from magic_matcher.cache import Cache
-from magic_matcher.features import make_reference
+from magic_matcher.global_stage import make_reference
 
 
 @pytest.fixture(scope="module")
 def matcher():
-    return matching.Matcher(backends.load("embedded"))
+    return matching.Matcher(features.load("embedded"))
 
 
 def reference_of(job, family, region, seed, radius):
@@ -305,7 +305,7 @@ def test_target_and_tools_are_chosen_where_none_is_named(demonstration):
         with pytest.raises(MagicError) as caught:
             matching.select(scene, found, ids, name)
         assert caught.value.code == code
-    result = matching.match(found, tools, target, backends.load("embedded"))
+    result = matching.match(found, tools, target, features.load("embedded"))
     assert result.target_id == "cylinder" and result.candidates[0].target.radius > 0
     # Nothing is planned below a hand.
     with pytest.raises(MagicError) as caught:

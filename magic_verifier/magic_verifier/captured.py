@@ -27,8 +27,8 @@ from magic_core.sensor import D435, STATION, scene_raycaster
 from magic_core.sensor import capture as photograph
 from magic_core.strategy import Physics, Strategy
 from magic_verifier import placing
-from magic_verifier.cases import Case, Meeting, scene_for, tool_object
 from magic_verifier.floating import settled
+from magic_verifier.subjects import Case, Meeting, scene_for, tool_object
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 #: Frames of each camera that are averaged, and the workspace: the perception node's defaults.

@@ -31,25 +31,10 @@ from magic_core.motion import MotionPlan
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import captured, placing, reliability
-from magic_verifier.cases import (
-    BASELINES,
-    METHODS,
-    SOURCES,
-    TARGET_SETS,
-    VARIANTS,
-    Case,
-    Meeting,
-    Options,
-    all_cases,
-    evaluated,
-    met_at,
-    scene_for,
-    short_name,
-    strategy_for,
-    tool_object,
-)
+from magic_verifier.cases import BASELINES, METHODS, SOURCES, TARGET_SETS, VARIANTS, Options, all_cases, evaluated, strategy_for
 from magic_verifier.feasibility import impossible
 from magic_verifier.floating import settled
+from magic_verifier.subjects import Case, Meeting, met_at, scene_for, short_name, tool_object
 from magic_verifier.verification import Limits, Verdict, wilson
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -78,7 +63,7 @@ def tested(options: Options, tool: str = "") -> dict[str, float]:
 
 @lru_cache(maxsize=4)
 def _matcher(features: str, weights: str, method: str) -> Any:
-    from magic_matcher.backends import load
+    from magic_matcher.features import load
     from magic_matcher.matching import Matcher
 
     if method == "no_feature_pca_patch":
@@ -306,7 +291,7 @@ def _seen(case: Case, problem: _Problem | None) -> list[dict[str, float]]:
 
 
 def _reference(strategy: Strategy) -> Any:
-    from magic_matcher.features import from_strategy
+    from magic_matcher.global_stage import from_strategy
 
     return from_strategy(strategy)
 

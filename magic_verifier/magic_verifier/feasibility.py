@@ -28,7 +28,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView
 from magic_core.strategy import Strategy
-from magic_verifier.cases import Case, load_object, scene_for
+from magic_verifier.subjects import Case, load_object, scene_for
 
 #: Turn of the border (degrees) that the goal of hooking needs, with a tenth off for outlines made of straight pieces.
 HOOK_TURN = 27.0

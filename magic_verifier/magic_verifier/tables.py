@@ -26,8 +26,9 @@ import numpy as np
 
 from magic_core.errors import Code, MagicError
 from magic_verifier import tables_report
-from magic_verifier.cases import TARGET_SETS, Case, Options, all_cases
+from magic_verifier.cases import TARGET_SETS, Options, all_cases
 from magic_verifier.evaluate import attempt
+from magic_verifier.subjects import Case
 
 #: The held-out mug of Table II's demonstration: no mug of the set has its seed.
 HELD_OUT_MUG = "mug:1000"

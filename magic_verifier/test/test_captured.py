@@ -15,8 +15,9 @@ from magic_core import transforms
 from magic_core.motion import MotionPlan
 from magic_verifier import captured, placing
 from magic_verifier import evaluate as ev
-from magic_verifier.cases import Case, Options, all_cases
+from magic_verifier.cases import Options, all_cases
 from magic_verifier.reliability import Judged, points, rows, table
+from magic_verifier.subjects import Case
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
 CASE = Case("caliper", ("caliper:50000",), "cylinder:0.025")

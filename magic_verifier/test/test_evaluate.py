@@ -23,8 +23,9 @@ from magic_core.rendering import Raycaster
 from magic_core.shapes import make
 from magic_verifier import evaluate as ev
 from magic_verifier import posing
-from magic_verifier.cases import METHODS, Options, all_cases, load_object, tool_names, tool_object
+from magic_verifier.cases import METHODS, Options, all_cases, tool_names
 from magic_verifier.simulation import sphere_of, usable_pieces
+from magic_verifier.subjects import load_object, tool_object
 from magic_verifier.toolsets import evaluation_of
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
@@ -151,7 +152,7 @@ def test_a_strategy_is_evaluated_by_its_folder_and_no_task_is_known_by_name(tmp_
     assert len(cases) == 36 and {case.target for case in cases} == {"block:1", "block:2", "block:3"}
     answer = ev.run_case(options, cases[0])
     assert answer["success"], answer
-    source = "".join(Path(ev.__file__).with_name(name).read_text() for name in ("evaluate.py", "cases.py", "toolsets.py"))
+    source = "".join(Path(ev.__file__).with_name(name).read_text() for name in ("evaluate.py", "cases.py", "subjects.py", "toolsets.py"))
     assert not [name for name in ("hooking", "hanging", "scooping", "pushing", "hammering") if f'"{name}"' in source]
 
 

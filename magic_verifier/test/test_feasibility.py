@@ -11,7 +11,8 @@ from magic_core import shapes
 from magic_core import strategy as strategies
 from magic_core.shapes.solids import stroke
 from magic_verifier import feasibility, placing
-from magic_verifier.cases import CONTROL_COUNT, Case, Options, all_cases, control_cases
+from magic_verifier.cases import CONTROL_COUNT, Options, all_cases, control_cases
+from magic_verifier.subjects import Case
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
 

@@ -15,7 +15,7 @@ from magic_core.motion import MotionPlan
 from magic_core.shapes import make
 from magic_planner.object_motion import plan_tool_motion
 from magic_verifier import evaluate as ev
-from magic_verifier.cases import scene_for
+from magic_verifier.subjects import scene_for
 from magic_verifier.verification import verify
 
 

@@ -27,7 +27,7 @@ from magic_core.scene import Scene
 from magic_core.sensor import capture, looking_at, scene_raycaster
 from magic_core.shapes import make
 from magic_core.strategy import Goal, Physics, load
-from magic_matcher.backends import load as load_features
+from magic_matcher.features import load as load_features
 from magic_matcher.matching import Matcher
 from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion

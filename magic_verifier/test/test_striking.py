@@ -16,7 +16,8 @@ from magic_core.motion import MotionPlan
 from magic_core.shapes import make
 from magic_planner.object_motion import plan_tool_motion
 from magic_verifier import evaluate as ev
-from magic_verifier.cases import Options, all_cases, scene_for, tool_names
+from magic_verifier.cases import Options, all_cases, tool_names
+from magic_verifier.subjects import scene_for
 from magic_verifier.verification import verify
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")

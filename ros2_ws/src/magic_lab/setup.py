@@ -31,6 +31,7 @@ setup(
         "trimesh",
         beside("magic_core"),
         beside("magic_bringup"),
+        beside("magic_server"),
         beside("magic_verifier"),
     ],
     zip_safe=False,

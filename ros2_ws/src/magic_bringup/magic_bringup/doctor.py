@@ -13,7 +13,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import GetParameters
@@ -21,6 +21,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
+from magic_bringup.connection import Client
 from magic_bringup.graph import NODES
 from magic_core import conversions, qos
 from magic_core.entry import version
@@ -32,9 +33,6 @@ from magic_core.tf_listener import TransformListener
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_interfaces.srv import MatchContact
 from magic_server.remote import servers_of
-
-if TYPE_CHECKING:
-    from magic_bringup.client import Client
 
 #: What is listened for at least, s: every node reports once a second.
 LISTEN = 3.0
