@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magic_bags import rgbd_to_bag
-from magic_bringup import demo, report
+from magic_bringup import demo, report, rgbd_to_bag
 from magic_core import conversions, transforms
 
 CAPTURE = Path(__file__).resolve().parents[2] / "shared" / "data" / "rgbd" / "realsense_single"

@@ -26,21 +26,18 @@ setup(
     ],
     install_requires=[
         "numpy<2",
-        "opencv-python-headless",
         "rosbags",
         beside("magic_core"),
-        beside("magic_perception"),
     ],
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",
-    description="Bags without rosbag2: player, recorder, and what makes a bag of a scene or of a picture.",
+    description="Bags without rosbag2: reading, writing, player and recorder.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             f"bag_player = {PACKAGE}.programs:bag_player",
             f"bag_recorder = {PACKAGE}.programs:bag_recorder",
-            f"rgbd_to_bag = {PACKAGE}.programs:rgbd_to_bag",
         ]
     },
 )

@@ -4,4 +4,3 @@ from magic_core.entry import program
 
 bag_player = program("magic_bags.bag_player")
 bag_recorder = program("magic_bags.bag_recorder")
-rgbd_to_bag = program("magic_bags.rgbd_to_bag")

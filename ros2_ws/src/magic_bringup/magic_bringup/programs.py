@@ -5,7 +5,7 @@ from magic_core.entry import program
 strategy_server = program("magic_server.strategy_server")
 magic = program("magic_bringup.client")
 report = program("magic_bringup.report")
-rgbd_to_bag = program("magic_bags.rgbd_to_bag")
+rgbd_to_bag = program("magic_bringup.rgbd_to_bag")
 bridge = program("magic_bringup.bridge")
 robot_model = program("magic_bringup.robot_model")
 bag_player = program("magic_bags.bag_player")

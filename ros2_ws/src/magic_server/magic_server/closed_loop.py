@@ -184,8 +184,13 @@ class ClosedLoop:
         meant |= {outcome.target_id} if self._touched else set()
         carried = None if self._held is None else self._held.hull(self._server.robot.forward(np.array(positions))[0])
         asked = replace(job.claim, start=positions, meant=frozenset(meant), carried=carried)
+        began = time.monotonic()
 
         def allowed() -> None:
+            # What the joints told before the last move's end was heard may be from on the way.
+            told = [joint.came for name, joint in self._server.joints.all().items() if name in asked.joints]
+            if told and min(told) <= began and time.monotonic() - min(told) <= self._limits.state_age:
+                raise NotYet(Code.STALE_DATA, "joint_states have not come since the last move ended")
             world = self._server.world(asked)
             permit(asked, replace(world, servers={**world.servers, **self._arm.servers()}), self._limits, Purpose.MOVE)
 

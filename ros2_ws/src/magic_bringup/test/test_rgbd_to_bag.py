@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from magic_bags import rgbd_to_bag
 from magic_bags.bag_file import info as read_info
+from magic_bringup import rgbd_to_bag
 from magic_core import images, transforms
 from magic_core import strategy as strategies
 from magic_core.camera import Intrinsics
