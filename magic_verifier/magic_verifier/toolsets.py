@@ -75,6 +75,11 @@ def evaluation_of(strategy: Strategy) -> Evaluation:
         tools = ToolSet(**given)
         if not tools.tools and not (tools.each and tools.count > 0):
             raise MagicError(Code.BAD_STRATEGY, path, entry, "tools, or each with a count above 0")
+        for each in tools.each:
+            try:
+                each.format(0)
+            except (IndexError, KeyError, ValueError) as error:
+                raise MagicError(Code.BAD_STRATEGY, f"{path}.each", each, "a name with {} where its number goes") from error
         sets[str(name)] = tools
     more = {key: tuple(data[key]) for key in ("targets", "near_misses") if data.get(key)}
     found = Evaluation(

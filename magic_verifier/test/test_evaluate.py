@@ -163,6 +163,7 @@ def test_a_strategy_is_evaluated_by_its_folder_and_no_task_is_known_by_name(tmp_
         ({"tools": []}, "environment.evaluation: key: 'tools'"),
         ({"sets": {"own": {"tool": []}}}, "environment.evaluation.sets.own: key: 'tool'"),
         ({"sets": {"own": {"each": ["mug:{}"]}}}, "tools, or each with a count above 0"),
+        ({"sets": {"own": {"each": ["mug:{}", "mug:{seed}"], "count": 2}}}, "a name with {} where its number goes"),
         ({"values": {"distanse": 1.0}}, "goal.values of the tree: 'distanse'"),
     ],
 )

@@ -429,9 +429,13 @@ class ClosedLoop:
 
     def _judge(self, job: Job) -> str:
         """Look whether the goal is met, twice, so that what moves is seen to move; raises GOAL_MISSED, GOAL_UNSEEN."""
+        settle, apart = seen_goal.patience(self._strategy, self._settings.accuracy)
         self._say("looking whether the goal is met")
-        first = self._fresh()
-        second = None if first is None else self._fresh(math.nextafter(conversions.time_from_msg(first.header.stamp), math.inf))
+        first = self._fresh(self._now() + max(settle, SETTLED))
+        second = None
+        if first is not None:
+            stamp = conversions.time_from_msg(first.header.stamp)
+            second = self._fresh(max(stamp + apart, math.nextafter(stamp, math.inf)))
         if first is None or second is None:
             raise MagicError(
                 Code.GOAL_UNSEEN, f"carried out, but no picture came within {self._settings.look_time:g} s that shows what came of it"

@@ -38,6 +38,8 @@ SURFACE = 1000
 HAND = ("hand", "arm", "fingers")
 #: After these phases' beginning the tool acts no more.
 ENDING = ("retreat",)
+#: Looks are put no farther apart than this to tell slow motions, s.
+APART = 5.0
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,18 @@ class Hand:
 
     released: bool
     away: float | None = None
+
+
+def patience(strategy: Strategy, accuracy: float) -> tuple[float, float]:
+    """How long after the motion a goal is to be looked at first, and how far apart the two looks have to be at least, s.
+
+    The first is the longest time that the goal lets things settle; the second what tells a thing at rest from one that moves by the
+    goal's bound, where its place is known to ``accuracy`` (m), at most :data:`APART`: what is slower than that shows cannot be told.
+    """
+    nodes = list(strategy.goal.tree.nodes())
+    settle = max((n.after.args["settle"] for n in nodes if n.after is not None and n.after.kind == "settle"), default=0.0)
+    apart = max((2 * accuracy / n.args["below"] for n in nodes if n.kind == "at_rest" and n.args["below"] > 0), default=0.0)
+    return float(settle), min(float(apart), APART)
 
 
 def judge(
@@ -263,8 +277,7 @@ class _Asked:
     def _at_rest(self, what: str, below: float, turning: float) -> _Told:
         way = float(np.linalg.norm(self.thing(what, self.now).middle - self.thing(what, self.first).middle))
         seconds = max(self.now.stamp - self.first.stamp, 1e-3)
-        text = f"the {what} moved {1000 * way:.0f} mm in {seconds:.1f} s"
-        return _Told(True, text) if way <= self.accuracy else self.at_least(-way, -below * seconds, self.accuracy, text)
+        return self.at_least(-way, -below * seconds, self.accuracy, f"the {what} moved {1000 * way:.0f} mm in {seconds:.1f} s")
 
     def _released(self) -> _Told:
         return _Told(self.hand.released, "the tool was let go" if self.hand.released else "the tool is in the hand")

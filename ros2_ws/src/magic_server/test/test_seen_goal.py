@@ -8,7 +8,7 @@ import trimesh
 
 from magic_core import goal, transforms
 from magic_core.mesh import from_trimesh
-from magic_server.seen_goal import Hand, Sight, Thing, judge
+from magic_server.seen_goal import APART, Hand, Sight, Thing, judge, patience
 from magic_server.testing import fakes
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -244,6 +244,24 @@ def test_two_looks_tell_how_fast_things_are():
     for place, met in ((0.502, True), (0.504, True), (0.506, False)):
         found = asked(rest, BESIDE, {**BESIDE, "object_2": at(place)}, then=BESIDE, seconds=0.5, accuracy=1e-5)
         assert found.met is met, found.message
+
+
+def test_what_creeps_is_not_at_rest_by_two_looks_at_once():
+    """Two pictures a fifth of a second apart cannot tell a thing that creeps at the bound from one that stands."""
+    rest = tree({"at_rest": {"what": "target", "below": 0.02}})
+    assert asked(rest, BESIDE, BESIDE, seconds=0.2).met is None
+    settle, apart = patience(replace(fakes.strategy(), goal=rest), 0.005)
+    assert (settle, apart) == (0.0, pytest.approx(0.5))
+    for speed, met in ((0.0, True), (0.05, False)):
+        moved = {**BESIDE, "object_2": at(0.5 + speed * (apart + 0.01))}
+        assert asked(rest, BESIDE, moved, then=BESIDE, seconds=apart + 0.01).met is met
+
+
+def test_the_longest_settling_is_waited_for():
+    test = {"all": [FAR, {"all": [FAR], "after": {"settle": 0.5}}, {"all": [FAR], "after": {"settle": "long"}}]}
+    assert patience(replace(fakes.strategy(), goal=tree(test, values={"long": 2.25})), 0.005) == (2.25, 0.0)
+    crawl = tree({"at_rest": {"what": "target", "below": 0.001}})
+    assert patience(replace(fakes.strategy(), goal=crawl), 0.005) == (0.0, APART), "and not for ever"
 
 
 def test_what_is_measured_by_the_target_asks_that_it_was_seen():
