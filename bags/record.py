@@ -24,7 +24,7 @@ from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
-from magic_core.sensor import D435, STATION, capture, looking_at, scene_raycaster
+from magic_core.sensor import D435, SMEARED, STATION, capture, looking_at, scene_raycaster
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures, pose_data
 from magic_core.strategy import Strategy
@@ -212,7 +212,7 @@ def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, 
     """A scene at rest: static transforms and known objects first, then frames and joint states in the order of time."""
     caster = scene_raycaster([t.mesh for t in things])
     frames = [
-        capture([], D435, pose, [seed, index, number], camera=name, stamp=START + 0.1 + index * PERIOD, raycaster=caster)
+        capture([], D435, pose, [seed, index, number], camera=name, stamp=START + 0.1 + index * PERIOD, raycaster=caster, model=SMEARED)
         for index in range(FRAMES)
         for number, (name, pose) in enumerate(cameras.items())
     ]
@@ -300,7 +300,7 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
             ]
             caster = scene_raycaster(meshes)
             frames = [
-                capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=START + 0.1 + t, raycaster=caster)
+                capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=START + 0.1 + t, raycaster=caster, model=SMEARED)
                 for number, (name, pose) in enumerate(cameras.items())
             ]
             first = first or frames

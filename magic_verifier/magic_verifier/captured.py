@@ -3,7 +3,7 @@
 :func:`lay_out` puts the true objects on the table: the target and its fixtures where
 the demonstration had them, each tool in a turn drawn by the seed, where nothing else
 stands, as it comes to rest.  :func:`capture` looks at them with the model of two
-D435 (:mod:`magic_core.sensor`), :func:`perceive` reconstructs them as the perception
+D435 that smear depth past edges and over small holes (:data:`magic_core.sensor.SMEARED`), :func:`perceive` reconstructs them as the perception
 node does, and :func:`pair` says which reconstruction is which thing.  Everything after that
 (match, plan, verify) sees the reconstructions alone.  :func:`judge` carries the motion
 out once more, on the true meshes, with a friction and densities that the strategy
@@ -23,7 +23,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.motion import MotionPlan
 from magic_core.scene import Scene, SceneObject
-from magic_core.sensor import D435, STATION, scene_raycaster
+from magic_core.sensor import D435, SMEARED, STATION, scene_raycaster
 from magic_core.sensor import capture as photograph
 from magic_core.strategy import Physics, Strategy
 from magic_verifier import placing
@@ -93,7 +93,8 @@ def capture(layout: Layout, case: Case, seed: int) -> list[RgbdFrame]:
     frames = []
     for number, (name, pose) in enumerate(STATION.items()):
         shots = [
-            photograph([], D435, pose, [*placing.seed_of(case.name, seed), number, k], camera=name, raycaster=caster) for k in range(FRAMES)
+            photograph([], D435, pose, [*placing.seed_of(case.name, seed), number, k], camera=name, raycaster=caster, model=SMEARED)
+            for k in range(FRAMES)
         ]
         frames.append(average(shots))
     return frames

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Header
@@ -128,11 +128,13 @@ class StrategyServer(LifecycleNode):
         self._server_name = self.resolve_service_name("run_strategy")
         self._outlet = Outlet(self, self.robot.base_frame)
         self.publication = Publication(self._outlet, self.world, self._limits)
+        # What comes on a topic is taken in the order in which it came: two at a time, the older could be the one that stays.
+        one, two, three = (MutuallyExclusiveCallbackGroup() for _ in range(3))
         self.objects_topic = self.create_subscription(
-            SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=group
+            SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=one
         ).topic_name
-        self.create_subscription(JointState, "joint_states", self._on_joints, qos.SENSOR, callback_group=group)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=group)
+        self.create_subscription(JointState, "joint_states", self._on_joints, qos.SENSOR, callback_group=two)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=three)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self._frames_pub = self.create_publisher(TFMessage, "/tf_static", qos.LATCHED)
         self._server = ActionServer(

@@ -259,6 +259,8 @@ class FakeArm(Node):
         self.tells, self.squeezes = True, False
         self.late = self.velocity = 0.0
         self.apart = False
+        #: Where the joints are is told in the order in which they were there.
+        self._telling = threading.Lock()
         self.moving, self.admits = threading.Event(), threading.Event()
         self.admits.set()
         self.asked = threading.Event()
@@ -280,8 +282,11 @@ class FakeArm(Node):
         self.create_timer(0.02, self._tell, callback_group=group)
 
     def _tell(self) -> None:
-        if not self.tells:
-            return
+        with self._telling:
+            if self.tells:
+                self._publish_state()
+
+    def _publish_state(self) -> None:
         fingers, arm = [self.opening / 2] * len(FINGERS), list(self.positions)
         parts = [(JOINTS, arm), (FINGERS, fingers)] if self.apart else [((*FINGERS, *JOINTS), fingers + arm)]
         stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
@@ -306,7 +311,8 @@ class FakeArm(Node):
         elif code:
             handle.abort()
         else:
-            self.positions = list(trajectory.points[-1].positions)
+            with self._telling:
+                self.positions = list(trajectory.points[-1].positions)
             self._tell()
             handle.succeed()
         return result
