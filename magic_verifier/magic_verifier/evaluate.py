@@ -329,7 +329,8 @@ def _try(
     finally:
         seconds["plan"] += time.perf_counter() - started
     limits = Limits(required_rate=options.required_rate)
-    verdict = verify(strategy, tool, target, obstacles, table, candidate, plan, seed=options.seed, limits=limits)
+    asked = (strategy, tool, target, obstacles, table, candidate, plan)
+    verdict = verify(*asked, seed=options.seed, limits=limits, tried=answer["simulations"])
     seconds["verify"] += verdict.seconds
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}

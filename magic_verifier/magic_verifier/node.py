@@ -172,7 +172,7 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
-        asked = digest((goal.strategy, tool, target, obstacles, table, candidate, plan, goal.repetitions, goal.seed))
+        asked = digest((goal.strategy, tool, target, obstacles, table, candidate, plan, goal.repetitions, goal.seed, goal.tried))
         if goal.want_film and self._last is not None and asked == self._last[0]:
             return self._with_film(self._last[1], tool, target, obstacles, table)
         verdict = verify(
@@ -195,6 +195,7 @@ class VerifierNode(Node):
             robot=self._robot,
             pool=self._pool.executor,
             workers=self._pool.count,
+            tried=int(goal.tried),
         )
         self.get_logger().info(
             f"{goal.strategy} {plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ LEAD, NEAR = 0.1, 0.03
 #: How an arm's hand yields (N/m): a usual stiffness of Cartesian impedance control.
 STIFFNESS = 2000.0
 #: Two-sided 95 % of the normal distribution.
-Z95 = 1.959964
+Z95 = NormalDist().inv_cdf(0.975)
 #: A parameter is named as the cause of failures if as clean a separation by any of the parameters had a chance of less than this.
 BY_CHANCE = 0.05
 
@@ -115,7 +116,7 @@ class Recording:
 class Verdict:
     """The answer: code OK exactly where success.
 
-    success_rate over the rollouts with its 95 % interval (rate_low, rate_high); failures: reasons of the failing ones with their
+    success_rate over the rollouts with its interval (rate_low, rate_high), 95 % or what :func:`level` says; failures: reasons of the failing ones with their
     counts; runs: what each rollout came to, the scene as given first; metrics and recording of the judged run (the first one that
     failed, else the first); simulated seconds over all runs, seconds of wall time.
     """
@@ -145,15 +146,25 @@ def wilson(successes: int, count: int, z: float = Z95) -> tuple[float, float]:
     return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
 
 
-def decided(successes: int, count: int, most: int, required: float) -> bool:
+def level(tried: int) -> float:
+    """The level of a motion's interval, where so many motions for the same task were tried before it: each try shares the 5 % that an
+    interval may be wrong by (Bonferroni), as one of many that fail now and then is found to pass by chance."""
+    return 1 - 0.05 / (1 + tried)
+
+
+def _z(tried: int) -> float:
+    return NormalDist().inv_cdf((1 + level(tried)) / 2)
+
+
+def decided(successes: int, count: int, most: int, required: float, z: float = Z95) -> bool:
     """Whether no further rollout is needed: the interval lies on one side of the required rate, or can no more come above it."""
-    low, high = wilson(successes, count)
-    return low >= required or high < required or wilson(successes + most - count, most)[0] < required
+    low, high = wilson(successes, count, z)
+    return low >= required or high < required or wilson(successes + most - count, most, z)[0] < required
 
 
-def passes(successes: int, count: int, required: float) -> bool:
+def passes(successes: int, count: int, required: float, z: float = Z95) -> bool:
     """Whether a success rate is shown to be no lower than required."""
-    return successes > 0 and wilson(successes, count)[0] >= required
+    return successes > 0 and wilson(successes, count, z)[0] >= required
 
 
 class _Recorder:
@@ -483,10 +494,10 @@ def from_held(task: Task, first: Outcome) -> Task:
     return task if first.held is None else replace(task, held=first.held, start=first.held.time)
 
 
-def _least_more(passed: int, count: int, most: int, required: float) -> int:
+def _least_more(passed: int, count: int, most: int, required: float, z: float) -> int:
     """How many further rollouts it takes at least until it is decided."""
     for more in range(1, most - count + 1):
-        if decided(passed + more, count + more, most, required) or decided(passed, count + more, most, required):
+        if decided(passed + more, count + more, most, required, z) or decided(passed, count + more, most, required, z):
             return more
     return most - count
 
@@ -500,9 +511,10 @@ def rollouts(
     workers: int = 0,
     stop: Any = None,
     progress: Callable[[str, float], None] | None = None,
+    z: float = Z95,
 ) -> list[Outcome]:
     """The outcomes of the rollouts in the order of their numbers, the ``first`` among them, until it is decided whether the required
-    rate is reached (``None``: all of them).
+    rate is reached (``None``: all of them).  z: of the interval, in standard deviations.
 
     With a pool others compute some of them meanwhile, to the same outcomes, none beyond those that are needed at least: which
     ones are computed where depends on who is ready first, what comes of them does not.
@@ -518,9 +530,9 @@ def rollouts(
         while len(outcomes) < most:
             end = most
             if required is not None:
-                if len(outcomes) > 1 and decided(passed, len(outcomes), most, required):
+                if len(outcomes) > 1 and decided(passed, len(outcomes), most, required, z):
                     break
-                end = len(outcomes) + _least_more(passed, len(outcomes), most, required)
+                end = len(outcomes) + _least_more(passed, len(outcomes), most, required, z)
             for index in [i for i, future in waiting.items() if future.done()]:
                 future = waiting.pop(index)
                 if isinstance(future.exception(), BrokenExecutor):
@@ -600,6 +612,7 @@ def verify(
     robot: Description | None = None,
     pool: Executor | None = None,
     workers: int = 1,
+    tried: int = 0,
 ) -> Verdict:
     """Simulate a plan and judge it.
 
@@ -608,7 +621,8 @@ def verify(
     repetitions: rollouts at most (0: :data:`ROLLOUTS`).  The first is the scene as given; if it fails, so does the verdict.  Success
     means that the lower end of the 95 % interval of the success rate is no lower than ``limits.required_rate``; the rollouts end when
     that is decided.  ``repetitions=1`` simulates the scene as given alone and judges by it, whatever the required rate: the interval
-    then says how little that is.
+    then says how little that is.  ``tried``: motions that were simulated for the same task before this one; the more, the wider is the
+    interval (:func:`level`).
 
     ``spreads``: what is drawn (default: the file that ships); ``deadline``: a moment of ``time.monotonic()``; ``cancel`` is asked every
     few steps; ``progress`` hears phase and simulated time.  ``robot``: the arm of an arm plan, ``None`` for the Panda; ``arm_options``:
@@ -632,34 +646,36 @@ def verify(
         task = make_task(strategy, tool, target, tuple(obstacles), table, plan, seed, settings, spreads, limits, arm_options, robot)
         outcomes.append(rollout(task, 0, stop, progress))
         if outcomes[0].judgement.code == Code.OK and most > 1:
-            outcomes = rollouts(task, outcomes[0], most, limits.required_rate, pool, workers, stop, progress)
+            outcomes = rollouts(task, outcomes[0], most, limits.required_rate, pool, workers, stop, progress, _z(tried))
             passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
-            shown = _shown(outcomes, passed, most, limits.required_rate)
+            shown = _shown(outcomes, passed, most, limits.required_rate, _z(tried))
             if shown > 0:  # recording costs, and of the drawn rollouts one is looked at: the same again, recorded
                 outcomes[shown] = rollout(from_held(task, outcomes[0]), shown, stop)
     except MagicError as error:
         runs = tuple(outcome.judgement for outcome in outcomes)
         return Verdict(False, error.code, error.message, 0.0, {}, simulated(), elapsed(), None, runs)
-    return _verdict(task, outcomes, most, simulated(), elapsed())
+    return _verdict(task, outcomes, most, tried, simulated(), elapsed())
 
 
-def _shown(outcomes: list[Outcome], passed: int, most: int, required: float) -> int:
+def _shown(outcomes: list[Outcome], passed: int, most: int, required: float, z: float) -> int:
     """Which rollout a verdict shows: the first one that failed where it is a no, else the scene as given."""
-    if most == 1 or passed == len(outcomes) or passes(passed, len(outcomes), required):
+    if most == 1 or passed == len(outcomes) or passes(passed, len(outcomes), required, z):
         return 0
     return next(i for i, outcome in enumerate(outcomes) if outcome.judgement.code != Code.OK)
 
 
-def _verdict(task: Task, outcomes: list[Outcome], most: int, simulated: float, seconds: float) -> Verdict:
+def _verdict(task: Task, outcomes: list[Outcome], most: int, tried: int, simulated: float, seconds: float) -> Verdict:
     judgements = [outcome.judgement for outcome in outcomes]
     passed = [j.code == Code.OK for j in judgements]
     count, good, required = len(passed), sum(passed), task.limits.required_rate
-    low, high = wilson(good, count)
-    success = passed[0] and (most == 1 or passes(good, count, required))
-    shown = _shown(outcomes, good, most, required)
+    z = _z(tried)
+    low, high = wilson(good, count, z)
+    success = passed[0] and (most == 1 or passes(good, count, required, z))
+    shown = _shown(outcomes, good, most, required, z)
     failures = reasons(task, judgements)
     code, message = judgements[shown].code, judgements[shown].message
-    rate = f"{good} of {count} rollouts passed (95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
+    before = f", for {tried} tried before" if tried else ""
+    rate = f"{good} of {count} rollouts passed ({100 * level(tried):.3g} % interval{before} {100 * low:.0f} to {100 * high:.0f} %)"
     if success:
         code = Code.OK
         message += f"; {rate}" if most > 1 else "; the scene as given alone, nothing varied"

@@ -94,6 +94,8 @@ class Stages:
         self.state_known = False
         self.matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
+        #: Motions that the verifier was asked for.
+        self._tried = 0
         self._last_code = 0
 
     def perceive(self, request: pipeline.Request, timeout: float) -> tuple[pipeline.Request, str]:
@@ -341,8 +343,10 @@ class Stages:
             plan=plan,
             repetitions=server.settings.repetitions,
             seed=request.seed,
+            tried=self._tried,
             timeout=timeout,
         )
+        self._tried += 1
         with self._minding(server.verifier):
             answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
         result = answer.result

@@ -97,6 +97,7 @@ def test_nothing_unverified_is_published(bench):
         ("turn", Code.DRIFT, "it drifted"),
         ("keep", Code.DRIFT, "it drifted"),
     ]
+    assert [goal.tried for what, goal in bench.fakes.goals if what == "verify_motion"] == [0, 1, 2, 3]
     bench.wait(lambda: bench.messages["markers"])
     texts = [m.text for m in bench.messages["markers"][-1].markers if m.ns == "reasons"]
     assert len(texts) == 3
