@@ -70,7 +70,8 @@ class Perception(Node):
     mono8), ``camera/NAME/color/camera_info`` and ``camera/NAME/aligned_depth_to_color/image_raw`` (16UC1 mm or 32FC1 m);
     where an image is not published but its ``/compressed`` or ``/compressedDepth`` is, those;
     with ``aligned`` false, ``camera/NAME/depth/image_rect_raw`` and ``camera/NAME/depth/camera_info`` instead, and depth
-    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``joint_states``: the robot
+    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``obstacles`` (latched): what other
+    software knows of; ``joint_states``: the robot
     (parameters ``robot.*``) is cut out of every picture.
     Publishes ``objects`` and ``perception/markers`` (latched), ``/diagnostics`` (1 Hz).
     """
@@ -120,8 +121,9 @@ class Perception(Node):
 
         self.streams = {camera: Stream(camera, tolerance, self.count + WAITING) for camera in self.cameras}
         self.tracker = Tracker()
-        self.known: tuple[SceneObject, ...] = ()
-        self.known_problem: tuple[Code, str] | None = None
+        # By topic: calibrated fixtures, and what other software knows of.
+        self.known: dict[str, tuple[SceneObject, ...]] = {}
+        self.known_problems: dict[str, tuple[Code, str]] = {}
         self.unheard: dict[str, str] = {}
         self.distortion: dict[str, float] = {}
         # Of each camera: the share of its last picture that was cut as the robot, or why it was not.
@@ -143,7 +145,8 @@ class Perception(Node):
         self.topics = {camera: self._subscribe(camera, inputs) for camera in self.cameras}
         self.compressed: dict[tuple[str, str], Subscription] = {}
         self.transforms = TransformListener(self, inputs, self.lock)
-        self.listen(SceneObjectArray, "known_objects", self.on_known, LATCHED, inputs)
+        for topic in ("known_objects", "obstacles"):
+            self.listen(SceneObjectArray, topic, partial(self.on_known, topic), LATCHED, inputs)
         if self.robot is not None:
             self.create_subscription(JointState, "joint_states", self.on_joints, SENSOR, callback_group=inputs)
         wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
@@ -328,19 +331,24 @@ class Perception(Node):
                 code, message = describe(self, error)
                 stream.wrong(what, Code(code), f"{self.topics[camera][what]}: {message}", now)
 
-    def on_known(self, msg: SceneObjectArray) -> None:
-        """Calibrated fixtures."""
+    def on_known(self, topic: str, msg: SceneObjectArray) -> None:
+        """Calibrated fixtures, and obstacles that other software tells."""
         try:
             if msg.header.frame_id and msg.header.frame_id.lstrip("/") != self.frame:
-                raise MagicError(Code.NO_TRANSFORM, "frame of known_objects", msg.header.frame_id, self.frame)
+                raise MagicError(Code.NO_TRANSFORM, f"frame of {topic}", msg.header.frame_id, self.frame)
             known = cv.scene_from_msg(msg).objects
             with self.lock:
-                self.known, self.known_problem = known, None
+                others = [item.id for name, items in self.known.items() if name != topic for item in items]
+                twice = sorted({item.id for item in known} & set(others))
+                if twice:
+                    raise MagicError(Code.BAD_REQUEST, f"ids of {topic}", ", ".join(twice), "ids that no other known object has")
+                self.known[topic] = known
+                self.known_problems.pop(topic, None)
                 self.again = True
         except Exception as error:
             code, message = describe(self, error)
-            self.known_problem = (Code(code), f"known_objects: {message}")
-            self.get_logger().error(self.known_problem[1])
+            self.known_problems[topic] = (Code(code), f"{topic}: {message}")
+            self.get_logger().error(self.known_problems[topic][1])
 
     def on_joints(self, msg: JointState) -> None:
         """Where the arm's joints are."""
@@ -366,7 +374,7 @@ class Perception(Node):
                 return
             self.last_run = now
             with self.lock:
-                known = self.known
+                known = tuple(item for items in self.known.values() for item in items)
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
             scene = perceive(frames, known, self.parameters, self.segmenter, report, earlier)
@@ -624,8 +632,7 @@ class Perception(Node):
         for topic, message in self.unheard.items():
             message = f"[{int(Code.NO_FRAMES)} QoS] {message}"
             states.append(pc.status(f"{label(self)}: topic {topic}", DiagnosticStatus.ERROR, message, Code.NO_FRAMES, {}))
-        if self.known_problem is not None:
-            code, message = self.known_problem
+        for code, message in list(self.known_problems.values()):
             message = f"[{int(code)} {code.name}] {message}"
             states.append(pc.status(f"{label(self)}: known objects", DiagnosticStatus.ERROR, message, code, {}))
         for state in states:

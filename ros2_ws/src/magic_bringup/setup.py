@@ -63,6 +63,7 @@ setup(
             "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
             "bag_player = magic_bringup.programs:bag_player",
             "bridge = magic_bringup.programs:bridge",
+            "detected_objects = magic_bringup.programs:detected_objects",
             "robot_model = magic_bringup.programs:robot_model",
             "bag_recorder = magic_bringup.programs:bag_recorder",
             "trials = magic_bringup.programs:trials",

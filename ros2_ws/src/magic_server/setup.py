@@ -31,6 +31,7 @@ setup(
         "trimesh",
         beside("magic_core"),
     ],
+    extras_require={"trees": ["py_trees"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

@@ -66,6 +66,8 @@ class Robot(Server, Protocol):
 
     def get_clock(self) -> Any: ...
 
+    def tell_held(self, held: Held | None) -> None: ...
+
     def get_parameter(self, name: str) -> Any: ...
 
 
@@ -119,13 +121,23 @@ class ClosedLoop:
         self.jobs, self.tried = [first], [first.outcome]
         self.notes: list[str] = []
         self.executed = False
-        self._held: Held | None = None
+        self._in_hand: Held | None = None
         #: Where the hand (3,) let the tool go, in the base's frame.
         self._let_go: NDArray[np.float64] | None = None
         self._touched = self._may_touch = False
         self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
         self._simulated = bool(server.get_parameter("use_sim_time").value)
         self._bounds = Bounds(settings.executions, settings.replans, time.monotonic() + settings.seconds)
+
+    @property
+    def _held(self) -> Held | None:
+        """What the hand holds."""
+        return self._in_hand
+
+    @_held.setter
+    def _held(self, held: Held | None) -> None:
+        self._in_hand = held
+        self._server.tell_held(held)
 
     # ------------------------------------------------------------ the loop
 
@@ -373,7 +385,7 @@ class ClosedLoop:
     def _corrected(self, job: Job, held: Held) -> Job:
         """The rest of the motion, planned anew from the tool's pose as it is: the same contact first."""
         trial = job.outcome.reports[-1].trial
-        stages = self._in_hand(held, job.stages)
+        stages = self._stages_in_hand(held, job.stages)
         others = [r for r in self._strategy.reflections if r != trial.reflection]
         worse = {id(c): index for index, c in enumerate(job.stages.matches.candidates)}
         outcome = self._work(
@@ -399,7 +411,7 @@ class ClosedLoop:
         outcome = self._work(request, stages, self._strategy.reflections, self._made)
         return Job(outcome, stages, self._claim(outcome, stages), held)
 
-    def _in_hand(self, held: Held, before: Stages) -> HeldStages:
+    def _stages_in_hand(self, held: Held, before: Stages) -> HeldStages:
         return HeldStages(
             self._server, self._token, self._run, self._strategy.simulatable, held, self.jobs[-1].claim.scene.objects, -math.inf, before
         )

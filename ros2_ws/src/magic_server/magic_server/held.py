@@ -47,6 +47,10 @@ class Held:
             return True
         return item.id not in known and scene_change.contained(hull_of(item), self.hull(world_from_tcp), scene_change.ABOUT)
 
+    def in_hand(self) -> SceneObject:
+        """The object in the frame of the hand's tip."""
+        return self.at(np.eye(4))
+
     def at(self, world_from_tcp: NDArray[np.float64]) -> SceneObject:
         """The object with the hand at a pose; the points seen of it before are left out."""
         item, pose = copy.copy(self.tool), self.pose(world_from_tcp)

@@ -38,7 +38,7 @@ from magic_server import interop, markers, pipeline
 from magic_server import settings as parameters
 from magic_server.arm import Arm
 from magic_server.closed_loop import ClosedLoop, Job
-from magic_server.held import HeldStages
+from magic_server.held import Held, HeldStages
 from magic_server.joints import JointStates
 from magic_server.outlet import Motion, Outlet
 from magic_server.permission import RECORDED, Claim, Limits, Look, NotYet, Verdict, World
@@ -71,7 +71,8 @@ class StrategyServer(LifecycleNode):
     Publishes
         verified_trajectory (JointTrajectory, latched, variant arm), verified_tool_trajectory (MultiDOFJointTrajectory,
         latched, variant fg), verified_motion (VerifiedMotion, latched, at 1 Hz besides), strategy/markers (MarkerArray, latched),
-        /tf_static (the contacts of the candidate tried last, ``<object>/contact``),
+        /tf_static (the contacts of the candidate tried last, ``<object>/contact``), in_hand (SceneObjectArray, latched: what this
+        node has made the hand hold, in the frame of the link between the fingertips; empty after it has let go),
         /diagnostics at 1 Hz.  A trajectory is published, and the arm moves, only where :mod:`magic_server.permission` says so;
         it is taken back, by an empty one, at the start, when the next run begins, when objects or arm are elsewhere, at the end.
     With ``execute``, calls also
@@ -137,6 +138,7 @@ class StrategyServer(LifecycleNode):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=three)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self._frames_pub = self.create_publisher(TFMessage, "/tf_static", qos.LATCHED)
+        self._held_pub = self.create_publisher(SceneObjectArray, "in_hand", qos.LATCHED)
         self._server = ActionServer(
             self,
             RunStrategy,
@@ -274,6 +276,11 @@ class StrategyServer(LifecycleNode):
         if kept is None or kept[0] is not scene:
             kept = self._look = scene, look_at(self.in_base(scene))
         return replace(kept[1], came=came, stamp=conversions.time_from_msg(scene.header.stamp))
+
+    def tell_held(self, held: Held | None) -> None:
+        """Tell everybody what the hand holds from now on."""
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.robot.config.move_group)
+        self._held_pub.publish(SceneObjectArray(header=header, objects=[held.in_hand()] if held is not None else []))
 
     def hand(self) -> NDArray[np.float64]:
         """base_from_tcp (4, 4) as the joints were last heard; raises NO_FRAMES where one was not."""

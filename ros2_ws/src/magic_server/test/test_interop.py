@@ -1,132 +1,32 @@
-"""Messages of software that is not installed here, built against their definitions.
-
-The field lists are those of vision_msgs 4.1, moveit_msgs 2.6 and control_msgs 5 (ROS 2 Jazzy), as far as they are used; where a package is
-installed, its own definitions are compared with them.
-"""
+"""Messages of software that is not installed here, built against their definitions (``foreign.py``)."""
 
 from array import array
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Pose, PoseWithCovariance, Vector3
+from foreign import CONSTANTS, DEFINITIONS, MOVEIT, PARALLEL, VISION, stand_in
+from geometry_msgs.msg import Pose
 from sensor_msgs.msg import JointState
-from shape_msgs.msg import Mesh, Plane, SolidPrimitive
 from std_msgs.msg import Header
-from trajectory_msgs.msg import JointTrajectory, MultiDOFJointTrajectory
 
-from magic_core import conversions
+from magic_core import conversions, transforms
 from magic_core.errors import Code, MagicError
+from magic_core.robot import Description
+from magic_interfaces.action import RunStrategy
+from magic_interfaces.msg import SceneObjectArray
 from magic_server import gripper, interop
+from magic_server.held import Held
 from magic_server.testing import fakes
-
-STANDARD = {
-    "std_msgs/Header": Header,
-    "geometry_msgs/Pose": Pose,
-    "geometry_msgs/Vector3": Vector3,
-    "geometry_msgs/PoseWithCovariance": PoseWithCovariance,
-    "shape_msgs/Mesh": Mesh,
-    "shape_msgs/Plane": Plane,
-    "shape_msgs/SolidPrimitive": SolidPrimitive,
-    "trajectory_msgs/JointTrajectory": JointTrajectory,
-    "trajectory_msgs/MultiDOFJointTrajectory": MultiDOFJointTrajectory,
-    "sensor_msgs/JointState": JointState,
-}
-PLAIN = {"string": str, "double": float, "boolean": bool, "octet": bytes}
-DEFINITIONS = {
-    "vision_msgs": {
-        "ObjectHypothesis": {"class_id": "string", "score": "double"},
-        "ObjectHypothesisWithPose": {"hypothesis": "vision_msgs/ObjectHypothesis", "pose": "geometry_msgs/PoseWithCovariance"},
-        "BoundingBox3D": {"center": "geometry_msgs/Pose", "size": "geometry_msgs/Vector3"},
-        "Detection3D": {
-            "header": "std_msgs/Header",
-            "results": "sequence<vision_msgs/ObjectHypothesisWithPose>",
-            "bbox": "vision_msgs/BoundingBox3D",
-            "id": "string",
-        },
-        "Detection3DArray": {"header": "std_msgs/Header", "detections": "sequence<vision_msgs/Detection3D>"},
-    },
-    "moveit_msgs": {
-        "CollisionObject": {
-            "header": "std_msgs/Header",
-            "pose": "geometry_msgs/Pose",
-            "id": "string",
-            "primitives": "sequence<shape_msgs/SolidPrimitive>",
-            "primitive_poses": "sequence<geometry_msgs/Pose>",
-            "meshes": "sequence<shape_msgs/Mesh>",
-            "mesh_poses": "sequence<geometry_msgs/Pose>",
-            "planes": "sequence<shape_msgs/Plane>",
-            "plane_poses": "sequence<geometry_msgs/Pose>",
-            "subframe_names": "sequence<string>",
-            "subframe_poses": "sequence<geometry_msgs/Pose>",
-            "operation": "octet",
-        },
-        "AttachedCollisionObject": {
-            "link_name": "string",
-            "object": "moveit_msgs/CollisionObject",
-            "touch_links": "sequence<string>",
-            "detach_posture": "trajectory_msgs/JointTrajectory",
-            "weight": "double",
-        },
-        "RobotState": {"attached_collision_objects": "sequence<moveit_msgs/AttachedCollisionObject>", "is_diff": "boolean"},
-        "PlanningSceneWorld": {"collision_objects": "sequence<moveit_msgs/CollisionObject>"},
-        "PlanningScene": {
-            "name": "string",
-            "robot_state": "moveit_msgs/RobotState",
-            "robot_model_name": "string",
-            "world": "moveit_msgs/PlanningSceneWorld",
-            "is_diff": "boolean",
-        },
-        "RobotTrajectory": {
-            "joint_trajectory": "trajectory_msgs/JointTrajectory",
-            "multi_dof_joint_trajectory": "trajectory_msgs/MultiDOFJointTrajectory",
-        },
-    },
-}
-CONSTANTS = {"CollisionObject": {"ADD": b"\x00", "REMOVE": b"\x01", "APPEND": b"\x02", "MOVE": b"\x03"}}
-PARALLEL = {
-    "Goal": {"command": "sensor_msgs/JointState"},
-    "Result": {"state": "sensor_msgs/JointState", "stalled": "boolean", "reached_goal": "boolean"},
-}
-
-
-def stand_in(definitions, package):
-    """Classes that take the fields of their definitions, of their types, and no others."""
-    made = {}
-
-    def kind_of(name):
-        return PLAIN.get(name) or STANDARD.get(name) or made[name.removeprefix(f"{package}/")]
-
-    def make(name, fields):
-        def init(self):
-            for field, kind in fields.items():
-                object.__setattr__(self, field, [] if kind.startswith("sequence<") else kind_of(kind)())
-
-        def assign(self, field, value):
-            assert field in fields, f"{package}/{name} has no field {field}"
-            kind = fields[field]
-            many = kind.startswith("sequence<")
-            values = value if many else [value]
-            assert isinstance(values, list)
-            wanted = kind_of(kind[len("sequence<") : -1] if many else kind)
-            assert all(type(v) is wanted for v in values), (name, field, values)
-            object.__setattr__(self, field, value)
-
-        return type(name, (), {"__init__": init, "__setattr__": assign, "__slots__": tuple(fields), **CONSTANTS.get(name, {})})
-
-    for name, fields in definitions.items():
-        made[name] = make(name, fields)
-    return SimpleNamespace(**made)
 
 
 @pytest.fixture(scope="module")
 def vision():
-    return stand_in(DEFINITIONS["vision_msgs"], "vision_msgs")
+    return VISION
 
 
 @pytest.fixture(scope="module")
 def moveit():
-    return stand_in(DEFINITIONS["moveit_msgs"], "moveit_msgs")
+    return MOVEIT
 
 
 @pytest.fixture(scope="module")
@@ -164,14 +64,38 @@ def test_a_planning_scene_has_objects_table_and_the_tool_in_the_hand(scene, move
     assert first.pose == scene.objects[0].pose
     assert first.meshes == list(scene.objects[0].pieces) and first.mesh_poses == [Pose()] * len(first.meshes)
 
-    held = interop.planning_scene(scene, moveit, "object_1", "panda_hand", ("panda_leftfinger", "panda_rightfinger"))
+    # The tool that the hand holds is not in the world, and is told in the hand's frame.
+    tool = Held(scene.objects[0], transforms.make(translation=[0.0, 0.0, 0.03]))
+    hand = SceneObjectArray(header=Header(frame_id="panda_hand_tcp"), objects=[tool.in_hand()])
+    held = interop.planning_scene(scene, moveit, hand, ["panda_leftfinger", "panda_rightfinger"], gone={"object_0"})
     (attached,) = held.robot_state.attached_collision_objects
-    assert (attached.link_name, attached.object.id, attached.touch_links) == (
-        "panda_hand",
-        "object_1",
-        ["panda_leftfinger", "panda_rightfinger"],
-    )
-    assert [(o.id, o.operation) for o in held.world.collision_objects] == [("table", b"\x00"), ("object_1", b"\x01"), ("object_2", b"\x00")]
+    assert (attached.link_name, attached.object.id, attached.object.header.frame_id) == ("panda_hand_tcp", "object_1", "panda_hand_tcp")
+    assert attached.touch_links == ["panda_leftfinger", "panda_rightfinger"] and attached.object.pose.position.z == -0.03
+    told = [(o.id, o.operation) for o in held.world.collision_objects]
+    assert told == [("table", b"\x00"), ("object_2", b"\x00"), ("object_0", b"\x01"), ("object_1", b"\x01")]
+    # What MoveIt knows better is left to it.
+    left = interop.planning_scene(scene, moveit, leave={"object_2"})
+    assert [o.id for o in left.world.collision_objects] == ["table", "object_1"]
+    (loose,) = interop.let_go({"object_1"}, moveit).robot_state.attached_collision_objects
+    assert (loose.object.id, loose.object.operation) == ("object_1", b"\x01")
+
+
+def test_the_grasp_at_the_contact_is_where_the_arm_closes_its_fingers(moveit):
+    robot = Description()
+    result = RunStrategy.Result(verified=True, rate_low=0.8, tool_id="object_1")
+    result.plan = conversions.plan_to_msg(fakes.plan("arm", start=0.1), "object_1")
+    (grasp,) = interop.grasps(result, robot, "panda_hand", moveit)
+    closing = dict.fromkeys(robot.names, 0.1 + 0.1)  # where the stand-in's plan stands at its grasp_time of 1 s
+    np.testing.assert_allclose(conversions.pose_from_msg(grasp.grasp_pose.pose), robot.poses(closing)["panda_hand"], atol=1e-9)
+    assert (grasp.grasp_pose.header.frame_id, grasp.grasp_quality, grasp.allowed_touch_objects) == ("panda_link0", 0.8, ["object_1"])
+    wide, narrow = [sum(t.points[0].positions) for t in (grasp.pre_grasp_posture, grasp.grasp_posture)]
+    assert (wide, narrow) == (pytest.approx(0.08), pytest.approx(0.03))
+    v = grasp.pre_grasp_approach.direction.vector
+    np.testing.assert_allclose([v.x, v.y, v.z], robot.poses(closing)["panda_hand_tcp"][:3, 2], atol=1e-9)
+    result.verified = False
+    assert interop.grasps(result, robot, "panda_hand", moveit) == []
+    result.verified, result.plan = True, conversions.plan_to_msg(fakes.plan("fg"), "object_1")
+    assert interop.grasps(result, robot, "panda_hand", moveit) == []
 
 
 def test_a_robot_trajectory_is_the_verified_one(moveit):
