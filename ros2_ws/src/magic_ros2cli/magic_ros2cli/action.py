@@ -1,4 +1,4 @@
-"""``ros2 action`` list and send_goal."""
+"""``ros2 action`` info, list and send_goal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import argparse
 import sys
 
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient, get_action_names_and_types
+from rclpy.action import (
+    ActionClient,
+    get_action_client_names_and_types_by_node,
+    get_action_names_and_types,
+    get_action_server_names_and_types_by_node,
+)
 
 from magic_ros2cli import connect, messages
 from magic_ros2cli.errors import CommandError
@@ -22,6 +27,35 @@ STATUS = {
 
 #: After a cancel was sent: how long the server may take to answer it and to end the goal, s.
 CANCEL_TIMEOUT = 10.0
+
+
+def action_info(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="ros2 action info", description="Print information about an action")
+    parser.add_argument("action_name", help="name of the ROS action to get info (e.g. '/fibonacci')")
+    parser.add_argument("-t", "--show-types", action="store_true", help="additionally show the action type")
+    parser.add_argument("-c", "--count", action="store_true", help="only display the number of action clients and action servers")
+    parsed = parser.parse_args(arguments)
+    action = connect.absolute(parsed.action_name)
+    with connect.node() as node:
+        nodes = connect.settle(node, lambda: sorted(node.get_node_names_and_namespaces()))
+        sides = {
+            what: [
+                (f"{space.rstrip('/')}/{name}", types)
+                for name, space in nodes
+                for found, types in ask(node, name, space)
+                if found == action
+            ]
+            for what, ask in (
+                ("clients", get_action_client_names_and_types_by_node),
+                ("servers", get_action_server_names_and_types_by_node),
+            )
+        }
+    print(f"Action: {parsed.action_name}")
+    for what, rows in sides.items():
+        print(f"Action {what}: {len(rows)}")
+        for name, types in [] if parsed.count else rows:
+            print(f"    {name} [{', '.join(types)}]" if parsed.show_types else f"    {name}")
+    return 0
 
 
 def action_list(arguments: list[str]) -> int:

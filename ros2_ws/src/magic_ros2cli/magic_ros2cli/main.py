@@ -13,15 +13,17 @@ from magic_ros2cli.errors import CommandError
 
 #: command -> verb -> module that has ``<command>_<verb>(arguments) -> int``; a command without verbs has the verb "".
 VERBS: dict[str, dict[str, str]] = {
-    "action": {"list": "action", "send_goal": "action"},
+    "action": {"info": "action", "list": "action", "send_goal": "action"},
     "bag": {"info": "bag", "play": "bag", "record": "bag"},
     "interface": {"show": "interface"},
     "launch": {"": "launch"},
-    "node": {"list": "node"},
-    "param": {"dump": "param", "get": "param", "list": "param", "set": "param"},
+    "lifecycle": {"get": "lifecycle", "list": "lifecycle", "nodes": "lifecycle", "set": "lifecycle"},
+    "node": {"info": "node", "list": "node"},
+    "param": {"describe": "param", "dump": "param", "get": "param", "list": "param", "set": "param"},
+    "pkg": {"executables": "pkg", "list": "pkg", "prefix": "pkg"},
     "run": {"": "run"},
     "service": {"call": "service", "list": "service", "type": "service"},
-    "topic": {"echo": "topic", "hz": "topic", "info": "topic", "list": "topic", "pub": "topic"},
+    "topic": {"echo": "topic", "hz": "topic", "info": "topic", "list": "topic", "pub": "topic", "type": "topic"},
 }
 
 

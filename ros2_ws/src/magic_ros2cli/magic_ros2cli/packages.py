@@ -8,6 +8,15 @@ from pathlib import Path
 from magic_ros2cli.errors import CommandError
 
 
+def names() -> list[str]:
+    """Names of all installed packages, sorted."""
+    found = set()
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        index = Path(prefix or os.devnull) / "share" / "ament_index" / "resource_index" / "packages"
+        found |= {path.name for path in index.iterdir() if path.is_file() and not path.name.startswith(".")} if index.is_dir() else set()
+    return sorted(found)
+
+
 def prefix_of(package: str) -> Path:
     """Prefix that a package is installed in; raises :class:`CommandError` with ros2cli's words."""
     if package and "/" not in package:

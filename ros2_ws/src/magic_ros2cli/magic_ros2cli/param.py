@@ -1,4 +1,4 @@
-"""``ros2 param`` list, get, set and dump."""
+"""``ros2 param`` list, get, set, describe and dump."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 
 from magic_ros2cli import connect
 from magic_ros2cli.errors import CommandError
@@ -23,6 +23,21 @@ TYPES = {
     ParameterType.PARAMETER_INTEGER_ARRAY: ("Integer values are:", "integer_array_value"),
     ParameterType.PARAMETER_DOUBLE_ARRAY: ("Double values are:", "double_array_value"),
     ParameterType.PARAMETER_STRING_ARRAY: ("String values are:", "string_array_value"),
+}
+
+
+#: ParameterType -> what ``describe`` calls it.
+NAMES = {
+    ParameterType.PARAMETER_NOT_SET: "not set",
+    ParameterType.PARAMETER_BOOL: "boolean",
+    ParameterType.PARAMETER_INTEGER: "integer",
+    ParameterType.PARAMETER_DOUBLE: "double",
+    ParameterType.PARAMETER_STRING: "string",
+    ParameterType.PARAMETER_BYTE_ARRAY: "byte array",
+    ParameterType.PARAMETER_BOOL_ARRAY: "boolean array",
+    ParameterType.PARAMETER_INTEGER_ARRAY: "integer array",
+    ParameterType.PARAMETER_DOUBLE_ARRAY: "double array",
+    ParameterType.PARAMETER_STRING_ARRAY: "string array",
 }
 
 
@@ -116,6 +131,32 @@ def param_get(arguments: list[str]) -> int:
     if not answer.values:
         raise CommandError("Parameter not set")
     print(text_of(answer.values[0], parsed.hide_type))
+    return 0
+
+
+def param_describe(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="ros2 param describe", description="Show descriptive information about declared parameters")
+    parser.add_argument("node_name", help="name of the ROS node")
+    parser.add_argument("parameter_names", nargs="+", help="names of the parameters")
+    parsed = parser.parse_args(arguments)
+    with connect.node() as node:
+        request = DescribeParameters.Request(names=parsed.parameter_names)
+        answer = _call(node, connect.absolute(parsed.node_name), DescribeParameters, "describe_parameters", request)
+    for descriptor in answer.descriptors:
+        print(f"Parameter name: {descriptor.name}")
+        print(f"  Type: {NAMES.get(descriptor.type, 'not set')}")
+        if descriptor.description:
+            print(f"  Description: {descriptor.description}")
+        print("  Constraints:")
+        if descriptor.read_only:
+            print("    Read only: true")
+        for span in [*descriptor.floating_point_range, *descriptor.integer_range][:1]:
+            print(f"    Min value: {span.from_value}")
+            print(f"    Max value: {span.to_value}")
+            if span.step:
+                print(f"    Step: {span.step}")
+        if descriptor.additional_constraints:
+            print(f"    Additional constraints: {descriptor.additional_constraints}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""``ros2 topic`` list, info, echo, hz and pub."""
+"""``ros2 topic`` list, info, type, echo, hz and pub."""
 
 from __future__ import annotations
 
@@ -56,6 +56,18 @@ def topic_info(arguments: list[str]) -> int:
         else:
             print(f"{what} count: {len(infos)}")
     return 0
+
+
+def topic_type(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="ros2 topic type", description="Print a topic's type")
+    parser.add_argument("topic_name", help="name of the ROS topic to get type (e.g. '/chatter')")
+    parsed = parser.parse_args(arguments)
+    topic = connect.absolute(parsed.topic_name)
+    with connect.node() as node:
+        types = connect.wait_for(lambda: dict(node.get_topic_names_and_types()).get(topic), 3.0)
+    for kind in types or []:
+        print(kind)
+    return 0 if types else 1  # without a word, as ros2cli
 
 
 def _type_of(node: Any, topic: str, given: str | None) -> Any:

@@ -6,9 +6,10 @@ import sys
 import time
 
 import rclpy
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.executors import MultiThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
@@ -21,8 +22,11 @@ from magic_interfaces.action import RunStrategy
 class SmallNode(Node):
     def __init__(self) -> None:
         super().__init__("small")
-        self.declare_parameter("gain", 0.5)
-        self.declare_parameter("count", 3)
+        gain = ParameterDescriptor(description="of the loop", floating_point_range=[FloatingPointRange(from_value=-1.0, to_value=2.5)])
+        self.declare_parameter("gain", 0.5, gain)
+        count = ParameterDescriptor(read_only=True, integer_range=[IntegerRange(from_value=1, to_value=9, step=2)])
+        count.additional_constraints = "odd"
+        self.declare_parameter("count", 3, count)
         self.declare_parameter("label", "one")
         self.declare_parameter("sizes", [1.0, 2.5])
         self.add_on_set_parameters_callback(self.check)
@@ -61,8 +65,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     rclpy.init()
     executor = MultiThreadedExecutor(3)
-    node = SmallNode()
-    executor.add_node(node)
+    nodes = SmallNode(), LifecycleNode("cycling")
+    for node in nodes:
+        executor.add_node(node)
     print("ready", flush=True)
     with contextlib.suppress(KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         executor.spin()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,6 +25,9 @@ ENVIRONMENT = {
 }
 ROS2 = [sys.executable, "-c", "import sys; from magic_ros2cli.main import main; sys.exit(main())"]
 TIMEOUT = 60.0
+#: The output of commands of ros2cli 0.32 on the graph of ``small_node.py``.  Written from ros2cli's own format strings and from what its own
+#: tests expect: ros2cli itself does not run without a ROS installation.
+RECORDED = HERE / "ros2cli.txt"
 
 
 def ros2(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -85,7 +90,7 @@ def small() -> Iterator[Follow]:
 
 
 def test_help_and_unknown_words() -> None:
-    assert "topic      echo, hz, info, list, pub" in out()
+    assert "topic      echo, hz, info, list, pub, type" in out()
     assert out("--help") == out()
     for words, names in ((("nonsense",), "topic"), (("topic", "nonsense"), "echo")):
         result = ros2(*words)
@@ -124,7 +129,7 @@ def test_lists(small: Follow) -> None:
         ("service", "type", "/switch"),
         ("action", "list", "-t"),
     )
-    assert nodes == "/small\n"
+    assert nodes == "/cycling\n/small\n"
     assert {"/latched [std_msgs/msg/String]", "/image [sensor_msgs/msg/Image]"} <= set(topics.splitlines())
     assert "/latched" in plain.splitlines()
     assert "/switch [std_srvs/srv/SetBool]" in services.splitlines() and "_action" not in services
@@ -244,3 +249,60 @@ def test_bag_verbs(small: Follow, tmp_path: Path) -> None:
     assert "played 1 messages" in ros2("bag", "play", str(bag), "--rate", "2.0").stderr
     result = ros2("bag", "play", str(tmp_path / "absent"))
     assert result.returncode == 1 and "no such bag" in result.stderr
+
+
+def recorded() -> Iterator[tuple[str, list[str]]]:
+    """Each command with the lines that it prints; an exit status that is not 0 is the last of them."""
+    command, lines = "", []
+    for line in RECORDED.read_text().splitlines():
+        if line.startswith("$ ros2 "):
+            if command:
+                yield command, lines
+            command, lines = line.removeprefix("$ ros2 "), []
+        else:
+            lines.append(line)
+    yield command, lines
+
+
+@pytest.fixture(scope="module")
+def printed(small: Follow) -> dict[str, list[str]]:
+    """What the commands print, several at a time: what takes long in each is the discovery of the graph."""
+
+    def lines(command: str) -> list[str]:
+        result = ros2(*shlex.split(command))
+        found = (result.stdout + result.stderr).splitlines()
+        return [*found, f"exit status {result.returncode}"] if result.returncode else found
+
+    commands = [command for command, _ in recorded()]
+    with concurrent.futures.ThreadPoolExecutor(6) as pool:
+        return dict(zip(commands, pool.map(lines, commands), strict=True))
+
+
+@pytest.mark.parametrize(("command", "lines"), [pytest.param(c, lines, id=c) for c, lines in recorded()])
+def test_it_prints_what_ros2cli_prints(printed: dict[str, list[str]], command: str, lines: list[str]) -> None:
+    assert printed[command] == lines
+
+
+def test_a_lifecycle_is_gone_through(small: Follow) -> None:
+    for transition, state in (
+        ("configure", "inactive [2]"),
+        ("activate", "active [3]"),
+        ("4", "inactive [2]"),
+        ("cleanup", "unconfigured [1]"),
+    ):
+        assert out("lifecycle", "set", "/cycling", transition) == "Transitioning successful\n"
+        assert out("lifecycle", "get", "cycling") == f"{state}\n"
+    every = out("lifecycle", "list", "/cycling", "-a").splitlines()
+    assert len(every) == 3 * 25 and every[:3] == ["- configure [1]", "\tStart: unconfigured", "\tGoal: configuring"]
+
+
+def test_packages_and_their_executables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prefix = fake_package(tmp_path, "#!/bin/sh\n")
+    (prefix / "lib" / "fake" / "notes.txt").write_text("not to be run")
+    monkeypatch.setitem(ENVIRONMENT, "AMENT_PREFIX_PATH", f"{prefix}:{ENVIRONMENT['AMENT_PREFIX_PATH']}")
+    names = out("pkg", "list").splitlines()
+    assert names == sorted(set(names)) and {"fake", "rclpy"} <= set(names)
+    assert out("pkg", "prefix", "fake") == f"{prefix}\n"
+    assert out("pkg", "prefix", "--share", "fake") == f"{prefix}/share/fake\n"
+    assert out("pkg", "executables", "fake") == "fake tool\n"
+    assert out("pkg", "executables", "--full-path", "fake") == f"{prefix}/lib/fake/tool\n"
