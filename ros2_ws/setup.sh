@@ -243,6 +243,11 @@ build() {
     --event-handlers console_direct- status- "$@" --cmake-args -DBUILD_TESTING=OFF "-DPython3_EXECUTABLE=$VENV/bin/python" --no-warn-unused-cli
 }
 logged "colcon build" build "${skip[@]}" || fail "colcon build: $(grep -aE 'Failed +<<<|^ERROR|rror:' "$LOG" | tail -n 1 | cut -c1-200) (see $LOG)"
+# Ctrl-C while Python itself starts would leave its traceback: the programs begin with SIGINT blocked, and look at it when they can (magic_core/entry.py).
+if env --block-signal=INT true 2>/dev/null; then
+  grep -lrE '^# EASY-INSTALL-(ENTRY-SCRIPT|SCRIPT)|load_entry_point' "$WS"/install/magic_*/lib/magic_*/ 2>/dev/null |
+    while IFS= read -r script; do sed -i --follow-symlinks '1s,^#!\(/[^ ]*python[0-9.]*\)$,#!/usr/bin/env -S --block-signal=INT \1,' "$script"; done
+fi
 echo "$where" >"$WS/install/.build_where"
 echo "$BUILD" >"$WS/install/.build_state"
 say "done in $SECONDS s; next: source $WS/env.sh"

@@ -23,18 +23,20 @@ def version(package: str = "magic_core") -> str:
 def program(module: str, function: str = "main") -> Callable[[], object]:
     """An entry point that prepares the environment, imports a module and calls its function.
 
-    The imports take seconds.  Ctrl-C during them ends the process as a signal does, without a traceback.  ``--version`` alone is
-    answered without them.
+    The imports take seconds.  Ctrl-C during them ends the process as a signal does, without a traceback.  What comes before, Python's own
+    start and the script's, is a quarter of a second in which nothing can be caught: ``setup.sh`` makes the installed scripts begin with
+    SIGINT blocked, and one that came meanwhile is heeded here.  ``--version`` alone is answered without the imports.
     """
     package = module.partition(".")[0]
 
     def begin() -> object:
-        if sys.argv[1:] == ["--version"]:
-            print(f"{package} {version(package)}")
-            return 0
         before = signal.getsignal(signal.SIGINT)
         if before is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        if sys.argv[1:] == ["--version"]:
+            print(f"{package} {version(package)}")
+            return 0
         try:
             environment.prepare()
         except MagicError as error:

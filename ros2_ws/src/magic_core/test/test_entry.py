@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -30,6 +31,22 @@ def test_an_interrupt_during_the_imports_leaves_no_traceback(tmp_path):
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == -signal.SIGINT
         assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.05, 0.1, 0.2, 0.3])
+def test_an_interrupt_while_python_starts_leaves_no_traceback(tmp_path, seconds):
+    """As setup.sh makes the installed scripts begin."""
+    (tmp_path / "slow_module.py").write_text("import time; time.sleep(60)")
+    script = tmp_path / "program"
+    # What a script of setuptools does first takes a tenth of a second.
+    script.write_text(f"#!/usr/bin/env -S --block-signal=INT {sys.executable}\nimport importlib.metadata\n{BEGIN}\n")
+    script.chmod(0o755)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    with subprocess.Popen([str(script)], env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        time.sleep(seconds)
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=20)
+        assert (process.returncode, said) == (-signal.SIGINT, "")
 
 
 def test_an_interrupt_after_the_imports_is_the_programs_own(tmp_path):

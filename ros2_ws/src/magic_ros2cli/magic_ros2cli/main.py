@@ -72,6 +72,8 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, terminate)
     try:
+        # The script begins with SIGINT blocked: one that came while Python started is heeded here, without a traceback.
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         status = dispatch(sys.argv[1:])
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is said: an interrupt of Python's own end would leave a traceback
         sys.stdout.flush()
