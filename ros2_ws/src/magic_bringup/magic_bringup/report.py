@@ -258,12 +258,17 @@ def motion_picture(plan: Any) -> Image:
 # ---------------------------------------------------------------- the page
 
 
+#: A picture that is wider than so many times its height shows too little on a phone's screen.
+BROAD = 1.6
+
+
 @dataclass(frozen=True)
 class Picture:
-    """A picture on the page: data URI and what stands below it."""
+    """A picture on the page: data URI and what stands below it; broad: on a phone it is scrolled along, not shrunk to the screen's width."""
 
     uri: str
     caption: str
+    broad: bool = False
 
 
 @dataclass(frozen=True)
@@ -278,7 +283,7 @@ class Section:
 
 
 def _picture(image: Image, caption: str, quality: int = 0) -> Picture:
-    return Picture(data_uri(image, quality), caption)
+    return Picture(data_uri(image, quality), caption, image.shape[1] > BROAD * image.shape[0])
 
 
 def _guard(title: str, draw: Callable[[], Section]) -> Section:

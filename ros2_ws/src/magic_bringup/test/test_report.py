@@ -1,6 +1,9 @@
 """The report: complete for a full record, and whole even where parts are missing or broken."""
 
+import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 
 import numpy as np
@@ -14,6 +17,8 @@ from magic_core.errors import Code, MagicError
 from magic_interfaces.action import RunStrategy
 from magic_interfaces.msg import CandidateReport
 from magic_server.testing import fakes
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +124,31 @@ def test_nothing_on_the_page_asks_for_more_than_a_phone_is_wide(folder, tmp_path
         assert max(row.count("<td") + row.count("<th") for row in table.split("</tr>")) <= 2
     (cells,) = re.findall(r'<table class="cells">.*?</table>', report.render(full(folder, tmp_path)), re.DOTALL)
     assert cells.count("<td") == cells.count("data-label") == 2 * 9
+
+
+#: A page that shows another one in a frame so many pixels wide, and says how wide that became and what of it lies outside, unless in a
+#: box that is scrolled.
+FRAME = """<!doctype html><body style="margin:0"><iframe id=f style="width:WIDTHpx;height:844px;border:0" src="report.html"></iframe>
+<pre id=o></pre><script>f.onload=()=>{const d=f.contentDocument,out=[];let boxes=0;
+for(const e of d.querySelectorAll('body *')){const r=e.getBoundingClientRect();let inside=false;
+for(let a=e.parentElement;a&&a!==d.body;a=a.parentElement)inside=inside||f.contentWindow.getComputedStyle(a).overflowX!=='visible';
+if(inside){boxes++;continue}
+if(r.right>d.documentElement.clientWidth+0.5||r.left<-0.5)out.push(e.tagName+'.'+e.className)}
+o.textContent='measured '+JSON.stringify([d.documentElement.scrollWidth,d.documentElement.clientWidth,out,boxes,d.querySelectorAll('img').length,
+[...d.querySelectorAll('img')].filter(i=>!i.naturalWidth).length])}</script></body>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian's package) to look at the page with")
+@pytest.mark.parametrize("width", [390, 1280])
+def test_a_browser_shows_the_page_no_wider_than_its_window(folder, tmp_path, width):
+    (tmp_path / "report.html").write_text(report.render(full(folder, tmp_path)))
+    (tmp_path / "frame.html").write_text(FRAME.replace("WIDTH", str(width)))
+    options = ("--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--virtual-time-budget=10000", "--dump-dom")
+    where = (f"--user-data-dir={tmp_path / 'profile'}", f"file://{tmp_path / 'frame.html'}")
+    shown = subprocess.run([CHROMIUM, *options, *where], capture_output=True, text=True, timeout=120, check=True).stdout
+    page_width, window, outside, scrolled, images, broken = json.loads(re.search(r"measured (\[.*\])<", shown)[1])
+    assert width - 20 <= window <= width and page_width <= window and outside == []
+    assert images >= 9 and broken == 0 and scrolled > 0
 
 
 def test_the_page_says_when_by_what_and_what_its_words_mean(folder, tmp_path):
