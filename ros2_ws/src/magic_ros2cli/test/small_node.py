@@ -22,11 +22,12 @@ from magic_interfaces.action import RunStrategy
 class SmallNode(Node):
     def __init__(self) -> None:
         super().__init__("small")
-        gain = ParameterDescriptor(description="of the loop", floating_point_range=[FloatingPointRange(from_value=-1.0, to_value=2.5)])
+        gain = ParameterDescriptor(description="of the loop", floating_point_range=[FloatingPointRange(from_value=-2.0, to_value=2.5)])
         self.declare_parameter("gain", 0.5, gain)
-        count = ParameterDescriptor(read_only=True, integer_range=[IntegerRange(from_value=1, to_value=9, step=2)])
-        count.additional_constraints = "odd"
-        self.declare_parameter("count", 3, count)
+        self.declare_parameter("count", 3)
+        odd = ParameterDescriptor(read_only=True, integer_range=[IntegerRange(from_value=1, to_value=9, step=2)])
+        odd.additional_constraints = "no even number"
+        self.declare_parameter("odd", 3, odd)
         self.declare_parameter("label", "one")
         self.declare_parameter("sizes", [1.0, 2.5])
         self.add_on_set_parameters_callback(self.check)
