@@ -25,7 +25,7 @@ from magic_core.shapes import section_view
 from magic_core.strategy import Strategy
 from magic_core.views import as_it_stands, own_views, square_on
 from magic_matcher import contour as contours
-from magic_matcher import curvature, global_stage, score
+from magic_matcher import curvature, enclosing, global_stage, score
 from magic_matcher.contour import Contour
 from magic_matcher.global_stage import Features, Proposal, Reference
 from magic_matcher.plausible import Demands, Refusal, demands, refusals
@@ -61,13 +61,16 @@ class MatchResult:
 class Tool:
     """A tool to consider: its id, the view in which contacts are matched, and what draws further ones, where it can be turned.
 
-    askew: the view is not square to the tool, and stands back behind the others.
+    askew: the view is not square to the tool, and stands back behind the others.  seen_share: how much of its surface was seen;
+    unseen_side: the level direction (2,), in the world, that the rest of it faces, where that is known.
     """
 
     id: str
     view: CanonicalView
     others: Callable[[], Sequence[CanonicalView]] = tuple
     askew: bool = False
+    seen_share: float = 1.0
+    unseen_side: Callable[[], NDArray[np.float64] | None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ def tool_of(item: SceneObject, kind: str) -> Tool:
 
     A hanger that lies on the table is edge-on in the side view of how it lies; the plane in which it is used is its own.
     """
+    seen: dict[str, Any] = {"seen_share": item.seen_share, "unseen_side": lambda: enclosing.unseen_side(item)}
     try:
         view = as_it_stands(item, kind)
     except MagicError as error:
@@ -95,10 +99,9 @@ def tool_of(item: SceneObject, kind: str) -> Tool:
         views = own_views(item.mesh, item.pieces, kind)
         if not views:
             raise
-        return Tool(item.id, views[0], lambda: views[1:])
-    return Tool(
-        item.id, view, lambda: own_views(item.mesh, item.pieces, kind, view.direction), not square_on(item.mesh, view.direction, kind)
-    )
+        return Tool(item.id, views[0], lambda: views[1:], **seen)
+    square = square_on(item.mesh, view.direction, kind)
+    return Tool(item.id, view, lambda: own_views(item.mesh, item.pieces, kind, view.direction), not square, **seen)
 
 
 def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
@@ -335,7 +338,9 @@ class Matcher:
         if not found:
             if len(failures) == 1:
                 raise failures[0]
-            raise MagicError(Code.NO_MATCH, "no tool has a place like the demonstrated contact: " + "; ".join(f.message for f in failures))
+            # Where a side that was not seen may hold the place, showing it comes before looking for another tool.
+            code = Code.HANDLE_NOT_SEEN if any(f.code is Code.HANDLE_NOT_SEEN for f in failures) else Code.NO_MATCH
+            raise MagicError(code, "no tool has a place like the demonstrated contact: " + "; ".join(f.message for f in failures))
         found.sort(key=lambda pair: -pair[0].score)
         return MatchResult(
             candidates=tuple(candidate for candidate, _ in found),
@@ -352,11 +357,14 @@ class Matcher:
         """The tool's candidates in the one of its views that shows the contact best.
 
         The view as the tool stands is taken where the match in it is clear, or where no other is better by enough to turn the tool;
-        if it is askew, only where no other shows a contact.  Raises NO_MATCH with what the best place of all views lacks.
+        if it is askew, only where no other shows a contact.  Raises NO_MATCH with what the best place of all views lacks, HANDLE_NOT_SEEN
+        where a loop is asked for, none shows, and a part of the tool large enough for one was not seen.
         """
         failures: list[tuple[float, MagicError]] = []
+        looked: list[CanonicalView] = []
 
         def look(view: CanonicalView) -> _Seen | None:
+            looked.append(view)
             try:
                 seen = self._in_view(task, tool.id, view)
             except MagicError as error:
@@ -378,7 +386,8 @@ class Matcher:
         if best is None and tool.askew:
             best = look(tool.view)
         if best is None:
-            raise max(failures, key=lambda failure: failure[0])[1]
+            error = max(failures, key=lambda failure: failure[0])[1]
+            raise _not_seen(task, tool, looked, error) or error
         return best
 
     def _in_view(self, task: _Task, tool_id: str, view: CanonicalView) -> _Seen:
@@ -474,6 +483,27 @@ def _no_match(tool_id: str, refusal: Refusal | None) -> MagicError:
         return MagicError(Code.NO_MATCH, f"usable contacts on {name}", 0, "a tool with an edge of at least 5 points to fit")
     what = f"{name}: {refusal.what} at its best place (similarity {refusal.similarity:.3f})"
     return MagicError(Code.NO_MATCH, f"{what}: {refusal.value} (allowed: {refusal.allowed})")
+
+
+def _not_seen(task: _Task, tool: Tool, looked: Sequence[CanonicalView], error: MagicError) -> MagicError | None:
+    """That a tool without a match may have its loop on a side that no camera saw; ``None`` where that cannot be the reason.
+
+    looked: the views of it that were looked at; error: what its best place lacks.
+    """
+    unseen = 1.0 - tool.seen_share
+    if not task.asked.loop or error.code is not Code.NO_MATCH or not unseen >= enclosing.UNSEEN:
+        return None
+    most = max((enclosing.most(contours.extract(view.mask)) for view in looked), default=0.0)
+    if most >= enclosing.LOOP:
+        return None
+    side = tool.unseen_side()
+    where = "" if side is None else f", most of it towards ({side[0]:.1f}, {side[1]:.1f}) in x and y"
+    name = tool.id or "the tool"
+    return MagicError(
+        Code.HANDLE_NOT_SEEN,
+        f"{name}: the demonstrated contact lies in a loop, and what was seen of {name} has neither hole nor hook; "
+        f"no camera saw {100 * unseen:.0f} % of its surface{where}; else {error.message}",
+    )
 
 
 def match(

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_matcher import holding
+from magic_matcher import enclosing, holding
 from magic_matcher.contour import Contour
 from magic_matcher.global_stage import Reference
 
@@ -33,12 +33,13 @@ HOLLOW, HOLLOW_SHARE = 0.2, 0.5
 @dataclass(frozen=True)
 class Demands:
     """What a place must show.  concave: its sign, ``None``: either; floor: of s_dino; gap (at most) and hollow (at least) in radii of the
-    target, ``None`` where they are not asked."""
+    target, ``None`` where they are not asked; loop: the reference lies in a loop (:mod:`magic_matcher.enclosing`)."""
 
     concave: bool | None
     floor: float
     gap: float | None
     hollow: float | None
+    loop: bool = False
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,13 @@ class Refusal:
 def demands(reference: Reference, floor: float) -> Demands:
     """What the reference contact asks of others."""
     concave = reference.concave if np.isfinite(reference.radius) else None
+    loop = reference.concave and enclosing.asked(reference.contour, reference.pixel, reference.normal, reference.radius)
     if not reference.concave or reference.target_radius is None or not np.isfinite(reference.target_radius):
-        return Demands(concave, floor, None, None)
+        return Demands(concave, floor, None, None, loop)
     held = holding.hold(reference.contour, reference.pixel[None], reference.normal[None], reference.target_radius)
     gap = float(held.gap[0])
     depth = HOLLOW_SHARE * float(held.press[0, 0])
-    return Demands(concave, floor, max(GAP, GAP_SHARE * gap) if np.isfinite(gap) else None, min(HOLLOW, depth) if depth > 0 else None)
+    return Demands(concave, floor, max(GAP, GAP_SHARE * gap) if np.isfinite(gap) else None, min(HOLLOW, depth) if depth > 0 else None, loop)
 
 
 def refusals(

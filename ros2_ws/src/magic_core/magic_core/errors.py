@@ -51,6 +51,7 @@ class Code(IntEnum):
     BAD_STRATEGY = 209
     OBJECT_CUT_OFF = 210
     AMBIGUOUS_OBJECT = 211
+    HANDLE_NOT_SEEN = 212
 
     # Planning
     BAD_MOTION = 300

@@ -123,6 +123,10 @@ REMEDIES: dict[Code, Remedy] = {
         "The words for tool or target fit several objects, or none.",
         "Say more of it (colour, size, place), or give its id: the message lists what there is.",
     ),
+    Code.HANDLE_NOT_SEEN: Remedy(
+        "The demonstrated contact lies in a loop (a handle, a hook), and what was seen of the tool has none: it may be on the side that no camera saw, or its hole was not seen through.",
+        "Turn the tool so that the handle stands out to the side of a camera; a second camera helps. The message says how much was not seen, and where.",
+    ),
     Code.BAD_MOTION: Remedy(
         "A pose, frame or table in the request is no rigid transform or plane.",
         "An error of who sends it: quaternions of length 1, finite numbers.",
