@@ -11,6 +11,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
   bowl), a shell;
 * things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where cameras
   look into it, with the handle carved in its own upright plane in the same way as a flat thing;
+* bowls and dishes become a body of revolution as well, from their rim, their inside and what shows of their outside;
 * other standing things are stacked from layers, completed by point symmetry where no camera saw through the completion;
 * every proposal but the flat ones has to agree with the masks, and free space forbids it: where rays of a depth camera pass
   through a proposed solid (a hoop taken for a ball, a bent wire for a wall), the thing is carved out of space instead.
@@ -34,6 +35,7 @@ from magic_perception.parameters import Parameters
 from magic_perception.sight import Agreement, Sight, agreement, surfaces
 from magic_perception.solids import Reconstruction, extruded
 from magic_perception.turned import build_round
+from magic_perception.vessels import build_vessel
 
 __all__ = ["Reconstruction", "Sight", "as_in_paper", "reconstruct"]
 
@@ -61,14 +63,20 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
     # Without the outermost half percent: one stray ray must not lay a mug down.
     length = float(np.max(np.subtract(*np.percentile(spread @ axes.T, [99.5, 0.5], axis=0))))
-    if height > 0.04 and height > 0.45 * length:
+    turned, stands = None, height > 0.04 and height > 0.45 * length
+    if stands:
         turned = build_round(sights, points, eyes, height, noise, parameters)
         if turned is not None:
             fit = agreement(turned.mesh, sights)
             if fit.overlap > 0.8 and fit.through < _FREE:
                 return replace(turned, fit=fit)
-        if height > 0.65 * length:  # a ladle's stem rises, but it lies
-            return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
+    vessel = build_vessel(sights, points, eyes, height, noise, parameters)
+    if vessel is not None:
+        fit = agreement(vessel.mesh, sights)
+        if fit.overlap > 0.85 and fit.through < _FREE:
+            return replace(vessel, fit=fit)
+    if stands and height > 0.65 * length:  # a ladle's stem rises, but it lies
+        return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
     return _freest([lambda: build_lying(sights, noise, parameters)], sights, noise)
 
 

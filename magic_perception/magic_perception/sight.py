@@ -155,7 +155,8 @@ def carve(
             if see_through is not None:
                 with np.errstate(invalid="ignore"):
                     inside = np.where(measured > z + see_through, 0, inside)
-                    behind = measured < z - see_through
+                    # Before what is not in the mask a nearer depth is smeared.
+                    behind = (measured < z - see_through) & (inside > 0.5)
                 blind |= behind
                 inside = np.where(behind, 1, inside)
             least = np.minimum(least, inside)

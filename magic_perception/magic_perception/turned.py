@@ -20,12 +20,16 @@ from magic_perception.solids import Reconstruction, hull_of
 
 @dataclass(frozen=True)
 class Body:
-    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not, or through and through (a band)."""
+    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not, or through and through (a band).
+
+    floor: height of the floor inside, m, where it was seen.
+    """
 
     axis: NDArray[np.float64]
     profile: NDArray[np.float64]
     open: bool = False
     through: bool = False
+    floor: float | None = None
 
     def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.interp(z, self.profile[:, 1], self.profile[:, 0])
@@ -178,6 +182,14 @@ def seen_into(sights: list[Sight], body: Body, noise: float) -> bool:
     return told > 8 and through > 0.5 * told
 
 
+def _through_the_top(body: Body, sight: Sight, spots: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a camera looks at spots (..., 3) inside a body's foot through its top."""
+    radius, top = body.profile[-1]
+    share = (top - spots[..., 2]) / np.maximum(sight.eye[2] - spots[..., 2], 1e-6)
+    met = spots[..., :2] + share[..., None] * (sight.eye[:2] - spots[..., :2])
+    return np.linalg.norm(met - body.axis, axis=-1) < radius
+
+
 #: Spacing of the offsets at which a mask's edge is looked for, m.
 EDGE_STEP = 5e-4
 
@@ -288,15 +300,22 @@ def build_round(
         return None
     if height > body.profile[-1, 1] + 0.012:
         return None
-    body = fit_to_silhouettes(body, sights)
-    body = replace(body, open=seen_into(sights, body, noise))
-    # Of a band some part of the table inside shows to some camera.
+    lid = not seen_into(sights, body, noise)
+    fitted = fit_to_silhouettes(body, sights)
+    if lid or not seen_into(sights, fitted, noise):
+        # A lid that depth shows is where it is: the masks' edges tell the sides alone.
+        level = fitted.profile[:, 1] * (body.profile[-1, 1] / fitted.profile[-1, 1])
+        fitted = replace(fitted, profile=np.column_stack([fitted.profile[:, 0], level]))
+    else:
+        fitted = replace(fitted, open=True)
+    body = fitted
+    # Of a band some part of the table inside shows to some camera, through its open top.
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     spots = np.array(
         [[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)]
     )
-    if max(float(np.mean(carve([sight], [spots]) < 0.3)) for sight in sights) > 0.12:
-        body = Body(body.axis, body.profile, True, True)
+    if body.open and max(float(np.mean((carve([sight], [spots]) < 0.3) & _through_the_top(body, sight, spots))) for sight in sights) > 0.12:
+        body = replace(body, through=True)
     top = body.profile[-1, 1]
     away = points[:, :2] - body.axis
     rho = np.linalg.norm(away, axis=1)
@@ -342,7 +361,7 @@ def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[
             hull = hull_of(primitives.revolve(simple, body.axis, 32).vertices)
             pieces = [hull] if hull is not None else pieces
         return mesh, pieces
-    floor = 0.0 if body.through else min(0.006, 0.2 * profile[-1, 1])
+    floor = 0.0 if body.through else min(0.006, 0.2 * profile[-1, 1]) if body.floor is None else body.floor
     inner = np.column_stack([profile[:, 0] - wall, profile[:, 1]])
     pieces: list[Mesh] = []
     if body.through:
@@ -370,6 +389,10 @@ def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[
     return mesh, pieces
 
 
+#: Pixels around a round body within which a mask may be the body's own.
+EDGE = 3
+
+
 def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, parameters: Parameters) -> tuple[list[Mesh], list[Mesh]] | None:
     """A handle as bars in the upright plane through the body's axis: meshes and convex pieces, or ``None`` if nothing is left after carving."""
     local = out[:, :2] - body.axis
@@ -389,6 +412,7 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
         abs(float((plane.mean(axis=(0, 1)) - sight.eye) @ e_n)) / np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye) for sight in sights
     ]
     useful = [sight for sight, f in zip(sights, facing, strict=True) if f > 0.25]
+    covered = np.zeros(grid_s.shape, bool)
     splat = np.zeros(grid_s.shape, np.uint8)
     column = np.round((local @ along - start) / cell).astype(int)
     row = np.round(out[:, 2] / cell).astype(int)
@@ -397,17 +421,33 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
     near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
     if useful:
         # Where depth lost a thin bar, the mask beside the body's outline is the handle's.
-        beside = [_beside(sight, body) for sight in useful]
+        drawn = [_drawn(sight, body) for sight in useful]
+        beside = [sight.mask & ~_wider(body_there, EDGE) for sight, body_there in zip(useful, drawn, strict=True)]
         thickness = min([thickness, *(_widest(sight, mask, plane) for sight, mask in zip(useful, beside, strict=True))])
         seen = [sight.look_up(plane, mask.astype(np.float32)) > 0.5 for sight, mask in zip(useful, beside, strict=True)]
         near |= clusters.connected(near | np.any(seen, axis=0), near, 8)
         # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
         columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
         # Of a bar no wider than the smear of depth a measurement a little behind it says nothing: only one far behind shows a hole.
-        field = carve(useful, columns, max(0.04, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
+        # Where a camera has the body in its picture its mask says nothing of the handle.
+        told = [replace(sight, hidden=sight.hidden | body_there) for sight, body_there in zip(useful, drawn, strict=True)]
+        field = carve(told, columns, max(0.04, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
+        # Before the body depth sees the handle, behind it nothing does; at the body's edge a mask may be the body's.
+        away = [bool((sight.eye[:2] - body.axis) @ along < 0) for sight in useful]
+        covered, beside_it = (
+            np.all(
+                [
+                    (sight.look_up(plane, there.astype(np.float32)) > 0.5) & far
+                    for sight, there, far in zip(useful, wide, away, strict=True)
+                ],
+                axis=0,
+            )
+            for wide in (drawn, [_wider(there, EDGE) for there in drawn])
+        )
+        covered |= beside_it & (field > 0.5)
     else:
         field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
-    solid = _bars(field > 0.5, near, grid_s, grid_z, body)
+    solid = _bars(field > 0.5, near, covered, grid_s, grid_z, body)
     parts = [
         p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5
     ]
@@ -437,8 +477,8 @@ def _standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> 
     return out[np.isin(labels, np.flatnonzero((off < apart) & (sizes >= 8)))]
 
 
-def _beside(sight: Sight, body: Body, margin: int = 3) -> NDArray[np.bool_]:
-    """The part of a camera's mask (H, W) that is not before or behind the round body."""
+def _drawn(sight: Sight, body: Body) -> NDArray[np.bool_]:
+    """Where the round body is in a camera's picture (H, W)."""
     turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     radius, z = body.profile.T
     rings = np.stack(
@@ -452,8 +492,11 @@ def _beside(sight: Sight, body: Body, margin: int = 3) -> NDArray[np.bool_]:
     drawn = np.zeros(sight.mask.shape, np.uint8)
     for low, high in itertools.pairwise(sight.pixels(rings)):
         cv2.fillConvexPoly(drawn, cv2.convexHull(np.concatenate([low, high])).round().astype(np.int32), 1)
-    drawn = cv2.dilate(drawn, np.ones((2 * margin + 1,) * 2, np.uint8))
-    return sight.mask & (drawn == 0)
+    return drawn > 0
+
+
+def _wider(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    return cv2.dilate(mask.view(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
 
 
 def _widest(sight: Sight, mask: NDArray[np.bool_], plane: NDArray[np.float64]) -> float:
@@ -478,15 +521,25 @@ def _handle_plane(local: NDArray[np.float64]) -> tuple[NDArray[np.float64], floa
 
 
 def _bars(
-    seen: NDArray[np.bool_], near: NDArray[np.bool_], grid_s: NDArray[np.float64], grid_z: NDArray[np.float64], body: Body
+    seen: NDArray[np.bool_],
+    near: NDArray[np.bool_],
+    covered: NDArray[np.bool_],
+    grid_s: NDArray[np.float64],
+    grid_z: NDArray[np.float64],
+    body: Body,
 ) -> NDArray[np.uint8]:
     """The handle's cells in its plane: what was ``seen`` solid ``near`` its points, joined to the body.
 
-    All (Z, S); grid_s and grid_z are the cells' distances from the axis and heights, metres.
+    All (Z, S); covered: behind the body for all cameras; grid_s and grid_z are the cells' distances from the axis and heights, metres.
     """
     within = grid_s < body.radius(grid_z)
     attach = within & (grid_s > body.radius(grid_z) - 0.0025) & (grid_z < body.profile[-1, 1])
-    solid = seen & near & ~within
+    solid = seen & near & ~within & ~covered
+    # What goes out of sight behind the body goes on to it, level by level, and so does a hole.
+    known = ~covered & ~within
+    first = known.argmax(axis=1)
+    on = solid[np.arange(len(solid)), first] & known.any(axis=1)
+    solid |= on[:, None] & covered & ~within & (np.arange(solid.shape[1]) < first[:, None])
     # Where the bar meets the body its points are few: join them over 5 mm.
     reachable = cv2.dilate(attach.astype(np.uint8), np.ones((1, 11), np.uint8)) > 0
     solid |= reachable & seen & ~within & (cv2.dilate(solid.astype(np.uint8), np.ones((5, 11), np.uint8)) > 0)

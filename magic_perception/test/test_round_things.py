@@ -1,0 +1,69 @@
+"""Bowls keep floor and both sides, lids stay closed, and a handle that goes out of sight behind its body goes on to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+import trimesh
+
+from magic_core import sensor
+from magic_core.mesh import Mesh
+from magic_core.views import find_view, holes_of
+from magic_perception.parameters import Parameters
+from magic_perception.pipeline import Report, perceive
+
+
+def seen(mesh: Mesh, names: tuple[str, ...], seed: int = 0, poses=scenes.POSES):
+    """The one thing perceived of a mesh on the table, and what kind of solid it became; by the sensor that smears."""
+    frames = [
+        sensor.capture([mesh], scenes.INTRINSICS, poses[name], [seed, i], camera=name, model=sensor.SMEARED) for i, name in enumerate(names)
+    ]
+    report = Report()
+    (item,) = perceive(frames, parameters=Parameters(), report=report).objects
+    return item, report.shapes[item.id]
+
+
+def bowl(rim: float, foot: float, height: float, wall: float = 0.004) -> Mesh:
+    """A bowl whose wall is a part of a parabola."""
+    z = np.linspace(0, height, 12)
+    outer = np.column_stack([foot + (rim - foot) * np.sqrt(z / height), z])
+    inner = np.column_stack([outer[1:, 0] - wall, outer[1:, 1]])[::-1]
+    profile = np.vstack([[0, 0], outer, inner[:-1], [inner[-1, 0] - 0.002, wall], [0, wall]])
+    solid = trimesh.creation.revolve(profile, sections=64)
+    return Mesh(solid.vertices, solid.faces)
+
+
+@pytest.mark.parametrize(("rim", "foot", "height"), [(0.075, 0.035, 0.055), (0.07, 0.04, 0.08), (0.08, 0.045, 0.038)])
+@pytest.mark.parametrize("names", [("left",), ("left", "right")])
+def test_a_bowl_is_one_hollow_thing(rim, foot, height, names):
+    truth = scenes.placed(bowl(rim, foot, height), 0.55, 0.02).painted((70, 90, 160))
+    item, shape = seen(truth, names)
+    assert shape == "round"
+    assert item.mesh.extents == pytest.approx([2 * rim, 2 * rim, height], abs=0.008)
+    solid = item.mesh.to_trimesh()
+    assert solid.is_watertight and solid.euler_number == 2
+    # Hollow, with a floor: nothing of the table shows through, and most of its hull is empty.
+    assert not holes_of(find_view(item.mesh, item.pieces, "top").mask).any()
+    assert solid.volume < 0.5 * solid.convex_hull.volume
+    assert abs(solid.volume - truth.to_trimesh().volume) < 0.4 * truth.to_trimesh().volume
+
+
+@pytest.mark.parametrize(("radius", "height", "recess"), [(0.033, 0.10, 0.003), (0.05, 0.21, 0.0), (0.042, 0.14, 0.005)])
+def test_a_lid_is_no_opening(radius, height, recess):
+    rim = radius - 0.003
+    profile = [[0, 0], [radius, 0], [radius, height], [rim, height], [rim, height - recess - 1e-4], [0, height - recess - 1e-4]]
+    solid = trimesh.creation.revolve(np.array(profile), sections=64)
+    item, _ = seen(scenes.placed(Mesh(solid.vertices, solid.faces), 0.6, 0.05).painted((180, 60, 50)), ("left",))
+    found = item.mesh.to_trimesh()
+    assert found.volume > 0.9 * found.convex_hull.volume
+    assert item.mesh.extents[2] == pytest.approx(height, abs=0.008)
+
+
+@pytest.mark.parametrize(("seed", "yaw", "names"), [(7009, 3.49, ("right",)), (7003, 2.09, ("left", "right"))])
+def test_a_handle_partly_behind_its_body_stays_open(seed, yaw, names):
+    mug = scenes.shape("mug", seed, 0.47, 0.15, yaw).painted((60, 90, 200))
+    item, shape = seen(mug, names, poses=sensor.STATION)
+    assert shape == "round with handle"
+    assert holes_of(find_view(item.mesh, item.pieces, "side").mask).sum() > 40
+    assert item.mesh.to_trimesh().euler_number == 0  # one handle, one loop, nothing apart
