@@ -237,6 +237,8 @@ if [ $REBUILD = 1 ] || { [ -f "$WS/install/.build_where" ] && [ "$(cat "$WS/inst
 fi
 # Not --packages-skip: of a package that is skipped but known, colcon wants the installation in this workspace.
 [ ${#skip[@]} = 0 ] || skip=(--packages-ignore "${skip[@]}")
+# A job for each core whatever else runs: by itself colcon asks make to wait while the load is high (-l), which on a busy machine is always.
+export MAKEFLAGS=${MAKEFLAGS:--j$(nproc)}
 # colcon runs on the environment's Python, because the scripts that it installs name the Python that it runs on.
 build() {
   cd "$WS" && "$VENV/bin/python" -c 'import sys; from colcon_core.command import main; sys.exit(main())' build --symlink-install \
