@@ -27,7 +27,7 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
     ],
     install_requires=["numpy<2", "scipy", "mplib", "toppra", beside("magic_core")],
-    extras_require={"xacro": ["xacro"]},
+    extras_require={"xacro": ["xacro"], "alternatives": ["ssik"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

@@ -132,10 +132,10 @@ class PlannerNode(Node):
         feedback("motion", f"moving {goal.tool.id} by strategy {goal.strategy}")
         strategy = strategies.find(goal.strategy, self._strategies or None)
         convert.check_frames(self._base, (goal.tool, goal.target, *goal.obstacles))
-        tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))
         for item, what in ((tool, "tool"), (target, "target")):
             check_solid(item.mesh, f"the {what} {item.id}")
-        obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
+        obstacles = tuple(convert.object_from_msg(o, pictures=False) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids) or "" in ids:
             raise MagicError(Code.BAD_REQUEST, "object ids", ", ".join(repr(i) for i in ids), "ids that are not empty and differ")

@@ -157,10 +157,10 @@ class VerifierNode(Node):
         strategy = strategies.find(goal.strategy, self._strategies or None)
         trajectories = goal.plan.tool_trajectory, goal.plan.arm_trajectory
         convert.check_frames(self._robot.base_frame, (goal.tool, goal.target, *goal.obstacles), *trajectories)
-        tool, target = convert.object_from_msg(goal.tool), convert.object_from_msg(goal.target)
+        tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))
         for item, what in ((tool, "tool"), (target, "target")):
             check_solid(item.mesh, f"the {what} {item.id}")
-        obstacles = tuple(convert.object_from_msg(o) for o in goal.obstacles)
+        obstacles = tuple(convert.object_from_msg(o, pictures=False) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids):
             raise MagicError(Code.BAD_REQUEST, "object ids", ", ".join(ids), "ids that differ")

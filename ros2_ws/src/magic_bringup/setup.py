@@ -60,6 +60,7 @@ setup(
             "report = magic_bringup.programs:report",
             "calibrate_cameras = magic_bringup.programs:calibrate_cameras",
             "reference = magic_bringup.programs:reference",
+            "goal_times = magic_bringup.programs:goal_times",
             "rgbd_to_bag = magic_bringup.programs:rgbd_to_bag",
             "bag_player = magic_bringup.programs:bag_player",
             "bridge = magic_bringup.programs:bridge",

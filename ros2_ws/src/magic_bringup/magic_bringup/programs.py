@@ -5,6 +5,7 @@ from magic_core.entry import program
 strategy_server = program("magic_server.strategy_server")
 magic = program("magic_bringup.client")
 report = program("magic_bringup.report")
+goal_times = program("magic_bringup.goal_times")
 rgbd_to_bag = program("magic_bringup.rgbd_to_bag")
 bridge = program("magic_bringup.bridge")
 detected_objects = program("magic_bringup.detected_objects")

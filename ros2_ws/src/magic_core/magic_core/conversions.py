@@ -371,8 +371,15 @@ def object_to_msg(item: SceneObject, header: Header) -> mi.SceneObject:
     return msg
 
 
-def object_from_msg(msg: mi.SceneObject) -> SceneObject:
-    """Message to SceneObject; raises BAD_MESH where there is more of it than MOST_TRIANGLES."""
+#: The view of an object for those who need none.
+_NO_VIEW = CanonicalView(np.zeros((1, 1, 3), np.uint8), np.zeros((1, 1), bool), 1.0, np.eye(4))
+
+
+def object_from_msg(msg: mi.SceneObject, pictures: bool = True) -> SceneObject:
+    """Message to SceneObject; raises BAD_MESH where there is more of it than MOST_TRIANGLES.
+
+    pictures: false leaves view and mask out, whether they came or not (a blank view, no mask).
+    """
     for what in ("triangles", "vertices"):
         count = sum(len(getattr(mesh, what)) for mesh in (msg.mesh, *msg.pieces))
         if count > MOST_TRIANGLES:
@@ -390,10 +397,10 @@ def object_from_msg(msg: mi.SceneObject) -> SceneObject:
         mesh=mesh_from_msg(msg.mesh, colors),
         pieces=tuple(mesh_from_msg(piece) for piece in msg.pieces),
         world_from_object=pose_from_msg(msg.pose),
-        view=view_from_msg(msg.view),
+        view=view_from_msg(msg.view) if pictures else _NO_VIEW,
         points=points,
         colors=point_colors,
-        mask=mask_from_msg(msg.mask) if len(msg.mask.data) else None,
+        mask=mask_from_msg(msg.mask) if pictures and len(msg.mask.data) else None,
         camera=msg.camera,
         world_from_box=pose_from_msg(msg.box_pose),
         box_extents=np.array([msg.box_size.x, msg.box_size.y, msg.box_size.z]),
@@ -403,6 +410,19 @@ def object_from_msg(msg: mi.SceneObject) -> SceneObject:
         cut_off=tuple(msg.cut_off),
         hanging=msg.hanging,
     )
+
+
+def without_pictures(msg: mi.SceneObject, cloud: bool, surface: bool) -> mi.SceneObject:
+    """What planner and verifier need of an object's message: view and mask left out, and without ``cloud`` its points, without ``surface``
+    its mesh, where convex pieces say the same.  Nothing is copied."""
+    light = copy.copy(msg)
+    light.view, light.mask = mi.CanonicalView(), Image()
+    if not cloud:
+        light.cloud = PointCloud2(header=msg.cloud.header)
+    if not surface and msg.pieces:
+        light.mesh = MeshMsg()
+        light.mesh_colors = type(msg.mesh_colors)("B")
+    return light
 
 
 def plane_to_msg(plane: NDArray[np.float64]) -> Plane:

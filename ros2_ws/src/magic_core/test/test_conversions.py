@@ -1,5 +1,6 @@
 """Messages and plain types: there and back."""
 
+import dataclasses
 import math
 import struct
 
@@ -9,9 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage
 
 from magic_core import conversions as cv
+from magic_core import shapes
 from magic_core import transforms as tf
 from magic_core.camera import Intrinsics
 from magic_core.contact import Contact, ContactCandidate, contact_frame
@@ -424,3 +427,25 @@ def test_views_of_no_possible_scale_are_refused(scale):
         CanonicalView(np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), bool), scale, np.eye(4))
     assert caught.value.code is Code.BAD_REQUEST_IMAGE
     assert CanonicalView(np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), bool), 1.0, np.eye(4)).kind == "top"
+
+
+def test_what_planner_and_verifier_are_sent_is_the_object_without_its_pictures():
+    item = dataclasses.replace(shapes.make("mug", 1).as_object("mug", tf.from_rpy(0, 0, 0.3, [0.4, 0.1, 0.0])), points=np.ones((5, 3)))
+    item = dataclasses.replace(item, colors=np.zeros((5, 3), np.uint8), mask=np.ones((4, 6), bool), camera="left", cut_off=("picture",))
+    whole = cv.object_to_msg(item, cv.header("panda_link0"))
+    light = cv.without_pictures(whole, cloud=False, surface=False)
+    assert len(serialize_message(light)) < 0.2 * len(serialize_message(whole))
+    assert light.cloud.header == whole.cloud.header and len(whole.view.image.data) and len(whole.mask.data), "the whole one is as it was"
+    same, bare = cv.object_from_msg(whole, pictures=False), cv.object_from_msg(light, pictures=False)
+    for got in (same, bare):
+        assert (got.id, got.camera, got.cut_off, got.confidence) == (item.id, "left", ("picture",), item.confidence)
+        assert got.mask is None and not got.view.mask.any()
+        np.testing.assert_array_equal(got.world_from_object, same.world_from_object)
+        assert len(got.pieces) == len(item.pieces)
+        for a, b in zip(got.pieces, item.pieces):
+            np.testing.assert_array_equal(a.vertices, b.vertices)
+    np.testing.assert_array_equal(same.mesh.vertices, item.mesh.vertices)
+    assert len(bare.mesh.vertices) == 0 and len(bare.points) == 0 and len(same.points) == 5
+    # Without pieces the mesh is all that there is of its shape.
+    whole.pieces = []
+    assert cv.without_pictures(whole, cloud=False, surface=False).mesh is whole.mesh

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image, JointState
 
 from magic_core import conversions, naming, transforms
+from magic_core.conversions import without_pictures as light
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_interfaces.action import PlanMotion, VerifyMotion
@@ -291,9 +292,10 @@ class Stages:
         goal = PlanMotion.Goal(
             strategy=request.strategy,
             variant=request.variant,
-            tool=self._tool_of(trial),
-            target=self._find(matches.target_id),
-            obstacles=self._obstacles(trial, matches),
+            # The tool's own points are never obstacles, and of an obstacle its pieces and what was measured of it count.
+            tool=light(self._tool_of(trial), cloud=False, surface=True),
+            target=light(self._find(matches.target_id), cloud=True, surface=True),
+            obstacles=[light(o, cloud=True, surface=False) for o in self._obstacles(trial, matches)],
             table=self.scene.table,
             candidate=trial.candidate,
             reflection=trial.reflection,
@@ -335,9 +337,9 @@ class Stages:
         timeout = min(timeout, server.settings.verify)
         goal = VerifyMotion.Goal(
             strategy=request.strategy,
-            tool=self._tool_of(trial),
-            target=self._find(matches.target_id),
-            obstacles=self._obstacles(trial, matches),
+            tool=light(self._tool_of(trial), cloud=False, surface=True),
+            target=light(self._find(matches.target_id), cloud=False, surface=True),
+            obstacles=[light(o, cloud=False, surface=True) for o in self._obstacles(trial, matches)],
             table=self.scene.table,
             candidate=trial.candidate,
             plan=plan,
