@@ -112,7 +112,7 @@ def _with_equal_ids(goal):
         (_with_bad_pose, Code.BAD_REQUEST),
         (_without_points, Code.BAD_MOTION),
         (_with_unknown_variant, Code.UNKNOWN_VARIANT),
-        (_with_empty_object, Code.BAD_ENCODING),
+        (_with_empty_object, Code.BAD_MESH),
         (_with_equal_ids, Code.BAD_REQUEST),
         (lambda goal: setattr(goal, "strategy", "dancing"), Code.UNKNOWN_STRATEGY),
         (lambda goal: setattr(goal, "strategy", "juggling"), Code.UNKNOWN_GOAL),
