@@ -117,7 +117,7 @@ class Bridge(Node):
     def _tell_scene(self) -> None:
         if self._scene is None or self._moveit is None:
             return
-        leave = {item.id for item in self._world.obstacles()}
+        leave = self._world.names()
         here = {item.id for item in self._scene.objects} - leave
         message = interop.planning_scene(
             self._scene, self._moveit, self._held, sorted(self._robot.finger_links), self._told - here - leave, leave

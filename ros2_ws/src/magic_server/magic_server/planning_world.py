@@ -97,6 +97,7 @@ class PlanningWorld:
         self._base_from = base_from
         self._found: dict[str, Obstacle] = {}
         self._cut: dict[bytes, tuple[Mesh, ...]] = {}
+        self._made: dict[str, tuple[Obstacle, SceneObject]] = {}
 
     def take_scene(self, message: Any, own: Collection[str] = ()) -> list[str]:
         """A PlanningScene, whole or a difference."""
@@ -142,14 +143,20 @@ class PlanningWorld:
             self._found.pop(name, None)
         return notes
 
+    def names(self) -> frozenset[str]:
+        """Ids of what there is."""
+        return frozenset(self._found)
+
     def obstacles(self) -> tuple[SceneObject, ...]:
-        """What there is, as known objects in the base's frame."""
-        result = []
-        for name, found in sorted(self._found.items()):
-            meshes = [s.mesh.transformed(s.object_from_shape) for s in found.shapes]
-            pieces = [piece.transformed(s.object_from_shape) for s in found.shapes for piece in s.pieces]
-            result.append(placed(name, concatenate(meshes), pieces, found.base_from_object, "known"))
-        return tuple(result)
+        """What there is, as known objects in the base's frame; one that has not changed is the same object as before."""
+        for name in set(self._made) - set(self._found):
+            del self._made[name]
+        for name, found in self._found.items():
+            if name not in self._made or self._made[name][0] is not found:
+                meshes = [s.mesh.transformed(s.object_from_shape) for s in found.shapes]
+                pieces = [piece.transformed(s.object_from_shape) for s in found.shapes for piece in s.pieces]
+                self._made[name] = found, placed(name, concatenate(meshes), pieces, found.base_from_object, "known")
+        return tuple(self._made[name][1] for name in sorted(self._made))
 
     def _shapes(self, message: Any) -> tuple[tuple[Shape, ...], list[str]]:
         name = message.id

@@ -112,7 +112,11 @@ def test_objects_are_added_moved_added_to_and_removed():
     np.testing.assert_allclose(where(world)["shelf"], [[0.4, 0.25, 0.0], [0.6, 0.35, 0.4]], atol=1e-6)
     assert len(world.obstacles()[0].pieces) == 2
     world.take(collision_object("post", primitive(SolidPrimitive.CYLINDER, 0.4, 0.02), operation=kind.APPEND))
-    assert set(where(world)) == {"shelf", "post"}
+    assert set(where(world)) == world.names() == {"shelf", "post"}
+    kept = world.obstacles()
+    world.take(collision_object("third", box, at=(-0.5, 0.0, 0.1)))
+    assert [item for item in world.obstacles() if item.id != "third"] == list(kept), "what has not changed is not made again"
+    world.take(collision_object("third", operation=kind.REMOVE))
     world.take(collision_object("shelf", operation=kind.REMOVE))
     assert set(where(world)) == {"post"}
     assert "nobody has said" in world.take(collision_object("ghost", operation=kind.MOVE))[0]
