@@ -1,6 +1,6 @@
 """Free motions of the Panda by roboplan, for :mod:`magic_planner.alternatives`: run by the Python of an environment that has it.
 
-Imports nothing of this project: roboplan asks for another numpy than MPlib.  ``python free_by_roboplan.py IN.npz OUT.npz``: boxes and pairs of
+Imports nothing of this project, whose environment cannot have roboplan: it asks for another numpy than MPlib.  ``python free_by_roboplan.py IN.npz OUT.npz``: boxes and pairs of
 joint positions in, paths and seconds of the processor out.
 """
 
@@ -10,6 +10,7 @@ import itertools
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ GROUP = "arm"
 
 def scene_of(given: Any) -> Any:
     """The Panda, its fingers open, among the boxes."""
-    from roboplan import core
-
+    core = import_module("roboplan.core")
     urdf, srdf = Path(str(given["urdf"])), Path(str(given["srdf"]))
     found = core.Scene("boxes", core.loadUrdfSceneDescription(str(urdf), [str(given["packages"])]))
     found.allowAdjacentLinkCollisions()
@@ -43,8 +43,7 @@ def scene_of(given: Any) -> Any:
 
 def main() -> None:
     """Plan every pair."""
-    from roboplan import core, rrt
-
+    core, rrt = import_module("roboplan.core"), import_module("roboplan.rrt")
     given = np.load(sys.argv[1])
     options = rrt.RRTOptions()
     options.rrt_connect, options.max_planning_time, options.group_name = True, SECONDS, GROUP
