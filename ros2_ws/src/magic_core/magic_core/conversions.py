@@ -425,7 +425,7 @@ def without_pictures(msg: mi.SceneObject, cloud: bool, surface: bool) -> mi.Scen
     light.view, light.mask = mi.CanonicalView(), Image()
     if not cloud:
         light.cloud = PointCloud2(header=msg.cloud.header)
-    if not surface and msg.pieces:
+    if not surface and any(piece.vertices for piece in msg.pieces):
         light.mesh = MeshMsg()
         light.mesh_colors = type(msg.mesh_colors)("B")
     return light

@@ -447,5 +447,6 @@ def test_what_planner_and_verifier_are_sent_is_the_object_without_its_pictures()
     np.testing.assert_array_equal(same.mesh.vertices, item.mesh.vertices)
     assert len(bare.mesh.vertices) == 0 and len(bare.points) == 0 and len(same.points) == 5
     # Without pieces the mesh is all that there is of its shape.
-    whole.pieces = []
-    assert cv.without_pictures(whole, cloud=False, surface=False).mesh is whole.mesh
+    for pieces in ([], [type(whole.mesh)()]):
+        whole.pieces = pieces
+        assert cv.without_pictures(whole, cloud=False, surface=False).mesh is whole.mesh
