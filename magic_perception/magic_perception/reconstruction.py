@@ -12,6 +12,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 * things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where cameras
   look into it, with the handle carved in its own upright plane in the same way as a flat thing;
 * bowls and dishes become a body of revolution as well, from their rim, their inside and what shows of their outside;
+* round things that lie on their side are built in the frame of their own axis as if they stood;
 * other standing things are stacked from layers, completed by point symmetry where no camera saw through the completion;
 * every proposal but the flat ones has to agree with the masks, and free space forbids it: where rays of a depth camera pass
   through a proposed solid (a hoop taken for a ball, a bent wire for a wall), the thing is carved out of space instead.
@@ -26,9 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
 from magic_perception import clusters, polygons, primitives
 from magic_perception.boxes import recognise_box
 from magic_perception.carved import build_carved
+from magic_perception.lain import build_lain
 from magic_perception.layers import build_layers
 from magic_perception.lying import build_lying
 from magic_perception.parameters import Parameters
@@ -64,17 +67,21 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     # Without the outermost half percent: one stray ray must not lay a mug down.
     length = float(np.max(np.subtract(*np.percentile(spread @ axes.T, [99.5, 0.5], axis=0))))
     turned, stands = None, height > 0.04 and height > 0.45 * length
+    # Round things: standing, hollow, on their side.  One that agrees well is taken; else the best of those that agree.
+    agreeing: list[tuple[float, Reconstruction]] = []
+    standing: Mesh | None = None
     if stands:
         turned = build_round(sights, points, eyes, height, noise, parameters)
         if turned is not None:
-            fit = agreement(turned.mesh, sights)
-            if fit.overlap > 0.8 and fit.through < _FREE:
-                return replace(turned, fit=fit)
-    vessel = build_vessel(sights, points, eyes, height, noise, parameters)
-    if vessel is not None:
-        fit = agreement(vessel.mesh, sights)
-        if fit.overlap > 0.85 and fit.through < _FREE:
-            return replace(vessel, fit=fit)
+            standing = turned.mesh
+            agreeing += _agreeing(turned, sights, 0.8)
+    for build, least in ((build_vessel, 0.85), (build_lain, 0.9)):
+        if max((score for score, _ in agreeing), default=0.0) < _WELL:
+            found = build(sights, points, eyes, height, noise, parameters)
+            agreeing += _agreeing(found, sights, least)
+    if agreeing:
+        # What stands and may have a handle gives way to another only where that is clearly better.
+        return max(agreeing, key=lambda pair: pair[0] + (_CLEARLY if pair[1].mesh is standing else 0.0))[1]
     if stands and height > 0.65 * length:  # a ladle's stem rises, but it lies
         return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
     return _freest([lambda: build_lying(sights, noise, parameters)], sights, noise)
@@ -82,6 +89,18 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
 
 #: Largest share of rays that may pass through a solid: noise and a pixel of the edge.
 _FREE = 0.15
+#: From this score on a solid agrees so well with what was seen that no other is looked for.
+_WELL = 0.86
+#: A solid is clearly better than another by so much of the score.
+_CLEARLY = 0.05
+
+
+def _agreeing(solid: Reconstruction | None, sights: list[Sight], least: float) -> list[tuple[float, Reconstruction]]:
+    """The solid with its score where its overlap is above ``least`` and few rays pass through it."""
+    if solid is None:
+        return []
+    fit = agreement(solid.mesh, sights)
+    return [(fit.score, replace(solid, fit=fit))] if fit.overlap > least and fit.through < _FREE else []
 
 
 def _freest(builds: list[Callable[[], Reconstruction | None]], sights: list[Sight], noise: float) -> Reconstruction:

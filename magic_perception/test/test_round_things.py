@@ -7,7 +7,7 @@ import pytest
 import scenes
 import trimesh
 
-from magic_core import sensor
+from magic_core import sensor, shapes, transforms
 from magic_core.mesh import Mesh
 from magic_core.views import find_view, holes_of
 from magic_perception.parameters import Parameters
@@ -47,6 +47,32 @@ def test_a_bowl_is_one_hollow_thing(rim, foot, height, names):
     assert not holes_of(find_view(item.mesh, item.pieces, "top").mask).any()
     assert solid.volume < 0.5 * solid.convex_hull.volume
     assert abs(solid.volume - truth.to_trimesh().volume) < 0.4 * truth.to_trimesh().volume
+
+
+def lain(mesh: Mesh, roll: float, yaw: float) -> Mesh:
+    """The mesh on its side, turned about its own axis by ``roll`` first, radians."""
+    side = transforms.from_rpy(0, np.pi / 2, 0) @ transforms.from_rpy(0, 0, roll)
+    return scenes.placed(mesh.transformed(side), 0.5, 0.0, yaw)
+
+
+@pytest.mark.parametrize(("seed", "roll", "yaw"), [(7002, 1.6, 0.4), (7005, 1.2, 2.2)])
+def test_a_mug_on_its_side_is_a_round_body_with_an_open_handle(seed, roll, yaw):
+    truth = lain(shapes.make("mug", seed).mesh, roll, yaw).painted((60, 90, 200))
+    item, shape = seen(truth, ("left", "right"), poses=sensor.STATION)
+    assert shape == "round with handle"
+    solid = item.mesh.transformed(item.world_from_object).to_trimesh()
+    assert solid.euler_number == 0
+    assert solid.bounds == pytest.approx(truth.to_trimesh().bounds, abs=0.012)
+
+
+def test_a_can_on_its_side():
+    can = trimesh.creation.cylinder(0.033, 0.12)
+    truth = lain(Mesh(can.vertices, can.faces), 0.0, 0.6).painted((180, 60, 50))
+    item, shape = seen(truth, ("left",))
+    assert shape == "round"
+    solid = item.mesh.transformed(item.world_from_object).to_trimesh()
+    assert solid.bounds == pytest.approx(truth.to_trimesh().bounds, abs=0.008)
+    assert solid.volume == pytest.approx(truth.to_trimesh().volume, rel=0.1)
 
 
 @pytest.mark.parametrize(("radius", "height", "recess"), [(0.033, 0.10, 0.003), (0.05, 0.21, 0.0), (0.042, 0.14, 0.005)])
