@@ -58,6 +58,7 @@ setup(
             f"learn = {PACKAGE}.programs:learn",
             f"reality = {PACKAGE}.programs:reality",
             f"benchmark = {PACKAGE}.programs:benchmark",
+            f"maniskill = {PACKAGE}.programs:maniskill",
         ]
     },
 )
