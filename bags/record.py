@@ -1,5 +1,7 @@
 """Records the bags of this folder: three scenes and three demonstrations, ray-cast with a model of two D435 cameras.
 
+``toppling`` and ``toppling_demonstration``, of a task that does not ship (``docs/your_own_task.md``), are recorded where they are named.
+
     python bags/record.py [--out DIR] [--seed N] [NAME ...]
 
 Source ``ros2_ws/env.sh`` first (the message packages are needed).  The same seed
@@ -20,14 +22,16 @@ from numpy.typing import NDArray
 
 from magic_bags.recording import Recording
 from magic_bringup import make_strategies
+from magic_bringup.demonstrating import UP, demonstrated, made_of, target_contact, target_view, through
 from magic_core import transforms
 from magic_core.camera import Intrinsics
+from magic_core.goal import Goal
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 from magic_core.sensor import D435, SMEARED, STATION, capture, looking_at, scene_raycaster
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures, pose_data
-from magic_core.strategy import Strategy
+from magic_core.strategy import Physics, Strategy, Waypoint
 
 Array = NDArray[np.float64]
 
@@ -40,7 +44,12 @@ JOINT_PERIOD, POSE_PERIOD = 0.05, 0.05
 D435_SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
 DEMONSTRATION_FRAMES = 3
 #: Before it is used, the tool lies on the table at x, y, yaw, seen so often, and is then taken to where its use begins: seconds.
-PICKED_UP_FROM = {"hooking": (0.44, -0.24, 0.3), "hanging": (0.44, -0.26, 0.2), "scooping": (0.46, 0.31, 0.1)}
+PICKED_UP_FROM = {
+    "hooking": (0.44, -0.24, 0.3),
+    "hanging": (0.44, -0.26, 0.2),
+    "scooping": (0.46, 0.31, 0.1),
+    "toppling": (0.44, -0.24, 0.3),
+}
 LYING_FRAMES = 2
 REST, TAKE = 0.6, 3.4
 
@@ -208,6 +217,56 @@ def scooping_scene(seed: int) -> list[Thing]:
     ]
 
 
+#: A bottle, and how far above its middle it is pulled.
+BOTTLE, HIGH_UP = {"radius": 0.025, "half_height": 0.07}, 0.035
+#: Where it stands (m).
+BOTTLE_X = 0.62
+
+
+def toppling_scene(seed: int) -> list[Thing]:
+    """A caliper on the table, and a bottle out in front."""
+    caliper = make("caliper", seed + 4, beam=0.26, opening=0.105, jaw=0.07, width=0.022, thickness=0.018)
+    bottle = make("cylinder", seed + 9, **BOTTLE)
+    return [
+        Thing("caliper", caliper, lying(caliper, 0.44, -0.22, 0.5)),
+        Thing("bottle", bottle, lying(bottle, BOTTLE_X, 0.0, 0.0)),
+    ]
+
+
+def toppling() -> Strategy:
+    """An L hook, lowered behind a bottle's neck, pulls the bottle over; what it is for is not said."""
+    tool = make("l_hook", 0, length=0.25, tip=0.07, width=0.02, thickness=0.018, inner_radius=0.03, bend=np.pi / 2)
+    target = make("cylinder", 0, **BOTTLE)
+    tool_view = tool.view("top")
+    direction, normal = -UP, np.array([1.0, 0.0, 0.0])
+    seen = target_view(target, "top", direction)
+    touched = target_contact(seen, BOTTLE["radius"] * normal, normal, BOTTLE["radius"])
+    waypoints = (
+        Waypoint("above", np.array([0.03, 0, -0.12 - HIGH_UP]), "approach"),
+        Waypoint("behind", np.array([0.03, 0, -HIGH_UP]), "approach"),
+        Waypoint("touch", np.array([0.0, 0, -HIGH_UP]), "contact", 0.05),
+        Waypoint("pulled", np.array([-0.08, 0, -HIGH_UP]), "goal"),
+        Waypoint("up", np.array([-0.08, 0, -0.12 - HIGH_UP]), "retreat"),
+    )
+    times, contacts = through(waypoints)
+    contact = tool.contact("inner", tool_view)
+    return Strategy(
+        name="toppling",
+        description="",
+        view="top",
+        mode="plan",
+        **demonstrated(tool, tool_view, contact, target, seen, touched, normal, direction, times, contacts),
+        waypoints=waypoints,
+        goal=Goal("none"),
+        physics=Physics(friction=0.3),
+        environment={
+            "world_from_target": pose_data(transforms.make(translation=[BOTTLE_X, 0.0, BOTTLE["half_height"]])),
+            "tool": made_of(tool),
+            "target": made_of(target),
+        },
+    )
+
+
 def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, Array]) -> None:
     """A scene at rest: static transforms and known objects first, then frames and joint states in the order of time."""
     caster = scene_raycaster([t.mesh for t in things])
@@ -332,10 +391,12 @@ def _write_truth(path: Path, seed: int, things: list[Thing]) -> None:
 
 SCENES = {"hooking": (hooking_scene, CAMERAS), "hanging": (hanging_scene, HIGH_CAMERAS), "scooping": (scooping_scene, CAMERAS)}
 NAMES = (*SCENES, *(f"{name}_demonstration" for name in SCENES))
+#: Of a task that does not ship.
+OTHERS = ("toppling", "toppling_demonstration")
 
 
 def record(name: str, out: Path, seed: int = 0) -> Path:
-    """Record one bag of :data:`NAMES` into a folder of its name; an older one is replaced."""
+    """Record one bag of :data:`NAMES` or :data:`OTHERS` into a folder of its name; an older one is replaced."""
     path = out / name
     if path.exists():
         shutil.rmtree(path)
@@ -343,6 +404,10 @@ def record(name: str, out: Path, seed: int = 0) -> Path:
     if name in SCENES:
         scene, cameras = SCENES[name]
         record_scene(path, scene(seed), seed, cameras)
+    elif name == "toppling":
+        record_scene(path, toppling_scene(seed), seed, CAMERAS)
+    elif name == "toppling_demonstration":
+        record_demonstration(path, toppling(), seed, CAMERAS)
     else:
         task = name.removesuffix("_demonstration")
         record_demonstration(path, make_strategies.STRATEGIES[task](), seed, SCENES[task][1])
@@ -354,11 +419,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Record the bags of this folder.")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder that gets one folder for each bag")
     parser.add_argument("--seed", type=int, default=0, help="seed of objects and sensor noise, from 0 up")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(NAMES)}; all of them by default")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"which of {', '.join(NAMES)}; all of them by default; or of {', '.join(OTHERS)}",
+    )
     options = parser.parse_args(arguments)
-    unknown = [name for name in options.names if name not in NAMES]
+    unknown = [name for name in options.names if name not in (*NAMES, *OTHERS)]
     if unknown:
-        parser.error(f"unknown bag {unknown[0]!r} (allowed: {', '.join(NAMES)})")
+        parser.error(f"unknown bag {unknown[0]!r} (allowed: {', '.join((*NAMES, *OTHERS))})")
     for name in options.names or NAMES:
         path = record(name, options.out, options.seed)
         size = sum(f.stat().st_size for f in path.iterdir())
