@@ -9,6 +9,9 @@ from collections.abc import Iterable, Sequence
 
 from magic_core.errors import Code, MagicError
 
+#: A joint that is where it was up to a second ago, within this (rad, m), has been there meanwhile.
+RESTS = 1e-3
+
 
 class JointHistory:
     """Positions of joints over the last ``memory`` seconds, put together from messages that may each tell of some joints only.
@@ -55,7 +58,8 @@ class JointHistory:
             return min((self._tracks[n][-1][0] if n in self._tracks else -math.inf for n in names), default=-math.inf)
 
     def at(self, names: Iterable[str], stamp: float, reach: float) -> dict[str, float]:
-        """Positions by name at a stamp, linear between states; before the first and after the last as these, for at most ``reach`` seconds.
+        """Positions by name at a stamp, linear between states; before the first and after the last as these, for at most ``reach`` seconds, and in a longer
+        gap where the joint is after it where it was before.
 
         Raises ``NO_FRAMES`` where nothing was received, ``STALE_DATA`` for a joint that no message tells of, or none within reach.
         """
@@ -73,7 +77,8 @@ class JointHistory:
         i = bisect_left(track, (stamp, -math.inf))
         near = track[max(i - 1, 0) : i + 1]
         gaps = [abs(stamp - at) for at, _ in near]
-        if min(gaps) > reach:
+        rests = len(near) == 2 and abs(near[1][1] - near[0][1]) < RESTS and max(gaps) < 1.0
+        if min(gaps) > reach and not rests:
             raise MagicError(
                 Code.STALE_DATA,
                 f"state of {name} nearest to the picture's stamp, s away",

@@ -209,6 +209,18 @@ def test_messages_that_say_nothing_are_refused(positions, stamp):
     assert not history.known()
 
 
+def test_a_joint_that_is_after_a_gap_where_it_was_before_has_been_there():
+    history = JointHistory()
+    for stamp, resting, moving in ((10.0, 0.5, 0.0), (10.8, 0.5004, 0.4)):
+        history.take(["a", "b"], [resting, moving], stamp)
+    assert history.at(["a"], 10.4, 0.2)["a"] == pytest.approx(0.5, abs=1e-3)
+    with pytest.raises(MagicError, match="STALE_DATA"):
+        history.at(["b"], 10.4, 0.2)
+    history.take(["a"], [0.5], 13.0)
+    with pytest.raises(MagicError, match="STALE_DATA"):
+        history.at(["a"], 11.9, 0.2)
+
+
 def test_a_bag_that_begins_again_begins_anew():
     history = JointHistory(memory=5.0)
     history.take(["a"], [1.0], 100.0)
