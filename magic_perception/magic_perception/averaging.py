@@ -6,17 +6,28 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 
+#: A place has changed since an older frame where a channel of its colour, smoothed, is off by more than this (of 255) and than so many times what the
+#: frames are off by elsewhere, in a blob of so many pixels in both directions; and so have as many pixels around it.
+CHANGED, NOISES, BLOB, AROUND = 10.0, 5.0, 3, 7
+#: So has depth that is off by more than the spread in a blob of so many pixels: flicker at edges is narrower.
+FAR_BLOB = 9
+#: The same of two means, which have less noise: levels of colour, and of depth m at one metre (as its noise, growing with the square), in a blob of so
+#: many pixels; and how far the camera may be from where it was (entries of its pose).
+FAINT, SHIFT, DEEP_BLOB, PLACE = 6.0, 0.006, 7, 1e-4
+
 
 def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
-    """The mean of the frames of one camera that stands still; stamp and pose are those of the last.
+    """The mean of the frames of one camera that stands still, as of the last of them, whose stamp and pose it has.
 
-    A pixel needs depth in half of the frames.  Where the values spread by more than ``spread`` metres (edges flicker
+    A pixel needs depth in half of the frames that count there.  Where the values spread by more than ``spread`` metres (edges flicker
     between two surfaces) the median is taken instead of the mean, so that no surface is made up between two.
-    What is blind in one of them is blind in the mean: colours of the robot and of what is behind it are mixed there.
+    What moves, and what the robot hid before, is taken from the frames alone that show it as the last one does: the mean of a thing's places is
+    a thing that is nowhere.  Blind is what is blind in the last frame.
     Raises ``BAD_IMAGE`` for frames of different sizes, ``NO_FRAMES`` for none.
     """
     if not frames:
@@ -26,8 +37,10 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
         return last
     if any(f.depth.shape != last.depth.shape for f in frames):
         raise MagicError(Code.BAD_IMAGE, "sizes of the frames to average", [f.depth.shape for f in frames], "one size")
+    older = [_still(frame, last, spread) for frame in frames[:-1]]
+    used = np.stack([*older, np.ones_like(older[0])])
     depth = np.stack([f.depth for f in frames]).astype(np.float32)
-    valid = np.isfinite(depth)
+    valid = np.isfinite(depth) & used
     count = valid.sum(axis=0)
     filled = np.where(valid, depth, 0)
     mean = filled.sum(axis=0) / np.maximum(count, 1)
@@ -35,13 +48,51 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
     if wide.any():
         ordered = np.sort(np.where(valid[:, wide], depth[:, wide], np.inf), axis=0)
         mean[wide] = np.take_along_axis(ordered, ((count[wide] - 1) // 2)[None], axis=0)[0]
-    mean[2 * count < len(frames)] = np.nan
-    veils = [f.blind for f in frames if f.blind is not None]
-    blind = np.logical_or.reduce(veils) if veils else None
-    if blind is not None:
-        mean[blind] = np.nan
+    mean[2 * count < used.sum(axis=0)] = np.nan
+    if last.blind is not None:
+        mean[last.blind] = np.nan
     total = np.zeros(last.color.shape, np.float32)
-    for frame in frames:
-        cv2.accumulate(frame.color, total)
-    color = np.clip(total / len(frames) + 0.5, 0, 255).astype(np.uint8)
-    return replace(last, depth=mean.astype(np.float32), color=color, blind=blind)
+    for frame, counts in zip(frames, used, strict=True):
+        cv2.accumulate(frame.color, total, mask=counts.view(np.uint8))
+    color = np.clip(total / used.sum(axis=0)[..., None] + 0.5, 0, 255).astype(np.uint8)
+    return replace(last, depth=mean.astype(np.float32), color=color)
+
+
+def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
+    """Whether a mean of frames shows what an earlier one of the same camera, from the same place, did: no blob of it differs by more than noise."""
+    if frame.camera != before.camera or frame.depth.shape != before.depth.shape or frame.intrinsics != before.intrinsics:
+        return False
+    if not np.allclose(frame.world_from_camera, before.world_from_camera, atol=PLACE):
+        return False
+    blind, veiled = (np.zeros(f.depth.shape, bool) if f.blind is None else f.blind for f in (frame, before))
+    valid, was = np.isfinite(frame.depth), np.isfinite(before.depth)
+    with np.errstate(invalid="ignore"):
+        other = (valid != was) | (np.abs(frame.depth - before.depth) > SHIFT * np.maximum(frame.depth, 0.5) ** 2)
+    return not (
+        _opened(_recolored(frame, before, FAINT), BLOB).any()
+        or _opened(other & ~blind & ~veiled, DEEP_BLOB).any()
+        or _opened(blind != veiled, DEEP_BLOB).any()
+    )
+
+
+def _recolored(frame: RgbdFrame, other: RgbdFrame, least: float) -> NDArray[np.bool_]:
+    """(H, W): where two frames differ in colour, by more than ``least`` (of 255) and than elsewhere."""
+    difference = cv2.GaussianBlur(cv2.absdiff(frame.color, other.color).max(axis=2), (0, 0), 1.0)
+    return difference > max(least, NOISES * float(np.median(difference)))
+
+
+def _still(frame: RgbdFrame, last: RgbdFrame, spread: float) -> NDArray[np.bool_]:
+    """(H, W): where a frame shows what the last one does."""
+    changed = _opened(_recolored(frame, last, CHANGED), BLOB)
+    with np.errstate(invalid="ignore"):
+        changed |= _opened(np.abs(frame.depth - last.depth) > spread, FAR_BLOB)
+    if changed.any():
+        changed = cv2.dilate(changed.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).view(bool)
+    for blind in (frame.blind, last.blind):
+        if blind is not None:
+            changed = changed | blind
+    return ~changed
+
+
+def _opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)

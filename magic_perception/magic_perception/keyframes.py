@@ -71,10 +71,16 @@ class Keyframes:
         return True
 
     def update(
-        self, frames: list[RgbdFrame], labels: list[NDArray[np.int32]], earlier: list[tuple[RgbdFrame, RgbdFrame]], still: Collection[str]
+        self,
+        frames: list[RgbdFrame],
+        labels: list[NDArray[np.int32]],
+        earlier: list[tuple[RgbdFrame, RgbdFrame]],
+        still: Collection[str],
+        carried: Collection[int] = (),
     ) -> None:
         """Keep the frames of a scene; labels (H, W): where things are in them; earlier: what :meth:`useful` gave and what has become of
-        it since; still: the cameras that did not move while these frames were taken."""
+        it since; still: the cameras that did not move while these frames were taken; carried: labels of what will not stay where it is, which is
+        blotted out: a thing in the robot's hand is hidden by it as soon as it has left."""
         after = {id(old): new for old, new in earlier}
         kept = []
         for item in self._kept:
@@ -85,7 +91,12 @@ class Keyframes:
         for frame, image in zip(frames, labels, strict=True):
             if frame.camera not in still or self.limit < 1:
                 continue
-            new = Keyframe(frame, image > 0)
+            things = image > 0
+            passing = np.isin(image, list(carried)) & things
+            if passing.any():
+                passing = _widened(passing)
+                frame, things = frame.blinded(passing), things & ~passing
+            new = Keyframe(frame, things)
             for old in [k for k in kept if alike(k.frame, frame, NEAR, TURNED)]:
                 kept = [k for k in kept if k is not old]
                 if alike(old.frame, frame, STILL, STEADY):
@@ -142,9 +153,13 @@ def contradicted(
         for k in newer if changed else ():
             stale |= _drawn(looks[k], np.isin(labels[k], sorted(changed)), looks[i])
         if changed:
-            stale = cv2.dilate(stale.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).view(bool)
+            stale = _widened(stale)
         result.append(stale)
     return result
+
+
+def _widened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return cv2.dilate(mask.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).view(bool)
 
 
 def _opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

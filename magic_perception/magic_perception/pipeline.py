@@ -20,20 +20,21 @@ from magic_core.views import find_view
 from magic_perception import cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
 from magic_perception.glass import once, unmeasured
-from magic_perception.hidden import hangs, veil
+from magic_perception.hidden import ROBOT, hangs, veil
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.seen import cut_off, witnessed
 from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
 from magic_perception.sight import agreement
 from magic_perception.smear import behind
+from magic_perception.solids import hull_of
 
 
 @dataclass
 class Report:
     """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of all processors.
 
-    labels: of the frames.  cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer
+    labels: of the frames; numbers: the label of each object, by its id in the scene.  cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer
     ones contradict it.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
     """
 
@@ -41,6 +42,7 @@ class Report:
     cpu: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     labels: list[NDArray[np.int32]] = field(default_factory=list)
+    numbers: dict[str, int] = field(default_factory=dict)
     shapes: dict[str, str] = field(default_factory=dict)
     pixels: dict[str, int] = field(default_factory=dict)
     cameras: list[cameras.Disagreement] = field(default_factory=list)
@@ -111,7 +113,9 @@ def perceive(
         poses = [frame.world_from_camera for frame in frames]
         # One camera alone is measured against where it was before.
         count = now if now > 1 else len(looks)
-        pairs = cameras.measure(looks[:count], labels[:count], poses[:count], world_from_table, parameters.seed)
+        hanging = _hanging(looks, labels, fixtures)
+        still = [_at_rest(image, hanging) for image in labels[:count]]
+        pairs = cameras.measure(looks[:count], still, poses[:count], world_from_table, parameters.seed)
         report.cameras = pairs
         worst = max(pairs, key=lambda pair: (pair.beyond, pair.offset), default=None)
         if worst is not None and worst.beyond:
@@ -137,6 +141,7 @@ def perceive(
             moved = cameras.brought_together(looks, worst, world_from_table)
             looks = [after if same else before for before, after, same in zip(looks, moved, here, strict=True)]
             labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
+            hanging = _hanging(looks, labels, fixtures)
         found = iter(labels[:now])
         report.labels = [next(found) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(given, seeing, strict=True)]
         blank = [item for look, image in zip(looks[:now], labels[:now], strict=True) for item in unmeasured(look, image, world_from_table)]
@@ -148,7 +153,7 @@ def perceive(
 
     def build(label: int) -> _Built | MagicError:
         try:
-            return _build(label, looks, labels, now, fixtures, world_from_table, apart, parameters)
+            return _build(label, looks, labels, now, label in hanging, world_from_table, apart, parameters)
         except MagicError as error:
             return error
 
@@ -164,6 +169,7 @@ def perceive(
             else:
                 solids.append(built)
                 ids[label] = f"object_{len(solids)}"
+                report.numbers[ids[label]] = label
 
     with report.stage("views"):
         objects = []
@@ -186,6 +192,20 @@ def perceive(
     return Scene((*objects, *known), plane, stamp, camera_offset=offset, camera_angle=angle, notes=tuple(report.notes))
 
 
+def _hanging(looks: list[Looked], labels: list[NDArray[np.int32]], fixtures: tuple[Mesh, ...]) -> set[int]:
+    """The labels of what hangs above the table."""
+    top = max((int(image.max()) for image in labels), default=0)
+    return {label for label in range(1, top + 1) if hangs(looks, labels, label, fixtures)}
+
+
+def _at_rest(labels: NDArray[np.int32], hanging: set[int]) -> NDArray[np.int32]:
+    """The labels (H, W) of a picture without what may be on its way: what hangs, and what the robot is before, or holds.  Two cameras' pictures are not of one
+    moment: that they see such a thing at two places does not speak against their poses."""
+    beside = cv2.dilate((labels == ROBOT).view(np.uint8), np.ones((7, 7), np.uint8)).view(bool)
+    doubtful = hanging | set(np.unique(labels[beside & (labels > 0)]).tolist())
+    return np.where(np.isin(labels, sorted(doubtful)), 0, labels) if doubtful else labels
+
+
 @dataclass(frozen=True)
 class _Built:
     """A solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, and its pixels there."""
@@ -206,12 +226,12 @@ def _build(
     looks: list[Looked],
     labels: list[NDArray[np.int32]],
     now: int,
-    fixtures: tuple[Mesh, ...],
+    hanging: bool,
     world_from_table: NDArray[np.float64],
     apart: float,
     parameters: Parameters,
 ) -> _Built:
-    """The solid of the object with that label, and what was seen of it; now: so many looks are no earlier ones; apart: how far the cameras disagree, m."""
+    """The solid of the object with that label, and what was seen of it; now: so many looks are no earlier ones; hanging: nothing carries it; apart: how far the cameras disagree, m."""
     table_from_world = transforms.inverse(world_from_table)
     sights, clouds, paints, counts = [], [], [], []
     for looked, image in zip(looks, labels, strict=True):
@@ -237,7 +257,7 @@ def _build(
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     points, colors = points[keep], colors[keep]
-    cut, hanging = cut_off(looks, labels, label, parameters), hangs(looks, labels, label, fixtures)
+    cut = cut_off(looks, labels, label, parameters)
     if max(counts[:now]) < parameters.min_pixels:
         cut.append(UNSEEN)
     # A wall, a monitor, a person: no thing on the table.
@@ -249,7 +269,9 @@ def _build(
             round(across, 2),
             f"up to {parameters.max_extent}",
         )
-    solid = reconstruct(sights, parameters)
+    # Of a hand, or of what is in one, its place is asked, and it is elsewhere in the next scene.
+    seen_alone = hull_of(transforms.apply(table_from_world, points)) if hanging else None
+    solid = reconstruct(sights, parameters) if seen_alone is None else Reconstruction(seen_alone, (seen_alone,), "hull")
     evidence = Evidence(
         solid.shape,
         solid.fit or agreement(solid.mesh, sights),

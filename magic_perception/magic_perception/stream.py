@@ -159,16 +159,21 @@ def next_scene(
     more are known), the last of them at most ``skew`` seconds old, that is ``period`` later than the scene before (``done``) and
     before ``limit``.  A camera's next frame is waited for where it may still come before that stamp, unless all is ``settled``:
     nothing is under way.  Where more than a period is waiting, whole periods are passed over.  So which frames are averaged depends on
-    their stamps, and not on when each came or when this is asked.
+    their stamps, and not on when each came or when this is asked.  A stamp at which a frame of a camera is missing makes no scene: in the one before it
+    what moves is elsewhere.
     """
     if not stamps or not all(stamps.values()):
         return None
     gaps = {camera: float(np.median(np.diff(each))) if len(each) > 1 else math.inf for camera, each in stamps.items()}
+    # So often a camera sends a frame, also where many are lost; two that follow each other by a driver's whim say nothing.
+    short = {
+        camera: min((s for s in np.diff(each).tolist() if s > 0.3 * gaps[camera]), default=math.inf) for camera, each in stamps.items()
+    }
 
     def whole(stamp: float) -> bool:
         for camera, each in stamps.items():
             n = bisect_right(each, stamp)
-            if n < min(count, len(each)) or stamp - each[n - 1] > skew:
+            if n < min(count, len(each)) or stamp - each[n - 1] > (skew if settled else min(skew, 0.95 * short[camera])):
                 return False
             if n == len(each) and not settled and stamp - each[-1] > 0.75 * gaps[camera]:
                 return False

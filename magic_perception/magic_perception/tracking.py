@@ -2,39 +2,72 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from magic_core.scene import Scene, SceneObject
+from magic_core.scene import ROBOT, Scene, SceneObject
+
+Array = NDArray[np.float64]
+
+#: Speed of what a robot pushes or carries, m/s: so far a thing may be from where it was last seen, where nothing else can be it.
+SPEED = 0.5
+#: What may be the same thing from afar: box edges within this, m, and this share, of each other, and mean colours within this (Lab).
+EDGE, SHARE, COLOR = 0.010, 0.15, 14.0
+#: A thing's speed says where it is for so many seconds.
+AHEAD = 2.0
+#: What is so near to where it was, m, stands there.
+STANDS = 0.02
+
+
+@dataclass(frozen=True)
+class _Track:
+    """A thing as it was seen last: centre and box edges m, mean colour (Lab), speed m/s; when, s, and how many scenes ago."""
+
+    centre: Array
+    extents: Array
+    color: Array
+    speed: Array
+    stamp: float
+    age: int = 0
+
+    @classmethod
+    def of(cls, item: SceneObject, stamp: float, before: _Track | None) -> _Track:
+        """Of an object as it is seen; before: as it was seen before that, if it was."""
+        centre = item.world_from_object[:3, 3].copy()
+        seconds = stamp - before.stamp if before is not None else 0.0
+        speed = (centre - before.centre) / seconds if before is not None and seconds > 1e-3 else np.zeros(3)
+        return cls(centre, np.sort(item.box_extents), _color(item), speed, stamp)
+
+    def expected(self, stamp: float) -> Array:
+        """Where it is at a stamp if it goes on as it did."""
+        return self.centre + self.speed * min(max(stamp - self.stamp, 0.0), AHEAD)
 
 
 class Tracker:
     """Hands ids on from the last scenes.
 
-    An object takes the id of the one it resembles most in place (within ``reach`` metres) and in size (box edges
-    within ``growth`` of each other plus 15 mm); a thing not seen for ``memory`` scenes is forgotten, but its number is not given out again.
+    An object takes the id of the one it resembles most in place (within ``reach`` metres of where that was, or would be if it went on as it did) and in
+    size (box edges within ``growth`` of each other plus 15 mm).  What is left then takes the id of what is missing where both are alike in size
+    and colour, no farther apart than a robot may have moved it, and nothing else could be either of them.
+    A thing not seen for ``memory`` scenes is forgotten, but its number is not given out again.  ``standing``: ids of what is where it was before.
     """
 
     def __init__(self, reach: float = 0.10, growth: float = 0.5, memory: int = 10) -> None:
         self.reach, self.growth, self.memory = reach, growth, memory
-        self._last: dict[str, tuple[np.ndarray, np.ndarray, int]] = {}
+        self.standing: frozenset[str] = frozenset()
+        self._last: dict[str, _Track] = {}
         self._next = 1
 
     def update(self, scene: Scene) -> Scene:
         """The scene with stable ids; known objects keep theirs."""
         seen = [o for o in scene.objects if o.source == "camera"]
-        costs = []
-        for i, item in enumerate(seen):
-            for name, (centre, extents, _) in self._last.items():
-                distance = float(np.linalg.norm(item.world_from_object[:3, 3] - centre))
-                change = np.abs(np.sort(item.box_extents) - np.sort(extents))
-                if distance < self.reach and np.all(change < 0.015 + self.growth * np.maximum(np.sort(extents), np.sort(item.box_extents))):
-                    costs.append((distance + 0.5 * float(change.max()), i, name))
-        names: dict[int, str] = {}
-        for _, i, name in sorted(costs):
-            if i not in names and name not in names.values():
-                names[i] = name
+        new = [_Track.of(item, scene.stamp, None) for item in seen]
+        names = self._near(new)
+        names |= self._far(new, names)
         taken = {o.id for o in scene.objects if o.source != "camera"}
         renamed: list[SceneObject] = []
         for i, item in enumerate(seen):
@@ -44,9 +77,54 @@ class Tracker:
                 if candidate not in taken:
                     names[i] = candidate
             renamed.append(replace(item, id=names[i]))
-        new = {old.id: item.id for old, item in zip(seen, renamed, strict=True)}
-        renamed = [replace(item, cut_off=tuple(new.get(by, by) for by in item.cut_off)) for item in renamed]
-        self._last = {n: (c, e, age + 1) for n, (c, e, age) in self._last.items() if age + 1 < self.memory}
+        ids = {old.id: item.id for old, item in zip(seen, renamed, strict=True)}
+        renamed = [replace(item, cut_off=tuple(ids.get(by, by) for by in item.cut_off)) for item in renamed]
+        before = self._last
+        self._last = {n: replace(track, age=track.age + 1) for n, track in before.items() if track.age + 1 < self.memory}
         for item in renamed:
-            self._last[item.id] = (item.world_from_object[:3, 3].copy(), item.box_extents.copy(), 0)
+            self._last[item.id] = _Track.of(item, scene.stamp, before.get(item.id))
+        kept = ((name, before[name], self._last[name]) for name in self._last.keys() & before.keys())
+        self.standing = frozenset(name for name, old, now in kept if np.linalg.norm(now.centre - old.centre) < STANDS)
         return replace(scene, objects=(*renamed, *(o for o in scene.objects if o.source != "camera")))
+
+    def carried(self, item: SceneObject) -> bool:
+        """Whether an object of the newest scene is where it is by the grace of what holds it: it hangs, or the robot is before it and it was not there before."""
+        return item.source == "camera" and (item.hanging or (ROBOT in item.cut_off and item.id not in self.standing))
+
+    def _near(self, new: list[_Track]) -> dict[int, str]:
+        """The ids of what is about where something was, the most alike first."""
+        costs = []
+        for i, item in enumerate(new):
+            for name, old in self._last.items():
+                distance = min(float(np.linalg.norm(item.centre - place)) for place in (old.centre, old.expected(item.stamp)))
+                change = np.abs(item.extents - old.extents)
+                if distance < self.reach and np.all(change < 0.015 + self.growth * np.maximum(old.extents, item.extents)):
+                    costs.append((distance + 0.5 * float(change.max()), i, name))
+        names: dict[int, str] = {}
+        for _, i, name in sorted(costs):
+            if i not in names and name not in names.values():
+                names[i] = name
+        return names
+
+    def _far(self, new: list[_Track], names: dict[int, str]) -> dict[int, str]:
+        """The ids of what is elsewhere, of those without one, where there is no other choice."""
+
+        def alike(item: _Track, old: _Track) -> bool:
+            edges = np.abs(item.extents - old.extents) < EDGE + SHARE * np.maximum(item.extents, old.extents)
+            distance = float(np.linalg.norm(item.centre - old.centre))
+            near = distance < self.reach + SPEED * max(item.stamp - old.stamp, 0.0)
+            return bool(near and edges.all() and np.linalg.norm(item.color - old.color) < COLOR)
+
+        left = [i for i in range(len(new)) if i not in names]
+        gone = [name for name in self._last if name not in names.values()]
+        pairs = [(i, name) for i in left for name in gone if alike(new[i], self._last[name])]
+        return {i: name for i, name in pairs if [p[0] for p in pairs].count(i) == 1 and [p[1] for p in pairs].count(name) == 1}
+
+
+def _color(item: SceneObject) -> Array:
+    """(3,) mean colour in Lab; not a number where none was seen."""
+    if len(item.colors) == 0:
+        return np.full(3, math.nan)
+    step = max(1, len(item.colors) // 500)
+    colors = np.ascontiguousarray(item.colors[::step][None], dtype=np.uint8)
+    return cv2.cvtColor(colors, cv2.COLOR_RGB2LAB)[0].astype(float).mean(axis=0)

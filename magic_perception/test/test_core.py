@@ -1,6 +1,7 @@
 """Perception's core against analytic truths and ray-cast scenes."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters, polygons, primitives
-from magic_perception.averaging import average
+from magic_perception.averaging import average, unchanged
 from magic_perception.evaluate import overlap
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
@@ -263,8 +264,6 @@ def test_ball():
 def test_known_objects_are_left_out(hooking):
     meshes, captured, scene, _ = hooking
     tin = nearest(scene, meshes[1])
-    from dataclasses import replace
-
     post = replace(tin, id="post", source="known")
     again = perceive([c[0] for c in captured], (post,))
     assert len(again.objects) == 3 and again.find("post") is post
@@ -514,6 +513,47 @@ def test_average_takes_noise_out_and_keeps_edges():
     assert np.isnan(gone.depth).all()
 
 
+def test_what_moves_is_where_the_last_frame_shows_it():
+    """A thing that is pushed, and the robot before the table, leave no trace of where they were in the mean."""
+
+    def shown(x, seed):
+        return scenes.capture(
+            [(shapes.make("cylinder", 1, radius=0.03, half_height=0.03).mesh.transformed(transforms.make(translation=[x, 0.0, 0.03])))],
+            seed=seed,
+        )[0]
+
+    frames = [shown(x, seed) for seed, x in enumerate((0.50, 0.52, 0.54))]
+    mean, alone = average(frames), average([shown(0.54, seed) for seed in (2, 3, 4)])
+    assert np.mean(np.abs(mean.color.astype(int) - alone.color).max(axis=2) > 8) < 1e-3
+    both = np.isfinite(mean.depth) & np.isfinite(alone.depth)
+    assert np.mean(np.abs(mean.depth - alone.depth)[both] > 0.015) < 1e-3
+    # Where nothing moves it is a mean.
+    assert np.median(np.abs(mean.depth - frames[-1].depth)[both]) > 1e-4
+    for count in (1, 2):  # the robot was there before, and has left
+        stripe = np.zeros(mean.depth.shape, bool)
+        stripe[:, 100:150] = True
+        after = average([*(frame.blinded(stripe) for frame in frames[:count]), *[frames[-1]] * (3 - count)])
+        assert after.blind is None and np.isfinite(after.depth[:, 100:150]).mean() > 0.9
+
+
+def test_what_has_not_changed_is_told_from_what_has_moved_by_millimetres():
+    def shown(x, first, color=(60, 90, 160)):
+        ball = shapes.make("cylinder", 1, radius=0.03, half_height=0.03).mesh.transformed(transforms.make(translation=[x, 0.0, 0.03]))
+        return average([scenes.capture([ball.painted(color)], seed=first + k)[0] for k in range(3)])
+
+    before = shown(0.5, 0)
+    assert all(unchanged(shown(0.5, 10 * k), before) for k in range(1, 6))
+    assert not unchanged(shown(0.504, 10), before)
+    wood = (150, 120, 90)  # the table's colour: its depth alone tells
+    assert not unchanged(shown(0.512, 10, wood), shown(0.5, 0, wood))
+    stripe = np.zeros(before.depth.shape, bool)
+    stripe[:, 100:110] = True
+    assert not unchanged(before.blinded(stripe), before)
+    assert not unchanged(replace(before, camera="right"), before)
+    moved = before.world_from_camera @ transforms.make(translation=[0.001, 0.0, 0.0])
+    assert not unchanged(replace(before, world_from_camera=moved), before)
+
+
 def test_registration_of_a_plane_seen_from_aside():
     depth_camera, color_camera = Intrinsics(160, 120, 100, 100, 79.5, 59.5), Intrinsics(320, 240, 220, 220, 159.5, 119.5)
     color_from_depth = transforms.from_rpy(0, 0, 0, [0.015, 0, 0])
@@ -617,11 +657,18 @@ def test_which_frames_are_averaged_depends_on_their_stamps_alone():
     assert next_scene({"left": [0.1, 0.3, 0.5], "right": [0.28, 0.48, 0.68]}, 3) is None
     assert next_scene({"left": [0.1, 0.3, 0.5], "right": [0.28, 0.48, 0.68]}, 3, settled=True) == 0.68
     assert next_scene(stamps, 3, limit=0.68) is None and next_scene({"left": [], "right": [1.0]}, 1) is None
+    # A frame that is missing is not replaced by the one before, unless nothing else comes.
+    both = [round(0.2 * k, 1) for k in range(1, 9)]
+    assert next_scene({"left": both, "right": both}, 3, 0.0, 1.0, 0.5) == 1.0
+    assert next_scene({"left": both, "right": [s for s in both if s not in (1.0, 1.2)]}, 3, 0.0, 1.0, 0.5) == 1.4
+    # Where more frames are lost than come, too.
+    some = [0.2, 0.4, 1.0, 1.4, 1.8, 2.2]
+    assert next_scene({"left": [round(0.2 * k, 1) for k in range(1, 12)], "right": some}, 3, 1.4, 0.0, 0.5) == 1.8
+    end = {"left": both[:5], "right": both[:3]}
+    assert next_scene(end, 3, 0.6, 0.2, 0.5) is None and next_scene(end, 3, 0.6, 0.2, 0.5, settled=True) == 1.0
 
 
 def test_ids_stay(hooking):
-    from dataclasses import replace
-
     _, _, scene, _ = hooking
     tracker = Tracker()
     first = tracker.update(scene)
@@ -631,6 +678,34 @@ def test_ids_stay(hooking):
         assert second.find(a.id).world_from_object is a.world_from_object
     moved = replace(scene, objects=(replace(scene.objects[0], world_from_object=transforms.make(None, [5.0, 0, 0])),))
     assert tracker.update(moved).objects[0].id == "object_4"
+
+
+def test_what_a_robot_pushes_keeps_its_id_and_what_is_another_thing_gets_none(hooking):
+    scene = hooking[2]
+    tracker = Tracker()
+
+    def ids(stamp, **items):
+        told = replace(
+            scene, stamp=stamp, objects=tuple(replace(o, world_from_object=transforms.make(translation=x)) for o, x in items.values())
+        )
+        return dict(zip(items, (o.id for o in tracker.update(told).objects)))
+
+    one, other = scene.objects[:2]
+    assert np.abs(np.sort(one.box_extents) - np.sort(other.box_extents)).max() > 0.03
+    first = ids(10.0, a=(one, [0.7, 0.0, 0.0]), b=(other, [0.4, 0.3, 0.0]))
+    # Pushed by 0.2 m in a second, then on by as much; not seen for two seconds, and found again.
+    for stamp, x in ((11.0, 0.5), (12.0, 0.3), (14.0, 0.1)):
+        assert ids(stamp, a=(one, [x, 0.0, 0.0]), b=(other, [0.4, 0.3, 0.0])) == first
+    # Farther than anything moves it, of another size, of another colour: another thing.
+    painted = replace(one, colors=255 - one.colors)
+    for item, x in ((one, [0.1, 5.0, 0.0]), (other, [0.1, 0.3, 0.0]), (painted, [0.1, 0.3, 0.0])):
+        found = ids(15.0, a=(item, x), b=(other, [0.4, 0.3, 0.0]))
+        assert found["b"] == first["b"] and found["a"] not in first.values()
+        tracker = Tracker()
+        first = ids(14.0, a=(one, [0.1, 0.0, 0.0]), b=(other, [0.4, 0.3, 0.0]))
+    # Two that could both be it: neither is.
+    found = ids(15.0, a=(one, [0.1, 0.3, 0.0]), c=(one, [0.1, -0.3, 0.0]), b=(other, [0.4, 0.3, 0.0]))
+    assert not {found["a"], found["c"]} & set(first.values())
 
 
 # ---------------------------------------------------------------- offline

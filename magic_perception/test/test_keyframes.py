@@ -10,7 +10,7 @@ import pytest
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.mesh import Mesh
-from magic_core.scene import PICTURE, UNSEEN
+from magic_core.scene import PICTURE, UNSEEN, Scene
 from magic_core.sensor import SMEARED, STATION, capture, looking_at
 from magic_core.shapes import make
 from magic_perception.coverage import REGION, WRIST, compared, views
@@ -33,8 +33,11 @@ class Watcher:
     def look(self, frames, still=("left", "right", "wrist")):
         report = Report()
         earlier = self.keyframes.useful(frames)
-        scene = self.tracker.update(perceive(frames, (), REGION, None, report, earlier))
-        self.keyframes.update(frames, report.labels, report.earlier, still)
+        scene = perceive(frames, (), REGION, None, report, earlier)
+        numbers = [report.numbers[item.id] for item in scene.objects]
+        scene = self.tracker.update(scene)
+        carried = [n for n, item in zip(numbers, scene.objects, strict=True) if self.tracker.carried(item)]
+        self.keyframes.update(frames, report.labels, report.earlier, still, carried)
         return scene, earlier, report
 
 
@@ -168,3 +171,34 @@ def test_memory_is_bounded_and_ends():
     none = Keyframes(limit=0)
     none.update(frames[:1], [image], [], {"wrist"})
     assert none.useful([elsewhere]) == []
+
+
+def test_what_the_robot_carries_is_not_remembered_where_it_was(table):
+    """A mug in the hand, and where it was a moment ago hidden by the arm: nothing is there."""
+    _, frames = table
+    report, memory = Report(), Keyframes()
+    scene = perceive(frames[:2], (), REGION, None, report)
+    mug = report.numbers[only(scene, MUG).id]
+    memory.update(frames[:2], report.labels, [], {"left", "right"}, [mug])
+    blind = [replace(hidden(f, table[0][0], 12), stamp=2.0) for f in frames[:2]]
+    assert len(perceive(blind, (), REGION, earlier=memory.useful(blind)).objects) == 2
+    memory.update(frames[:2], report.labels, [], {"left", "right"})
+    assert len(perceive(blind, (), REGION, earlier=memory.useful(blind)).objects) == 3
+
+
+def test_what_hangs_or_comes_before_the_robot_is_carried(table):
+    mug = only(perceive(table[1][:2], (), REGION), MUG)
+
+    def item(x, **told):
+        return replace(mug, world_from_object=transforms.make(translation=[x, 0.0, 0.1]), **told)
+
+    tracker = Tracker()
+    for stamp, x, told, carried in (
+        (1.0, 0.5, {"cut_off": ("robot",)}, True),  # there was nothing before
+        (2.0, 0.5, {"cut_off": ("robot",)}, False),
+        (3.0, 0.56, {"cut_off": ("robot",)}, True),
+        (4.0, 0.62, {}, False),
+        (5.0, 0.62, {"hanging": True}, True),
+    ):
+        (found,) = tracker.update(Scene((item(x, **told),), np.array([0.0, 0.0, 1.0, 0.0]), stamp)).objects
+        assert found.id == "object_1" and tracker.carried(found) == carried
