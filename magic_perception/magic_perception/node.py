@@ -27,14 +27,14 @@ from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
 from magic_core.node import describe, parameter, robot_parameters, run
-from magic_core.qos import LATCHED, SENSOR
+from magic_core.qos import LATCHED, SENSOR, STATES
 from magic_core.robot import Description, RobotConfig
 from magic_core.scene import Scene, SceneObject
 from magic_core.self_filter import Margins
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
-from magic_perception.averaging import average
+from magic_perception.averaging import average, unchanged
 from magic_perception.keyframes import STEADY, STILL, Keyframes
 from magic_perception.parameters import METHODS, WORKSPACE, Parameters
 from magic_perception.pipeline import Report, perceive
@@ -51,6 +51,8 @@ DECODERS = {
 }
 #: What a user can do about a unit.
 REMEDY = "set the driver's depth unit, or this node's parameter depth_unit"
+#: A scene in which nothing changes is looked at again after so long by the stamps, s; what noise has made of it is not for ever.
+AFRESH = 10.0
 #: After so long without a new pair of images, s, none of those that were taken together is still on its way.
 SETTLED = 0.5
 
@@ -121,6 +123,8 @@ class Perception(Node):
 
         self.streams = {camera: Stream(camera, tolerance, self.count + WAITING) for camera in self.cameras}
         self.tracker = Tracker()
+        # What the last scene was made of, and the scene.
+        self.looked: tuple[list[RgbdFrame], tuple[SceneObject, ...], Scene] | None = None
         # By topic: calibrated fixtures, and what other software knows of.
         self.known: dict[str, tuple[SceneObject, ...]] = {}
         self.known_problems: dict[str, tuple[Code, str]] = {}
@@ -148,7 +152,8 @@ class Perception(Node):
         for topic in ("known_objects", "obstacles"):
             self.listen(SceneObjectArray, topic, partial(self.on_known, topic), LATCHED, inputs)
         if self.robot is not None:
-            self.create_subscription(JointState, "joint_states", self.on_joints, SENSOR, callback_group=inputs)
+            # Not behind the images: who is cut out by a state that is missing is not cut out.
+            self.create_subscription(JointState, "joint_states", self.on_joints, STATES, callback_group=MutuallyExclusiveCallbackGroup())
         wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
         wall_timer(self, 0.5, self.on_look, report)
         self.diagnostics = Diagnostics(self, self.on_report, report)
@@ -375,13 +380,20 @@ class Perception(Node):
             self.last_run = now
             with self.lock:
                 known = tuple(item for items in self.known.values() for item in items)
+            if (kept := self.same(frames, known)) is not None:
+                self.publish(kept)
+                self.done += 1
+                return
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
             scene = perceive(frames, known, self.parameters, self.segmenter, report, earlier)
             # An arm that could not be cut out would be remembered as a thing.
             whole = {f.camera for f in frames if not isinstance(self.cut.get(f.camera), MagicError)}
-            self.keyframes.update(frames, report.labels, report.earlier, still & whole)
+            numbers = [report.numbers.get(item.id, 0) for item in scene.objects]
             scene = self.tracker.update(replace(scene, frame_id=self.frame))
+            carried = [n for n, item in zip(numbers, scene.objects, strict=True) if self.tracker.carried(item)]
+            self.keyframes.update(frames, report.labels, report.earlier, still & whole, carried)
+            self.looked = frames, known, scene
             self.publish(scene)
             seconds = time.monotonic() - now
             self.done += 1
@@ -428,6 +440,17 @@ class Perception(Node):
             self.last_run = now
             self.outcome = (DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
             self.get_logger().error(self.outcome[2], throttle_duration_sec=5.0)
+
+    def same(self, frames: list[RgbdFrame], known: tuple[SceneObject, ...]) -> Scene | None:
+        """The scene as it was, where the frames show nothing else than those it was made of, a moment ago; ``None``: it has to be looked at."""
+        if self.looked is None:
+            return None
+        before, fixtures, scene = self.looked
+        stamp = max(frame.stamp for frame in frames)
+        recent = 0 <= stamp - max(frame.stamp for frame in before) < AFRESH
+        if not recent or list(map(id, known)) != list(map(id, fixtures)) or len(frames) != len(before):
+            return None
+        return replace(scene, stamp=stamp) if all(unchanged(f, b) for f, b in zip(frames, before, strict=True)) else None
 
     def gather(self, now: float) -> tuple[list[RgbdFrame], list[str], set[str]]:
         """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for; notes; and which cameras stood still."""
@@ -530,7 +553,7 @@ class Perception(Node):
                     wrong = error
                 last = error
                 continue
-            if self.robot is not None and self.robot.waits(pair.stamp) and now - pair.arrived < self.robot.age:
+            if self.robot is not None and self.robot.waits(pair.stamp) and now - pair.arrived < self.transform_timeout:
                 pending = min(pending, pair.stamp)
                 continue
             found.append(Placed(pair, pose, moved))
@@ -570,7 +593,11 @@ class Perception(Node):
                     pair.depth_frame_id,
                     f"{pair.frame_id}, that of colour; else set aligned to false",
                 )
-            frames.append(self.without_robot(RgbdFrame(pair.color, depth, intrinsics, last, stream.name, pair.stamp)))
+            try:
+                frames.append(self.without_robot(RgbdFrame(pair.color, depth, intrinsics, last, stream.name, pair.stamp)))
+            except MagicError:
+                if place is placed[-1]:
+                    raise
         result = average(frames)
         if np.isfinite(result.depth).sum() < 100:
             raise MagicError(
@@ -588,7 +615,8 @@ class Perception(Node):
         depths.check_pose(frame, stream.unit, REMEDY, self.parameters.region_low, self.parameters.region_high)
 
     def without_robot(self, frame: RgbdFrame) -> RgbdFrame:
-        """The frame, blind where the robot is; as it is where that is not known, which the diagnostics then say."""
+        """The frame, blind where the robot is; as it is where nobody tells, which the diagnostics then say.  Raises STALE_DATA where the arm is told of, but not
+        where it was then: an arm that is not cut out is a thing on the table."""
         if self.robot is None:
             return frame
         try:
@@ -601,6 +629,8 @@ class Perception(Node):
             self.cut[frame.camera] = float(frame.blind.mean()) if frame.blind is not None else 0.0
         except MagicError as error:
             self.cut[frame.camera] = error
+            if error.code == Code.STALE_DATA and self.robot.told(frame.stamp):
+                raise
         return frame
 
     def publish(self, scene: Scene) -> None:

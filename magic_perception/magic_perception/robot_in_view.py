@@ -11,6 +11,9 @@ from magic_core.joint_history import JointHistory
 from magic_core.robot import Description
 from magic_core.self_filter import Margins, SelfFilter
 
+#: Joint states that ended so long before a picture, s, say nothing of it: nobody sends them any more.
+SILENT = 2.0
+
 
 class RobotInView:
     """An arm before cameras.
@@ -48,7 +51,11 @@ class RobotInView:
 
     def waits(self, stamp: float) -> bool:
         """Whether joint states come that have not reached a stamp yet."""
-        return stamp - self.age < self.history.newest(self.robot.names) < stamp
+        return self.told(stamp) and self.history.newest(self.robot.names) < stamp
+
+    def told(self, stamp: float) -> bool:
+        """Whether joint states come, or came until a moment before a stamp: where one is missing the arm is somewhere nonetheless."""
+        return self.history.newest(self.robot.names) > stamp - SILENT
 
     def cut(self, frame: RgbdFrame, world_from_base: NDArray[np.float64] | None = None) -> RgbdFrame:
         """The frame, blind where it shows the robot, or may.

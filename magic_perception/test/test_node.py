@@ -772,3 +772,12 @@ def test_the_arm_is_cut_out_where_joint_states_tell_of_it(frames):
         bench.until(lambda: len(bench.objects[-1].objects) == 1, "scene without the arm", 60, lambda: tick(True))
         assert not bench.objects[-1].objects[0].hanging
         bench.until(lambda: any(m.endswith("robot: OK") for m in bench.messages()), "content with the robot", 30, lambda: tick(True))
+        # States that are missing for a moment: the arm is somewhere in the pictures, and no scene is made of them.
+        count, end = len(bench.objects), seconds[0] + 1.5
+
+        def gap():
+            if seconds[0] < end:
+                tick(False)
+
+        bench.until(lambda: seconds[0] >= end and "STALE_DATA" in bench.codes(), "word of what is missing", 30, gap)
+        assert not any(item.hanging for message in bench.objects[count:] for item in message.objects)

@@ -8,6 +8,7 @@ import pytest
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
 from magic_core.robot import Description
 from magic_core.robot_pictures import RobotPictures
 from magic_core.sensor import D435, capture, looking_at, scene_raycaster
@@ -101,6 +102,26 @@ def test_what_stands_or_hangs_on_a_fixture_does_not_hang():
     floating = perceive(seen([ball]), (), REGION)
     assert [o.hanging for o in on_it.objects if o.source == "camera"] == [False]
     assert [o.hanging for o in floating.objects] == [True]
+    # Where it is, is told as it was seen.
+    np.testing.assert_allclose(floating.objects[0].world_from_box[:3, 3], [0.5, 0.0, 0.23], atol=0.012)
+
+
+def test_what_is_on_its_way_does_not_set_the_cameras_against_each_other(monkeypatch):
+    """Two pictures of two moments, between which a carried box has moved by 30 mm; what stands tells that the cameras agree."""
+    import trimesh
+
+    def carried(x):
+        box = trimesh.creation.box(extents=(0.09, 0.07, 0.05))
+        return Mesh(box.vertices + [x, 0.0, 0.25], box.faces).painted((200, 60, 60))
+
+    standing = placed("cylinder", 9, 0.45, -0.2, radius=0.03)
+    pictures = [seen([standing, carried(0.50)])[0], seen([standing, carried(0.53)])[1]]
+    scene = perceive(pictures, (), REGION)
+    assert not scene.camera_offset > 0.006
+    np.testing.assert_allclose([o.world_from_box[:2, 3] for o in scene.objects if not o.hanging], [[0.45, -0.2]], atol=0.005)
+    monkeypatch.setattr("magic_perception.pipeline._at_rest", lambda labels, _hanging: labels)
+    with pytest.raises(MagicError, match="CAMERAS_DISAGREE"):
+        perceive(pictures, (), REGION)
 
 
 def across(frame, start, end, width):
@@ -132,11 +153,11 @@ def test_two_things_beside_each_other_stay_two_where_a_camera_sees_between():
     assert len(perceive([across(left, [0.515, -0.2, 0.0], [0.515, 0.4, 0.0], 70), right], (), REGION).objects) == 2
 
 
-def test_blind_pixels_are_blind_in_the_mean():
+def test_what_is_blind_in_the_last_frame_is_blind_in_the_mean():
     frames = seen(things())[:1] * 3
     stripe = np.zeros(frames[0].depth.shape, bool)
     stripe[:, 100:150] = True
-    mean = average([frames[0].blinded(stripe), *frames[1:]])
+    mean = average([*frames[:2], frames[2].blinded(stripe)])
     assert (mean.blind == stripe).all() and np.isnan(mean.depth[stripe]).all()
     assert average(frames).blind is None
 
@@ -168,3 +189,5 @@ def test_where_the_joints_are_not_known_is_told(panda):
 def test_joint_states_on_their_way_are_waited_for(panda):
     view = told(panda[0], OVER_THE_TABLE, at=10.0)
     assert view.waits(10.1) and not view.waits(10.0) and not view.waits(12.0)
+    # One that is missing in between is no silence.
+    assert view.told(9.0) and view.told(11.9) and not view.told(12.0)
