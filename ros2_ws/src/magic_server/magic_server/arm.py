@@ -135,7 +135,7 @@ class Arm:
                 tell(f"{where}: the fingers {'close on the tool' if action.close else 'open'}")
                 if not action.close:
                     guard.opened()
-                self._fingers(action, token)
+                self._fingers(action, token, look)
                 if action.close:
                     guard.closed()
 
@@ -149,6 +149,10 @@ class Arm:
             point.time_from_start = duration_to_msg((times[index] - times[move.first]) / speed)
             point.velocities = [v * speed for v in point.velocities]
             point.accelerations = [a * speed**2 for a in point.accelerations]
+            if (
+                index == move.last
+            ):  # where the arm stands, to a hundredth of a radian a second: controllers take no end at which it moves at all
+                point.velocities, point.accelerations = [0.0] * len(point.velocities), [0.0] * len(point.accelerations)
             goal.trajectory.points.append(point)
         names = trajectory.joint_names
         goal.path_tolerance = [JointTolerance(name=name, position=self.settings.path_tolerance) for name in names]
@@ -160,7 +164,7 @@ class Arm:
         if response.status != GoalStatus.STATUS_SUCCEEDED or result.error_code != FollowJointTrajectory.Result.SUCCESSFUL:
             raise execution.controller_error(result.error_code, response.status, result.error_string)
 
-    def _fingers(self, fingers: execution.Fingers, token: Token) -> None:
+    def _fingers(self, fingers: execution.Fingers, token: Token, looked: bool) -> None:
         settings = self.settings
         opening = max(0.0, fingers.opening - settings.squeeze) if fingers.close else fingers.opening
         goal = gripper.goal(self._command, settings.gripper_joint, opening * settings.finger_scale, settings.effort)
@@ -171,7 +175,7 @@ class Arm:
             # A gripper that squeezes a tool may say that it stalled, or abort because it did not get where it was told to.
             if response.status != GoalStatus.STATUS_SUCCEEDED and not result.stalled:
                 raise MagicError(Code.GRASP_FAILED, f"the gripper ended its goal with status {response.status}")
-            execution.check_grasp(fingers.opening, found, settings.grasp_tolerance)
+            execution.check_grasp(fingers.opening, found, settings.grasp_tolerance, looked)
         elif response.status != GoalStatus.STATUS_SUCCEEDED or not (result.reached or found >= fingers.opening - settings.grasp_tolerance):
             raise MagicError(
                 Code.EXECUTION_FAILED, f"the gripper did not open: mm between the fingers {1000 * found:.1f}, status {response.status}"

@@ -32,7 +32,7 @@ from magic_core.strategy import Strategy
 from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
 from magic_server import execution, in_hand, pipeline, scene_change, seen_goal
 from magic_server.arm import Arm
-from magic_server.held import Held, HeldStages
+from magic_server.held import Carried, Held, HeldStages
 from magic_server.joints import STANDSTILL
 from magic_server.permission import Claim, Limits, Look, NotYet, Purpose, World, permit
 from magic_server.remote import Token
@@ -122,8 +122,7 @@ class ClosedLoop:
         self.notes: list[str] = []
         self.executed = False
         self._in_hand: Held | None = None
-        #: Where the hand (3,) let the tool go, in the base's frame.
-        self._let_go: NDArray[np.float64] | None = None
+        self._carried: Carried | None = None
         self._touched = self._may_touch = False
         self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
         self._simulated = bool(server.get_parameter("use_sim_time").value)
@@ -175,7 +174,8 @@ class ClosedLoop:
         self.notes.append(f"{error.code.name}: {error.message}")
 
     def _carry_out(self, job: Job) -> str:
-        self._held, self._touched, self._may_touch, self._let_go = job.held, False, False, None
+        self._held, self._touched, self._may_touch = job.held, False, False
+        self._carried = None if job.held is None else Carried(job.held)
         self.executed = False
         self._arm.execute(job.outcome.plan, self._token, self._say, self, job.held is not None, self._settings.look)
         self.executed = True
@@ -192,10 +192,7 @@ class ClosedLoop:
         job = self.jobs[-1]
         outcome = job.outcome
         positions = tuple(outcome.plan.arm_trajectory.points[point].positions)
-        meant = {outcome.tool_id} if self._held is not None or self._touched else set()
-        meant |= {outcome.target_id} if self._touched else set()
-        carried = None if self._held is None else self._held.hull(self._server.robot.forward(np.array(positions))[0])
-        asked = replace(job.claim, start=positions, meant=frozenset(meant), carried=carried)
+        asked = replace(job.claim, start=positions, meant=frozenset(self._meant()))
         began = time.monotonic()
 
         def allowed() -> None:
@@ -204,10 +201,26 @@ class ClosedLoop:
             if told and min(told) <= began and time.monotonic() - min(told) <= self._limits.state_age:
                 raise NotYet(Code.STALE_DATA, "joint_states have not come since the last move ended")
             world = self._server.world(asked)
-            permit(asked, replace(world, servers={**world.servers, **self._arm.servers()}), self._limits, Purpose.MOVE)
+            claim = asked if world.scene is None else replace(asked, carried=self._tool_at(world.scene.stamp))
+            permit(claim, replace(world, servers={**world.servers, **self._arm.servers()}), self._limits, Purpose.MOVE)
 
         self._allowed(allowed)
         self._begun()
+
+    def _meant(self) -> set[str]:
+        """The ids of what the motion has moved so far, or may have."""
+        outcome = self.jobs[-1].outcome
+        moved = {outcome.tool_id} if self._carried is not None or self._touched else set()
+        return moved | ({outcome.target_id} if self._touched else set())
+
+    def _tool_at(self, stamp: float) -> NDArray[np.float64] | None:
+        """The hull of the tool where it was at a stamp, once it has been taken up; raises STALE_DATA where nobody said where the hand was then."""
+        if self._carried is None:
+            return None
+        try:
+            return self._carried.hull(stamp, self._server.hand)
+        except MagicError as error:
+            raise NotYet(error.code, error.message) from error  # of a newer picture it may be known
 
     def watch(self, move: execution.Move, speed: float) -> Callable[[], None]:
         """Look at the scene while the arm moves."""
@@ -218,11 +231,9 @@ class ClosedLoop:
         if not self._settings.watch:
             return lambda: None
         began = self._now()
-        meant = {job.outcome.tool_id} if self._held is not None or self._touched else set()
-        meant |= {job.outcome.target_id} if self._touched else set()
         until = (contact - times[move.first]) / speed
         watching = SceneWatch(
-            job.claim.scene, meant, job.outcome.target_id, until, self._settings.watch_tolerance, self._limits.objects_age
+            job.claim.scene, self._meant(), job.outcome.target_id, until, self._settings.watch_tolerance, self._limits.objects_age
         )
 
         newest: list[Look | None] = [None]
@@ -259,12 +270,13 @@ class ClosedLoop:
         job = self.jobs[-1]
         tool = next(o for o in job.stages.scene.objects if o.id == job.outcome.tool_id)
         self._held = Held(tool, conversions.pose_from_msg(job.outcome.plan.tool_from_tcp))
+        self._carried = Carried(self._held, self._now(), self._server.hand())
 
     def opened(self) -> None:
         """The fingers are about to open: what was in the hand is where it was let go."""
         self._touched = self._touched or self._may_touch
-        if self._held is not None:
-            self._let_go = self._server.hand()[:3, 3]
+        if self._held is not None and self._carried is not None:
+            self._carried = replace(self._carried, let_go=self._now(), let_go_at=self._server.hand())
         self._held = None
 
     def look(self, point: int) -> None:
@@ -275,15 +287,16 @@ class ClosedLoop:
         if scene is None:
             self._unseen("no picture came")
             return
-        hand = self._server.hand()
+        hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
         expected = held.pose(hand)
         job = self.jobs[-1]
         axis = "xy".index(self._server.robot.config.closing_axis)
-        found = in_hand.locate(held.mesh, expected, self._points(scene, job), hand[:3, axis])
+        prior = in_hand.AGAIN if held.looked else in_hand.PRIOR
+        found = in_hand.locate(held.mesh, expected, self._points(scene, job), hand[:3, axis], prior)
         if found is None:
             lying = next((o for o in scene.objects if self._lies(o, job)), None)
             if lying is not None:
-                self._held = None
+                self._held = self._carried = None
                 raise MagicError(Code.GRASP_FAILED, f"{job.outcome.tool_id} was not taken along: it lies where it lay, seen as", lying.id)
             self._unseen("the hand hides it, or too little of it is seen")
             return
@@ -294,7 +307,8 @@ class ClosedLoop:
         if not off.within(settings.slip_shift, settings.slip_turn):
             limit = f"at most {1000 * settings.slip_shift:g} mm and {np.degrees(settings.slip_turn):.0f} degrees"
             raise MagicError(Code.TOOL_SLIPPED, "the tool has slipped in the hand by", str(off), limit)
-        self._held = Held(held.tool, transforms.inverse(found.world_from_tool) @ hand)
+        self._held = Held(held.tool, transforms.inverse(found.world_from_tool) @ hand, True)
+        self._carried = Carried(self._held)
         raise Off(self._held, off)
 
     def _unseen(self, why: str) -> None:
@@ -456,7 +470,8 @@ class ClosedLoop:
         names = {"tool": outcome.tool_id, "target": outcome.target_id}
         table = conversions.plane_from_msg(first.table)
         looks = self._sight(job.stages.scene, False), self._sight(first, True), self._sight(second, True)
-        away = None if self._let_go is None else float(np.linalg.norm(self._server.hand()[:3, 3] - self._let_go))
+        let_go = None if self._carried is None else self._carried.let_go_at
+        away = None if let_go is None else float(np.linalg.norm((self._server.hand() - let_go)[:3, 3]))
         hand = seen_goal.Hand(self._held is None, away)
         phases = [phase.name for phase in outcome.plan.phases]
         seen = seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
@@ -468,15 +483,27 @@ class ClosedLoop:
 
     def _sight(self, scene: SceneObjectArray, after: bool) -> seen_goal.Sight:
         """Things where they were seen; after the motion a tool in the hand is where the hand has it."""
-        held, hand = self._held, self._server.hand()
+        stamp, known = conversions.time_from_msg(scene.header.stamp), self.jobs[-1].claim.scene.objects
+        held = self._held if after else None
+        hand = None if held is None else self._server.hand(stamp)
         things = {}
         for item in scene.objects:
             if after and UNSEEN in item.cut_off:
                 continue  # remembered from before the motion: what came of it is not known
-            if not after or held is None or not held.sees(item, hand, self.jobs[-1].claim.scene.objects):
+            if held is None or not held.sees(item, hand, known):
                 things[item.id] = seen_goal.Thing.of(conversions.mesh_from_msg(item.mesh), conversions.pose_from_msg(item.pose))
-        if after and held is not None:
+        if held is not None:
             things[held.tool.id] = seen_goal.Thing.of(held.mesh, held.pose(hand))
+        elif after and self._carried is not None and (tool := self._carried.held.tool.id) not in things:
+            # What the hand let go of is what is seen there, whatever its id; most of it, where it is seen in parts.
+            place = self._tool_at(stamp)
+            near = [
+                i
+                for i in things.keys() - known.keys()
+                if scene_change.contained(scene_change.hull(things[i].points), place, scene_change.ABOUT)
+            ]
+            if near:
+                things[tool] = things.pop(max(near, key=lambda i: float(np.prod(things[i].extents))))
         return seen_goal.Sight(things, conversions.time_from_msg(scene.header.stamp))
 
 

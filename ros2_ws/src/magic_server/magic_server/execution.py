@@ -35,6 +35,9 @@ class Look:
 
 Step = Move | Fingers | Look
 
+#: Fingers whose opening is no larger than this, m, have closed on nothing.
+EMPTY = 0.002
+
 #: What the error codes of control_msgs/FollowJointTrajectory say: name, what has happened, what it asks for.
 _ENDINGS = {
     0: ("SUCCESSFUL", "it ended as if carried out", "look at the controller's state"),
@@ -121,12 +124,14 @@ def _moves(first: int, last: int, velocities: Sequence[Sequence[float]], standst
     return [Move(first, last)]
 
 
-def check_grasp(wanted: float, found: float, tolerance: float) -> None:
+def check_grasp(wanted: float, found: float, tolerance: float, looked: bool = False) -> None:
     """Whether fingers that closed have the tool between them: their opening ``found`` is ``wanted`` within ``tolerance``, all m.
 
-    Raises GRASP_FAILED.
+    looked: the tool in the hand is looked at before it is used.  Then it is enough that there is something between the fingers: cameras that look down tell
+    a lying thing's thickness worst, and where the tool is tells more than how thick it is.  Raises GRASP_FAILED.
     """
-    if not abs(found - wanted) <= tolerance:
+    thinner = looked and EMPTY < found < wanted
+    if not thinner and not abs(found - wanted) <= tolerance:
         what = "the fingers closed on nothing, or lost the tool" if found < wanted else "the fingers did not close on the tool as planned"
         raise MagicError(
             Code.GRASP_FAILED, f"{what}: opening in mm", round(1000 * found, 1), f"{1000 * wanted:.1f} within {1000 * tolerance:.1f}"

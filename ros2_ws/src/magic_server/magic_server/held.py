@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,10 +24,11 @@ from magic_server.stages import Server, Stages, code_of, hull_of
 
 @dataclass(frozen=True)
 class Held:
-    """A tool in the hand: the object as it was seen before it was grasped, and tool_from_tcp (4, 4), how it is held."""
+    """A tool in the hand: the object as it was seen before it was grasped, and tool_from_tcp (4, 4), how it is held; ``looked``: as it was seen in the hand."""
 
     tool: SceneObject
     tool_from_tcp: NDArray[np.float64]
+    looked: bool = False
 
     @property
     def mesh(self) -> Mesh:
@@ -60,6 +62,26 @@ class Held:
         item.cloud = PointCloud2(header=item.cloud.header)
         item.hanging = True
         return item
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Where a tool has been that was taken up: in the hand from the stamp ``taken`` on, when the hand was at ``taken_at`` (4, 4; None: since before the
+    motion began), and until ``let_go``, when it was at ``let_go_at`` (None: it still is)."""
+
+    held: Held
+    taken: float = -math.inf
+    taken_at: NDArray[np.float64] | None = None
+    let_go: float = math.inf
+    let_go_at: NDArray[np.float64] | None = None
+
+    def hull(self, stamp: float, hand: Callable[[float], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Its hull at a stamp, with world_from_tcp (4, 4) by stamps: what has been let go is taken to stay where it was."""
+        if self.taken_at is not None and stamp <= self.taken:
+            return self.held.hull(self.taken_at)
+        if self.let_go_at is not None and stamp >= self.let_go:
+            return self.held.hull(self.let_go_at)
+        return self.held.hull(hand(stamp))
 
 
 class HeldStages(Stages):
@@ -100,9 +122,11 @@ class HeldStages(Stages):
 
     def _without_tool(self, scene: SceneObjectArray) -> SceneObjectArray:
         """The scene without what is in the hand, whatever its id."""
-        hand = self._server.hand()
         rest = copy.copy(scene)
-        rest.objects = [o for o in scene.objects if not self.held.sees(o, hand, self._known)]
+        rest.objects = [o for o in scene.objects if o.id != self._tool.id]
+        if any(o.id not in self._known for o in rest.objects):  # of what is known from before its id is enough
+            hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
+            rest.objects = [o for o in rest.objects if not self.held.sees(o, hand, self._known)]
         return rest
 
     def _enough(self, scene: SceneObjectArray, request: pipeline.Request) -> bool:

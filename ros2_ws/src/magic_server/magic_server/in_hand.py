@@ -22,8 +22,8 @@ from magic_core.mesh import Mesh
 
 Array = NDArray[np.float64]
 
-#: How far a tool may be off in the hand before it is looked at: standard deviations, m and rad.
-PRIOR = 0.015, 0.2
+#: How far a tool may be off in the hand before it is looked at, and since it was looked at: standard deviations, m and rad.
+PRIOR, AGAIN = (0.015, 0.2), (0.005, 0.07)
 #: Standard deviation, m, of a point on the surface as it was reconstructed; its errors hold together over a patch, so that however many
 #: points are seen they count as so many at most.
 NOISE, WORTH = 0.003, 60
@@ -79,11 +79,11 @@ def _surface(vertices: bytes, faces: bytes) -> tuple[Array, Array, cKDTree]:
     return np.asarray(points), np.asarray(mesh.face_normals[face]), cKDTree(points)
 
 
-def locate(mesh: Mesh, expected: Array, points: Array, closing: Array) -> Seen | None:
+def locate(mesh: Mesh, expected: Array, points: Array, closing: Array, prior: tuple[float, float] = PRIOR) -> Seen | None:
     """The pose of a tool that is expected at ``expected`` (world_from_tool), by world points (N, 3) of which some are on it.
 
-    closing (3,): unit direction in the world along which the fingers close.  ``None`` where too little of it is seen, or what is seen
-    would be as likely with the tool elsewhere.
+    closing (3,): unit direction in the world along which the fingers close.  prior: how well it is known to be there, standard deviations, m and rad.
+    ``None`` where too little of it is seen, or what is seen would be as likely with the tool elsewhere.
     """
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -97,7 +97,7 @@ def locate(mesh: Mesh, expected: Array, points: Array, closing: Array) -> Seen |
         return None
     along = expected[:3, int(np.argmax(mesh.extents))]
     starts = [_about(middle, transforms.from_rotvec(turn * closing, shift * along)) for turn in TURNS for shift in SHIFTS]
-    tried = [_fitted(surface, expected, start, points, middle) for start in starts]
+    tried = [_fitted(surface, expected, start, points, middle, prior) for start in starts]
     moved, against = min(tried, key=lambda fit: fit[1])
     pose = moved @ expected
     for other, more in tried:
@@ -114,10 +114,12 @@ def _about(middle: Array, turned: Array) -> Array:
     return transforms.make(translation=middle) @ turned @ transforms.make(translation=-middle)
 
 
-def _fitted(surface: tuple[Array, Array, cKDTree], expected: Array, moved: Array, points: Array, middle: Array) -> tuple[Array, float]:
+def _fitted(
+    surface: tuple[Array, Array, cKDTree], expected: Array, moved: Array, points: Array, middle: Array, prior: tuple[float, float]
+) -> tuple[Array, float]:
     """What has moved the tool from where it is expected (4, 4, in the world), sought from ``moved``, and what speaks against it."""
     on, normals, tree = surface
-    information = np.repeat([1 / PRIOR[0] ** 2, 1 / PRIOR[1] ** 2], 3)
+    information = np.repeat([1 / prior[0] ** 2, 1 / prior[1] ** 2], 3)
     for step in range(ROUNDS):
         pose = moved @ expected
         distances, index = tree.query(transforms.apply(transforms.inverse(pose), points))

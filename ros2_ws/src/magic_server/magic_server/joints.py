@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from magic_core import robot
 from magic_core.errors import Code, MagicError
+from magic_core.joint_history import JointHistory
 
 #: A joint that is faster than this moves, rad/s.
 STANDSTILL = 0.05
@@ -28,12 +30,13 @@ class Joint:
 
 
 class JointStates:
-    """The newest state of every joint, put together from messages that may each tell of some joints only.
+    """The newest state of every joint, put together from messages that may each tell of some joints only; ``history`` has those before.
 
     Arm and gripper often come from two drivers on the same topic.
     """
 
     def __init__(self) -> None:
+        self.history = JointHistory()
         self._joints: dict[str, Joint] = {}
         self._lock = threading.Lock()
 
@@ -44,6 +47,8 @@ class JointStates:
         told = velocities if len(velocities) == len(names) else [math.nan] * len(names)
         with self._lock:
             self._joints.update((n, Joint(float(p), float(v), stamp, came)) for n, p, v in zip(names, positions, told))
+        with suppress(MagicError):  # what has no stamp was at no moment
+            self.history.take(names, positions, stamp)
 
     def all(self) -> dict[str, Joint]:
         """Every joint that was heard of, by name."""

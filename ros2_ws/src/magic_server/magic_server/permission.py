@@ -6,7 +6,7 @@ moment.  :func:`permit` holds the two together and raises what speaks against it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -62,13 +62,19 @@ class Verdict:
 @dataclass(frozen=True)
 class Look:
     """The objects as seen at one moment: hulls (see :mod:`magic_server.scene_change`) by id, in ``frame``; ``stamp`` by the clock
-    of the stamps and ``came`` by the monotonic clock of this process, both in seconds.  partly: ids of those of which the robot hides a part."""
+    of the stamps and ``came`` by the monotonic clock of this process, both in seconds.  cut_off: what keeps a part of a thing out of
+    sight, by its id (SceneObject.cut_off).  remembered: the same hulls of what nothing shows now, because the robot hides it."""
 
     objects: Mapping[str, NDArray[np.float64]]
     frame: str
     stamp: float
     came: float
-    partly: frozenset[str] = frozenset()
+    cut_off: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    remembered: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def partly(self, before: Look, moved: Collection[str] = ()) -> frozenset[str]:
+        """Ids of what something hides a part of now that did not before; ``moved``: ids of what is elsewhere on purpose."""
+        return frozenset(name for name, by in self.cut_off.items() if by - (before.cut_off.get(name, frozenset()) - set(moved)))
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ class Claim:
     cannot judge; ``waived`` then says that goal and server both accept that, for the arm alone.
     joints, start: of an arm's trajectory, and their positions, rad, where the next move begins; both empty without an arm.
     state_known: whether the plan began where the arm was heard to be; else it began at home.
-    meant: ids of what the motion itself has moved so far; carried: hull of the tool where the arm has it in its hand, else None.
+    meant: ids of what the motion itself has moved so far; carried: hull of the tool where it was when the newest objects were seen, if the arm has, or had, it in
+    its hand, else None.
     motion: the motion itself, which the rule does not look into, and mark: what tells it from others, as its verdict has it.
     """
 
@@ -105,7 +112,8 @@ class World:
     whether it was.  servers: by what they do (``verifier`` is one), those who serve it.  scene: the newest, None: none came.
     joints: what was heard of them, by name.  recorded: the server is told that all comes from a recording, which no time makes
     older.  replaying: a bag is being played, whose stamps are of another time.  active: the server's lifecycle is in the state
-    active; stopped: an emergency stop has been asked for since it came there.
+    active; stopped: an emergency stop has been asked for since it came there.  simulated: the clock of the stamps is a simulation's, which may be slower than any
+    other, so that it alone tells how old a thing is.
     """
 
     clock: float
@@ -119,6 +127,7 @@ class World:
     replaying: bool = False
     active: bool = False
     stopped: bool = False
+    simulated: bool = False
 
 
 @dataclass(frozen=True)
@@ -152,9 +161,19 @@ def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tupl
         raise MagicError(Code.BAD_REQUEST, f"no arm moves by a recording: {RECORDED}", allowed="objects that are seen now")
     _frames(claim, world, limits)
     _seen(world, limits)
-    # Once the arm is among the objects it hides some of what was seen of them from where the motion began.
-    partly = world.scene.partly if claim.meant else frozenset()
-    scene_change.check(claim.scene.objects, world.scene.objects, limits.object_tolerance, claim.meant, partly, claim.carried)
+    # Once the arm is among the objects it hides some of what was seen of them from where the motion began, and so does what it carries.
+    among = bool(claim.meant)
+    # What was hidden then was planned with as it was remembered; now that it is seen it has not come.
+    shown = {name: there for name, there in claim.scene.remembered.items() if name in world.scene.objects}
+    scene_change.check(
+        {**shown, **claim.scene.objects},
+        world.scene.objects,
+        limits.object_tolerance,
+        claim.meant,
+        world.scene.partly(claim.scene, claim.meant) if among else (),
+        claim.carried,
+        world.scene.remembered if among else (),
+    )
     notes = _arm(claim, world, limits, purpose)
     return (*notes, *((RECORDED,) if world.recorded or world.replaying else ()))
 
@@ -236,7 +255,7 @@ def _seen(world: World, limits: Limits) -> None:
         raise NotYet(Code.NO_OBJECTS, "no objects have come")
     if world.recorded:
         return
-    ages = {"arrival": world.now - world.scene.came}
+    ages = {} if world.simulated else {"arrival": world.now - world.scene.came}
     if not world.replaying:
         ages["stamp"] = world.clock - world.scene.stamp
     for by, age in ages.items():

@@ -57,6 +57,18 @@ def gap(before: NDArray[np.float64], after: NDArray[np.float64], partly: bool) -
     return max(0.0, float((after - before).max())) if partly else distance(before, after)
 
 
+def parts(
+    before: Mapping[str, NDArray[np.float64]], after: Mapping[str, NDArray[np.float64]], partly: Collection[str], tolerance: float
+) -> dict[str, set[str]]:
+    """Of what is hidden in part (``partly``, ids) and was not there before under its id: the ids of the things before within whose hull, to
+    ``tolerance`` m, it lies.  What hides the middle of a thing leaves two, and what is left in sight of one may have another id."""
+    return {
+        name: found
+        for name in after.keys() - before.keys()
+        if name in partly and (found := {thing for thing, there in before.items() if contained(after[name], there, tolerance)})
+    }
+
+
 def check(
     before: Mapping[str, NDArray[np.float64]],
     after: Mapping[str, NDArray[np.float64]],
@@ -64,20 +76,23 @@ def check(
     meant: Collection[str] = (),
     partly: Collection[str] = (),
     carried: NDArray[np.float64] | None = None,
+    remembered: Collection[str] = (),
 ) -> None:
     """Refuse a scene in which an object is gone, has come, or has moved by more than ``tolerance`` m; raises :class:`Changed`.
 
-    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.  partly: ids of what
-    the arm hides a part of now.  carried: hull of the tool in the hand: what has come within :data:`ABOUT` of it is the tool, by
-    whatever id.
+    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.  partly, remembered: ids of what
+    the arm, or what it carries, hides a part of now that was seen before, and all of.  carried: hull of the tool when ``after`` was seen, in the hand or
+    where that let it go: what has come within :data:`ABOUT` of it is the tool, by whatever id.
     """
-    old, new = before.keys() - set(meant), after.keys() - set(meant)
+    there = parts(before, after, partly, tolerance)
+    old, new = before.keys() - set(meant), after.keys() - set(meant) - there.keys()
     if carried is not None:
         new = {name for name in new if name in old or not contained(after[name], carried, ABOUT)}
-    for what, ids in (("gone since the plan", old - new), ("come since the plan", new - old)):
+    hidden = set(remembered).union(*there.values())
+    for what, ids in (("gone since the plan", old - new - hidden), ("come since the plan", new - old)):
         if ids:
             raise Changed(Code.STALE_DATA, f"objects {what}", ", ".join(sorted(ids)), ", ".join(sorted(before)))
-    for name in sorted(old):
+    for name in sorted(old & new):
         moved = gap(before[name], after[name], name in partly)
         if not moved <= tolerance:
             raise Changed(

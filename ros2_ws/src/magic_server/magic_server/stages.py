@@ -51,6 +51,7 @@ class Server(Protocol):
     """What the stages need of the strategy server, a node."""
 
     settings: Settings
+    patience: float
     robot: Description
     matcher: RemoteService
     planner: RemoteAction
@@ -61,7 +62,7 @@ class Server(Protocol):
 
     def in_base(self, scene: SceneObjectArray) -> SceneObjectArray: ...
 
-    def hand(self) -> NDArray[np.float64]: ...
+    def hand(self, stamp: float | None = None) -> NDArray[np.float64]: ...
 
     def servers(self) -> dict[str, frozenset[bytes]]: ...
 
@@ -109,7 +110,7 @@ class Stages:
             remote.require(max(0.0, deadline - time.monotonic()), self._token)
         if not self._token.wait(lambda: all(len(s) <= 1 for s in server.servers().values()), deadline, alive=lambda: None):
             check_single(server.servers())
-        wait = min(timeout, server.settings.objects)
+        wait = min(timeout, server.patience * server.settings.objects)
 
         def enough() -> bool:
             scene = server.scene

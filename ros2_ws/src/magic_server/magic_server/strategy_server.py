@@ -32,11 +32,11 @@ from magic_core.robot import Description, RobotConfig
 from magic_core.scene import UNSEEN
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
-from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObject, SceneObjectArray, StageTimes
+from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObjectArray, StageTimes
 from magic_interfaces.srv import MatchContact
 from magic_server import interop, markers, pipeline
 from magic_server import settings as parameters
-from magic_server.arm import Arm
+from magic_server.arm import SLOW, Arm
 from magic_server.closed_loop import ClosedLoop, Job
 from magic_server.held import Held, HeldStages
 from magic_server.joints import JointStates
@@ -125,6 +125,8 @@ class StrategyServer(LifecycleNode):
         self.matcher = RemoteService(self, MatchContact, "match_contact", "matcher", group)
         self.planner = RemoteAction(self, PlanMotion, "plan_motion", "planner", group)
         self.verifier = RemoteAction(self, VerifyMotion, "verify_motion", "verifier", group)
+        # Of a simulation's clock nobody knows how slow it is.
+        self.patience = SLOW if self.get_parameter("use_sim_time").value else 1.0
         self._arm = Arm(self, settings.trajectory_action, settings.gripper_action, arm, group) if settings.execute else None
         self._server_name = self.resolve_service_name("run_strategy")
         self._outlet = Outlet(self, self.robot.base_frame)
@@ -134,7 +136,7 @@ class StrategyServer(LifecycleNode):
         self.objects_topic = self.create_subscription(
             SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=one
         ).topic_name
-        self.create_subscription(JointState, "joint_states", self._on_joints, qos.SENSOR, callback_group=two)
+        self.create_subscription(JointState, "joint_states", self._on_joints, qos.STATES, callback_group=two)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=three)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self._frames_pub = self.create_publisher(TFMessage, "/tf_static", qos.LATCHED)
@@ -282,13 +284,17 @@ class StrategyServer(LifecycleNode):
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.robot.config.move_group)
         self._held_pub.publish(SceneObjectArray(header=header, objects=[held.in_hand()] if held is not None else []))
 
-    def hand(self) -> NDArray[np.float64]:
-        """base_from_tcp (4, 4) as the joints were last heard; raises NO_FRAMES where one was not."""
-        joints = self.joints.all()
-        missing = [name for name in self.robot.names if name not in joints]
+    def hand(self, stamp: float | None = None) -> NDArray[np.float64]:
+        """base_from_tcp (4, 4) as the joints were last heard, or as they were at a stamp; raises NO_FRAMES, STALE_DATA where that is not known."""
+        names, joints = self.robot.names, self.joints.all()
+        missing = [name for name in names if name not in joints]
         if missing:
             raise MagicError(Code.NO_FRAMES, f"joint_states: nothing about {', '.join(missing)}")
-        return self.robot.forward(np.array([joints[name].position for name in self.robot.names]))[0]
+        if stamp is None:
+            positions = {name: joints[name].position for name in names}
+        else:
+            positions = self.joints.history.at(names, stamp, self._limits.state_age)
+        return self.robot.forward(np.array([positions[name] for name in names]))[0]
 
     def servers(self) -> dict[str, frozenset[bytes]]:
         """Those who serve what a run needs, by what they do."""
@@ -310,6 +316,7 @@ class StrategyServer(LifecycleNode):
             replaying=PLAYER in self.get_node_names(),
             active=self._active,
             stopped=self._stopped,
+            simulated=self.patience > 1.0,
         )
 
     def _poke(self) -> None:
@@ -546,7 +553,7 @@ class StrategyServer(LifecycleNode):
 
     def _when_allowed(self, ask: Callable[[], Any], token: Token) -> Any:
         """What ``ask`` returns, which asks the rule; waits a little where that may help.  Raises what the rule does."""
-        deadline = time.monotonic() + self.settings.objects
+        deadline = time.monotonic() + self.patience * self.settings.objects
         while True:
             token.check()
             try:
@@ -676,10 +683,16 @@ def tell_rates(message: CandidateReport | RunStrategy.Result, verdict: Verdict) 
 
 def look_at(scene: SceneObjectArray) -> Look:
     """The objects of a message as the rule wants to know them; ``came`` is not filled in.  What is only remembered has not been seen to be there."""
+    hulls = {item.id: hull_of(item) for item in scene.objects}
     seen = [item for item in scene.objects if UNSEEN not in item.cut_off]
-    reaches = {item.id: hull_of(item) for item in seen}
-    partly = frozenset(item.id for item in seen if SceneObject.ROBOT in item.cut_off)
-    return Look(reaches, scene.header.frame_id.lstrip("/"), conversions.time_from_msg(scene.header.stamp), -math.inf, partly)
+    return Look(
+        {item.id: hulls[item.id] for item in seen},
+        scene.header.frame_id.lstrip("/"),
+        conversions.time_from_msg(scene.header.stamp),
+        -math.inf,
+        {item.id: frozenset(item.cut_off) for item in seen if item.cut_off},
+        {item.id: hulls[item.id] for item in scene.objects if UNSEEN in item.cut_off},
+    )
 
 
 def fill(result: RunStrategy.Result, outcome: pipeline.Outcome) -> None:

@@ -52,17 +52,24 @@ class SceneWatch:
         if look.stamp == self._last:
             return
         self._last = look.stamp
-        for name, before in self._planned.objects.items():
+        partly = look.partly(self._planned, self._meant)
+        there = scene_change.parts(self._planned.objects, look.objects, partly, self._tolerance)
+        hidden = set(look.remembered).union(*there.values())
+        shown = {name: before for name, before in self._planned.remembered.items() if name in look.objects}
+        for name, before in {**shown, **self._planned.objects}.items():
             if name in self._meant or (name == self._target and look.stamp - began >= self._contact):
                 continue
             if name not in look.objects:
+                if name in hidden:
+                    self._missing[name] = 0
+                    continue
                 away = float((before - scene_change.hull(hand[None])).min())  # how deep the hand is in its hull; below 0: outside
                 self._missing[name] = 0 if away > -HIDES else self._missing[name] + 1
                 if self._missing[name] >= GONE:
                     raise Changed(Code.SCENE_CHANGED, f"{name} has gone while the arm moved", allowed="what the motion was planned for")
                 continue
             self._missing[name] = 0
-            moved = gap(before, look.objects[name], name in look.partly)
+            moved = gap(before, look.objects[name], name in partly)
             if not moved <= self._tolerance:
                 raise Changed(
                     Code.SCENE_CHANGED,

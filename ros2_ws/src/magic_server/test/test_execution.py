@@ -92,6 +92,10 @@ def test_plans_that_cannot_be_carried_out(change, says):
 )
 def test_what_is_between_the_fingers(found, says):
     check_grasp(0.03, 0.025, 0.01)
+    check_grasp(0.03, 0.008, 0.01, looked=True)
+    for never in (0.001, 0.045):
+        with pytest.raises(MagicError, match="GRASP_FAILED"):
+            check_grasp(0.03, never, 0.01, looked=True)
     with pytest.raises(MagicError) as caught:
         check_grasp(0.03, found, 0.01)
     assert caught.value.code == Code.GRASP_FAILED
@@ -455,8 +459,8 @@ def test_a_cancel_between_two_steps_sends_nothing_more(bench, monkeypatch):
     sent = []
     fingers = bench.server._arm._fingers
 
-    def canceled_afterwards(action, token):
-        fingers(action, token)
+    def canceled_afterwards(action, token, looked):
+        fingers(action, token, looked)
         token.cancel()
 
     monkeypatch.setattr(bench.server._arm, "_fingers", canceled_afterwards)

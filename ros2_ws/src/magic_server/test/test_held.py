@@ -20,7 +20,10 @@ def loop_of(told):
     plan = conversions.plan_to_msg(fakes.plan("arm"), "object_1")
     plan.tool_from_tcp = conversions.pose_to_msg(TOOL_FROM_TCP)
     outcome = pipeline.Outcome(0, "", plan=plan, tool_id="object_1", target_id="object_2")
-    server = SimpleNamespace(tell_held=told.append, hand=lambda: np.eye(4), get_parameter=lambda name: SimpleNamespace(value=False))
+    clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=0))
+    server = SimpleNamespace(
+        tell_held=told.append, hand=lambda: np.eye(4), get_parameter=lambda name: SimpleNamespace(value=False), get_clock=lambda: clock
+    )
     job = Job(outcome, SimpleNamespace(scene=scene), SimpleNamespace())
     rest = dict.fromkeys(("arm", "limits", "strategy", "request", "token", "work", "claim_of", "allowed", "begun", "tell"))
     return ClosedLoop(server, settings=LoopSettings(), first=job, run="run", **rest), scene.objects[0]

@@ -166,6 +166,14 @@ def test_a_recording_may_be_published_from_and_moves_nothing():
             permit(CLAIM, world, LIMITS, Purpose.MOVE)
 
 
+def test_a_slow_simulation_is_as_old_as_its_own_clock_says():
+    came = replace(WORLD, **seen(came=NOW - 30.0), simulated=True)
+    assert permit(CLAIM, came, LIMITS, Purpose.MOVE) == ()
+    for world in (replace(came, simulated=False), replace(came, scene=replace(came.scene, stamp=CLOCK - 30.0))):
+        with pytest.raises(NotYet, match="STALE_DATA"):
+            permit(CLAIM, world, LIMITS, Purpose.MOVE)
+
+
 def test_what_the_motion_itself_moves_may_be_elsewhere():
     in_hand = replace(CLAIM, meant=frozenset({"tool"}))
     for places in ({"tool": 0.7, "target": 0.2}, {"target": 0.2}):
@@ -182,8 +190,22 @@ def test_what_is_in_the_hand_has_not_come_and_what_the_arm_hides_has_not_moved()
     for claim, scene in ((replace(in_hand, carried=None), shown), (in_hand, look({"object_7": 0.85, "target": 0.2}))):
         with pytest.raises(MagicError, match="come since the plan: 'object_7'"):
             permit(claim, replace(WORLD, scene=scene), LIMITS, Purpose.MOVE)
-    half = replace(shown, objects={"target": scene_change.hull(CORNERS[CORNERS[:, 0] > 0] + [0.2, 0, 0])}, partly=frozenset({"target"}))
+    half = replace(
+        shown,
+        objects={"target": scene_change.hull(CORNERS[CORNERS[:, 0] > 0] + [0.2, 0, 0])},
+        cut_off={"target": frozenset({"robot"})},
+    )
     assert permit(in_hand, replace(WORLD, scene=half), LIMITS, Purpose.MOVE) == ()
+    # What nothing shows because the arm hides it has not gone; what is not told of at all has.
+    unseen = replace(shown, objects={}, remembered=look({"target": 0.2}).objects)
+    assert permit(in_hand, replace(WORLD, scene=unseen), LIMITS, Purpose.MOVE) == ()
+    # What was hidden when it was planned has not come where it is seen again, and has moved where it is elsewhere than it was remembered.
+    planned = replace(in_hand, scene=unseen)
+    assert permit(planned, replace(WORLD, scene=look({"target": 0.2})), LIMITS, Purpose.MOVE) == ()
+    with pytest.raises(MagicError, match="target has moved"):
+        permit(planned, replace(WORLD, scene=look({"target": 0.3})), LIMITS, Purpose.MOVE)
+    with pytest.raises(MagicError, match="gone since the plan: 'target'"):
+        permit(in_hand, replace(WORLD, scene=replace(shown, objects={})), LIMITS, Purpose.MOVE)
     # Before the arm is among the objects nothing is hidden that was seen when it was planned.
     with pytest.raises(MagicError, match="target has moved"):
         permit(replace(CLAIM, scene=look({"target": 0.2})), replace(WORLD, scene=half), LIMITS, Purpose.MOVE)

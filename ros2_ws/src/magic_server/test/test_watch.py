@@ -1,6 +1,7 @@
 """What a moving arm is stopped by, and how often a goal is tried anew."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +15,13 @@ from magic_server.watch import Bounds, SceneWatch
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
 BEGAN = 1000.0
 FAR = np.array([0.0, 0.0, 0.8])
+ROBOT = frozenset({"robot"})
 
 
 def look(places, after=0.0, came=0.0, partly=()):
     """Cubes of 50 mm along x, as a picture shows them some seconds after the move began."""
     hulls = {name: scene_change.hull(CORNERS + [x, 0, 0]) for name, x in places.items()}
-    return Look(hulls, "base", BEGAN + after, came, frozenset(partly))
+    return Look(hulls, "base", BEGAN + after, came, dict.fromkeys(partly, ROBOT))
 
 
 TABLE = {"tool": 0.0, "target": 0.2, "cup": 0.5}
@@ -79,6 +81,47 @@ def test_of_what_the_arm_hides_in_part_only_what_sticks_out_counts():
     watching.take(hidden, BEGAN, BEGAN + 1.3, 1.1, FAR)
     with pytest.raises(Changed, match="cup has moved"):
         take(watch(), {**TABLE, "cup": 0.55}, partly=("cup",))
+
+
+def test_a_thing_that_the_arm_parts_in_two_is_there_but_what_comes_elsewhere_is_not_it():
+    left, right = (scene_change.hull(CORNERS[side * CORNERS[:, 0] > 0] + [0.5, 0, 0]) for side in (-1, 1))
+    for ids in (("cup", "object_8"), ("object_8", "object_9")):
+        watching = watch()
+        for number in (1, 2, 3):
+            parted = look({"target": 0.2}, number, number)
+            parted = replace(parted, objects={**parted.objects, **dict(zip(ids, (left, right)))}, cut_off=dict.fromkeys(ids, ROBOT))
+            watching.take(parted, BEGAN, BEGAN + number + 0.3, number + 0.1, FAR)
+    watching = watch()
+    with pytest.raises(Changed, match="cup has gone"):
+        for number in (1, 2):  # moved away, and hidden in part there
+            moved = look({"target": 0.2, "object_8": 0.62}, number, number, ("object_8",))
+            watching.take(moved, BEGAN, BEGAN + number + 0.3, number + 0.1, FAR)
+
+
+def test_what_was_hidden_when_it_was_planned_is_held_to_what_was_seen_of_it():
+    """What cuts a thing off as it did then hides nothing new: it is compared as a whole."""
+    planned = replace(look(TABLE), cut_off={"cup": frozenset({"target"})})
+    for by, raises in (("target", True), ("tool", False)):
+        watching = SceneWatch(planned, ("tool",), "target", math.inf, 0.03, 5.0)
+        half = scene_change.hull(CORNERS[CORNERS[:, 0] > 0] + [0.5, 0, 0])
+        seen = look(TABLE, 1.0, 1.0)
+        seen = replace(seen, objects={**seen.objects, "cup": half}, cut_off={"cup": frozenset({by})})
+        if raises:
+            with pytest.raises(Changed, match="cup has moved"):
+                watching.take(seen, BEGAN, BEGAN + 1.3, 1.1, FAR)
+        else:
+            watching.take(seen, BEGAN, BEGAN + 1.3, 1.1, FAR)
+
+
+def test_what_was_hidden_when_it_was_planned_is_watched_once_it_is_seen():
+    planned = look({"tool": 0.0, "target": 0.2})
+    planned = replace(planned, remembered=look({"cup": 0.5}).objects)
+    watching = SceneWatch(planned, ("tool",), "target", math.inf, 0.03, 5.0)
+    take(watching, {"tool": 0.0, "target": 0.2}, 1.0)
+    take(watching, {"tool": 0.0, "target": 0.2}, 2.0)
+    take(watching, TABLE, 3.0)
+    with pytest.raises(Changed, match="cup has moved"):
+        take(watching, {**TABLE, "cup": 0.56}, 4.0)
 
 
 @pytest.mark.parametrize("seen", [None, look(TABLE, after=-6.0, came=0.0), look(TABLE, after=0.0, came=-6.0), look(TABLE, after=math.nan)])
