@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 #: Fingers that open are there when they are within this of where they were told to, m.
 THERE = 0.001
+#: Velocities at a trajectory's end that are no larger, rad/s, are none.
+NOTHING = float(np.finfo(np.float32).eps)
 
 
 class Error(IntEnum):
@@ -88,15 +90,16 @@ class Trajectory:
     """Positions and velocities over time, interpolated as the joint trajectory controller does.
 
     Between two points a polynomial of the first degree where only positions are given, of the third with velocities, of the fifth
-    with accelerations.  Before the first point comes the state in which it begins, where the first point's time is above 0.
+    with accelerations.  Before the first point comes the state (``q``, ``qd``) at the moment ``received``, in seconds from its start, where that is
+    before the first point's time; a trajectory that should have begun before that is entered where it would be by then.
     """
 
-    def __init__(self, points: Sequence[Point], q: Array, qd: Array) -> None:
+    def __init__(self, points: Sequence[Point], q: Array, qd: Array, received: float = 0.0) -> None:
         first = points[0]
-        if first.time > 0:
+        if first.time > received:
             zero = [0.0] * len(q)
             points = [
-                Point(0.0, q.tolist(), qd.tolist() if len(first.velocities) else (), zero if len(first.accelerations) else ()),
+                Point(received, q.tolist(), qd.tolist() if len(first.velocities) else (), zero if len(first.accelerations) else ()),
                 *points,
             ]
         self.times = [point.time for point in points]
@@ -186,7 +189,7 @@ class TrajectoryController:
                 raise RefusedError(Error.INVALID_GOAL, f"a number in point {index} is not finite, or its time below 0")
             if index and not point.time > points[index - 1].time:
                 raise RefusedError(Error.INVALID_GOAL, f"time of point {index} is not after that of the one before")
-        if any(points[-1].velocities):
+        if any(abs(velocity) > NOTHING for velocity in points[-1].velocities):
             raise RefusedError(Error.INVALID_GOAL, "velocities of the last point are not 0")
         if stamp > 0 and stamp + points[-1].time < now:
             raise RefusedError(Error.OLD_HEADER_TIMESTAMP, f"the trajectory ended {now - stamp - points[-1].time:.3f} s ago")
@@ -221,7 +224,9 @@ class TrajectoryController:
         )
         if self.goal is not None:
             self.goal.end(Error.INVALID_GOAL, "Current goal cancelled due to new incoming action.", canceled=True)
-        self.goal = Goal(Trajectory(mine, *self.desired), max(stamp, now), tolerances, goal_time if goal_time > 0 else self.goal_time)
+        start = stamp if stamp > 0 else now
+        trajectory = Trajectory(mine, *self.desired, now - start)
+        self.goal = Goal(trajectory, start, tolerances, goal_time if goal_time > 0 else self.goal_time)
         return self.goal
 
     def cancel(self, goal: Goal) -> None:
@@ -248,17 +253,12 @@ class TrajectoryController:
         if self.goal is not None:
             self._follow(self.goal, now)
         goal = self.goal
-        if goal is None:
-            self.desired = self._hold, np.zeros(len(self._hold))
-        else:
-            self.desired = goal.trajectory.sample(now - goal.start) if now >= goal.start else self.desired
+        self.desired = (self._hold, np.zeros(len(self._hold))) if goal is None else goal.trajectory.sample(now - goal.start)
         return self.desired
 
     def _follow(self, goal: Goal, now: float) -> None:
         """End the goal where its way or its end is over."""
         time = now - goal.start
-        if time < 0:
-            return
         error = np.abs(self.desired[0] - self._q)
         if time <= goal.trajectory.duration:
             for name, off, tolerance in zip(self.names, error.tolist(), goal.tolerances, strict=True):

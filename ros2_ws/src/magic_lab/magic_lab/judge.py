@@ -1,14 +1,14 @@
 """What truly came of a trial: the strategy's goal test on where everything was.  No ROS here.
 
 The goal tests of :mod:`magic_verifier.goals` watch a run of the verifier.  Here they watch the truth: tool, target and all else are put
-where they were, moment by moment, in a world of the true things, and what a test asks beyond that (a nudge, a turned pull)
-begins where the truth ends.
+where they were, step by step of the engine, in a world of the true things, and what a test asks beyond that (a nudge, a turned pull)
+begins where the truth ends.  What an event of the scenario has put elsewhere began there: no tool has moved it that far.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from magic_core.motion import Phase
 from magic_lab.scenarios import Scene
 from magic_lab.world import PLANE, SETTINGS, Thing
 from magic_verifier.floating import TARGET, TOOL, Body, Setup, fill_world
-from magic_verifier.goals import OBSERVE_EVERY, Judgement, goal_test
+from magic_verifier.goals import Judgement, goal_test
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, usable_pieces
 
 Array = NDArray[np.float64]
@@ -28,29 +28,38 @@ Array = NDArray[np.float64]
 MOVED, MOVING = 0.01, 0.02
 #: The tool has left the hand when it is farther (m) from where it was in it than this.
 LEFT = 0.03
+#: The truth's name for where an event has put a thing: the thing's, and this.
+PUT = "/put"
 
 
 @dataclass(frozen=True)
 class Track:
-    """Where everything truly was: times (T,) s, poses[name] (T, 4, 4) world_from_object, tcp (T, 4, 4) of the hand."""
+    """Where everything truly was: times (T,) s, poses[name] (T, 4, 4) world_from_object, tcp (T, 4, 4) of the hand; put[name] (4, 4): where an event
+    has put a thing, last."""
 
     times: Array
     poses: Mapping[str, Array]
     tcp: Array
+    put: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def of(cls, samples: Sequence[tuple[float, Mapping[str, Array]]], hand: str) -> Track:
         """Of (time, poses by name) with the hand among them; raises NO_FRAMES where there is none."""
         if len(samples) < 2:
             raise MagicError(Code.NO_FRAMES, "samples of the truth", len(samples), "at least 2")
-        names = set.intersection(*(set(poses) for _, poses in samples)) - {hand}
+        names = {name for name in set.intersection(*(set(poses) for _, poses in samples)) if not name.endswith(PUT)} - {hand}
         stacks = {name: np.stack([poses[name] for _, poses in samples]) for name in sorted(names)}
-        return cls(np.array([time for time, _ in samples]), stacks, np.stack([poses[hand] for _, poses in samples]))
+        put = {name.removesuffix(PUT): pose for name, pose in samples[-1][1].items() if name.endswith(PUT)}
+        return cls(np.array([time for time, _ in samples]), stacks, np.stack([poses[hand] for _, poses in samples]), put)
 
     def moved(self, name: str) -> Array:
         """(T,): how far a thing is from where it began, m."""
         places = self.poses[name][:, :3, 3]
         return np.linalg.norm(places - places[0], axis=1)
+
+    def begun(self, by: float) -> bool:
+        """Whether the hand has been more than ``by`` metres from where it was."""
+        return bool((np.linalg.norm((self.tcp - self.tcp[0])[:, :3, 3], axis=1) > by).any())
 
     def let_go(self, tool: str) -> int | None:
         """The sample at which the tool, once taken up, has left the hand; ``None``: it was never taken, or is held."""
@@ -63,7 +72,7 @@ class Track:
 
 
 class Replay:
-    """The truth as a run that a goal test can watch; :meth:`advance` goes on by one sample."""
+    """The truth as a run that a goal test can watch; :meth:`advance` goes on by one step of the engine."""
 
     variant = "arm"
 
@@ -72,7 +81,7 @@ class Replay:
         things = {thing.name: thing for thing in scene.things if thing.name in track.poses}
 
         def body(thing: Thing, name: str) -> Body:
-            return Body(name, tuple(usable_pieces(name, thing.item.pieces)), track.poses[thing.name][0])
+            return Body(name, tuple(usable_pieces(name, thing.item.pieces)), track.put.get(thing.name, track.poses[thing.name][0]))
 
         others = [
             replace(body(t, t.name), world_from_object=track.poses[t.name][-1]) for n, t in things.items() if n not in (tool, scene.target)
@@ -82,9 +91,12 @@ class Replay:
             scene.strategy.physics, friction=things[tool].friction, tool_density=things[tool].density, target_density=true.density
         )
         self.setup = Setup(body(things[tool], TOOL), body(true, TARGET), tuple(others), PLANE, physics, true.kind, SETTINGS)
-        self._index = self._beyond = 0
         self._gone = track.let_go(tool)
         self.duration = float(track.times[-1] - track.times[0])
+        self._steps, self._told = 0, round(self.duration * SETTINGS.frequency)
+        at = track.times[0] + np.arange(self._told + 1) / SETTINGS.frequency
+        moving = ((TOOL, tool), (TARGET, scene.target)) if true.kind != STATIC else ((TOOL, tool),)
+        self._ways = {name: transforms.interpolate(track.times, track.poses[thing], at) for name, thing in moving}
         self.release_time = None if self._gone is None else float(track.times[self._gone] - track.times[0])
         self.world = fill_world(self.setup, KINEMATIC if self._gone is None else DYNAMIC)
         self.phases = (Phase("goal", *self._pull()),)
@@ -100,7 +112,13 @@ class Replay:
     @property
     def time(self) -> float:
         """Seconds since the first sample."""
-        return float(self._track.times[self._index] - self._track.times[0]) + self._beyond / SETTINGS.frequency
+        return self._steps / SETTINGS.frequency
+
+    @property
+    def _index(self) -> int:
+        """The newest sample of the truth."""
+        times = self._track.times
+        return int(np.searchsorted(times, times[0] + self.time + 1e-6, side="right")) - 1
 
     @property
     def phase(self) -> str:
@@ -121,22 +139,15 @@ class Replay:
         return LEFT + float(np.linalg.norm(self._track.tcp[self._index][:3, 3] - self._track.tcp[self._gone][:3, 3]))
 
     def advance(self) -> None:
-        """Put tool and target where they were at the next sample; where there is none let physics go on."""
-        if self._index + 1 >= len(self._track.times):
-            self.world.step()
-            self._beyond += 1
-            return
-        self._index += 1
-        for name, thing, kind in ((TOOL, self._tool, DYNAMIC), (TARGET, self._target, self.setup.target_kind)):
-            if kind == STATIC:
-                continue
-            before, after = self._track.poses[thing][self._index - 1 : self._index + 1]
-            self.world.place(name, after)
-            if not self.world.component(name).kinematic:
-                dt = self._track.times[self._index] - self._track.times[self._index - 1]
-                self.world.set_velocity(name, (after - before)[:3, 3] / max(dt, 1e-3))
-        for _ in range(OBSERVE_EVERY):  # a goal looks so often
-            self.world.step()
+        """Go on by a step, from where tool and target were; beyond the last sample physics alone goes on."""
+        if self._steps < self._told:
+            for name, way in self._ways.items():
+                before, after = way[self._steps : self._steps + 2]
+                self.world.place(name, before)
+                if not self.world.component(name).kinematic:
+                    self.world.set_velocity(name, (after - before)[:3, 3] * SETTINGS.frequency)
+        self.world.step()
+        self._steps += 1
 
     def go_on(self, seconds: float) -> None:
         """Let physics go on from there."""

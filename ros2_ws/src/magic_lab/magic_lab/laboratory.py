@@ -42,7 +42,8 @@ class Silent:
 class Lab:
     """One scene from its reset on.
 
-    world, arm, gripper: physics and controllers.  moves: trajectories begun since the reset.  happened: events that have been.
+    world, arm, gripper: physics and controllers.  moves: trajectories begun since the reset.  happened: events that have been; put: where they have
+    put things, by name.
     """
 
     def __init__(self, scene: Scene, robot: Description, events: tuple[Event, ...] = (), allow_stalling: bool = False) -> None:
@@ -53,6 +54,7 @@ class Lab:
         self._rng = np.random.default_rng([scene.seed, 15])
         self._waiting = list(events)
         self.happened: list[Event] = []
+        self.put: dict[str, Array] = {}
         self.silent = Silent()
         self.moves = 0
         self._move_began = 0.0
@@ -136,6 +138,7 @@ class Lab:
             pose = world.pose(target)
             pose[:2, 3] += NUDGE * np.array([np.cos(angle), np.sin(angle)])
             world.place(target, pose)
+            self.put[target] = pose
         elif event.kind == "take_target" and world.things[target].kind == DYNAMIC:
             world.take_away(target)
         elif event.kind == "take_tool":

@@ -32,14 +32,16 @@ from magic_core.scene import Scene as KnownScene
 from magic_interfaces.msg import SceneObjectArray
 from magic_lab.cameras import Bodies, Camera
 from magic_lab.controllers import Error, Point, RefusedError
+from magic_lab.judge import PUT
 from magic_lab.laboratory import TICK, Lab
 from magic_lab.scenarios import EVENTS, SCENARIOS, Event, Scenario, case_of, draw, scenario_of
 from magic_verifier.cases import Case
 
 Array = NDArray[np.float64]
 
-#: Ticks between two messages of each kind: /tf at 50 Hz, the truth at 20 Hz, feedback of a trajectory at 20 Hz.
-TF_EVERY, TRUTH_EVERY, FEEDBACK = 2, 5, 0.05
+#: Ticks between two messages of each kind: /clock at 25 Hz, /tf at 20 Hz (robot_state_publisher's own), the truth at 20 Hz; and s between two words of a
+#: trajectory's feedback.  Each message on /clock wakes every node.
+CLOCK_EVERY, TF_EVERY, TRUTH_EVERY, FEEDBACK = 4, 5, 5, 0.05
 #: How far this clock may be behind the wall's before the difference is given up, s: it never runs faster to catch up.
 BEHIND = 0.05
 #: How long a reset may take, s.
@@ -246,7 +248,8 @@ class LabNode(Node):
 
     def _publish(self) -> None:
         lab, tick, stamp = self.lab, self._ticks - self._began, self.now
-        self._clock_out.publish(Clock(clock=cv.time_to_msg(stamp)))
+        if self._ticks % CLOCK_EVERY == 0:
+            self._clock_out.publish(Clock(clock=cv.time_to_msg(stamp)))
         q, qd = lab.joints
         positions = self.robot.arm_positions(q)
         if not lab.silent.joints:
@@ -264,7 +267,7 @@ class LabNode(Node):
                     )
                 )
         if tick % TRUTH_EVERY == 0:
-            truth = {**lab.world.poses(), TCP: lab.world.tcp()}
+            truth = {**lab.world.poses(), TCP: lab.world.tcp(), **{name + PUT: pose for name, pose in lab.put.items()}}
             self._truth_out.publish(TFMessage(transforms=[self._transform(self._base, name, pose, stamp) for name, pose in truth.items()]))
         if tick % self._picture_every == 0:
             self._photograph(lab, positions, stamp)

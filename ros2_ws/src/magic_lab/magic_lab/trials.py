@@ -40,10 +40,13 @@ STAGES = {1: "perceive", 2: "match", 3: "plan", 4: "verify", 5: "execute"}
 LOOK, RUN = 60.0, 300.0
 #: How long the truth is followed after a run has ended, s by the laboratory's clock.
 AFTER = 1.0
+#: The arm has begun to move once its hand is so far from where it was, m.
+BEGUN = 0.01
 #: A thing that perception sees is nearer to the true one than this share of its longest side.
 NEAR = 0.35
-#: Size of each camera's picture in the video, and how long each frame stands, ms: twice as fast as it was.
-SIZE, FRAME_MS = (400, 300), 100
+#: Size of each camera's picture in the video, how long each picture stands, ms (twice as fast as it was), and how many there are at most: of a long trial every
+#: second or third is left.
+SIZE, FRAME_MS, MOST_FRAMES = (400, 300), 100, 120
 #: Parameters of the graph beside a laboratory.
 SERVER = {"execute": True, "autostart": True, "effort": 60.0}
 
@@ -238,6 +241,7 @@ class Session:
             "seed": seed,
             "success": False,
             "verified": False,
+            "begun": False,
             "executed": False,
         }
         begun = time.monotonic()
@@ -253,7 +257,7 @@ class Session:
             record.update(
                 code=int(result.code),
                 reason=split_metrics(result.message)[0],
-                verified=result.verified or result.executed,
+                verified=result.verified,
                 executed=result.executed,
             )
             record["attempts"] = len(result.candidates)
@@ -269,7 +273,9 @@ class Session:
             record.update(code=int(error.code), reason=error.message)
         seen = self.seen
         if len(seen.truth) > 1 and found:
-            judgement = judge(scene, record.get("tool", scene.tools[0]), Track.of(seen.truth, self._hand))
+            track = Track.of(list(seen.truth), self._hand)
+            record["begun"] = track.begun(BEGUN)
+            judgement = judge(scene, record.get("tool", scene.tools[0]), track)
             record.update(truth=int(judgement.code), judgement=judgement.message, success=judgement.code == Code.OK and record["executed"])
         record.setdefault("code", int(Code.INTERNAL))
         record["stage"] = _stage(record)
@@ -288,7 +294,7 @@ def _stage(record: dict[str, Any]) -> str:
         return ""
     if record["code"] == Code.OK:
         return "truth"
-    if record["verified"]:
+    if record["begun"]:
         return "execute"
     return STAGES.get(record["code"] // 100, "execute")
 
@@ -296,23 +302,28 @@ def _stage(record: dict[str, Any]) -> str:
 def film(seen: Seen, out: Path, name: str) -> dict[str, Any]:
     """Write what the cameras saw as an animated WebP, its last frame as a picture, side by side with what was said; their names."""
     # A camera that sends nothing is shown as it was last.
-    now = {camera: np.zeros((SIZE[1], SIZE[0], 3), np.uint8) for camera in ("left", "right")}
+    now: dict[str, bytes] = {}
     pictures = sorted(seen.pictures, key=lambda picture: picture[0])
+    stamps = sorted({stamp for stamp, _, _ in pictures})
+    every = -(-len(stamps) // MOST_FRAMES)
+    shown = set(stamps[::-1][::every]) if stamps else set()
     frames: list[Image] = []
     lines = list(seen.lines)
+    dark = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     for index, (stamp, camera, data) in enumerate(pictures):
-        now[camera] = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        if index + 1 < len(pictures) and pictures[index + 1][0] == stamp:
+        now[camera] = data
+        if stamp not in shown or (index + 1 < len(pictures) and pictures[index + 1][0] == stamp):
             continue
         said = [line for at, line in lines if at <= stamp]
+        both = [cv2.imdecode(np.frombuffer(now[c], np.uint8), cv2.IMREAD_COLOR) if c in now else dark for c in ("left", "right")]
         bar = np.full((24, 2 * SIZE[0], 3), 255, np.uint8)
         text = f"{stamp - pictures[0][0]:6.1f} s  {said[-1][:95] if said else ''}"
         cv2.putText(bar, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (40, 40, 45), 1, cv2.LINE_AA)
-        frames.append(np.concatenate([np.concatenate(list(now.values()), axis=1), bar]))
+        frames.append(np.concatenate([np.concatenate(both, axis=1), bar]))
     if not frames:
         return {}
     animation = cv2.Animation()
-    animation.frames, animation.durations = frames, np.full(len(frames), FRAME_MS)
+    animation.frames, animation.durations = frames, np.full(len(frames), FRAME_MS * every)
     files = {"video": f"{name}.webp", "picture": f"{name}.jpg"}
     cv2.imwriteanimation(str(out / files["video"]), animation, [cv2.IMWRITE_WEBP_QUALITY, 50])
     cv2.imwrite(str(out / files["picture"]), frames[-1])
@@ -330,7 +341,7 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
         return {"good": good, "of": count, "interval": [round(low, 3), round(high, 3)]}
 
     objects = {name: [r for r in records if r["object"] == name] for name in dict.fromkeys(r["object"] for r in records)}
-    carried = [r for r in records if r["verified"]]
+    carried = [r for r in records if r["begun"]]  # the arm moves by what was verified alone
     timed = [r["seconds"] for r in records if "seconds" in r]
     return {
         "scenario": records[0]["scenario"] if records else "",

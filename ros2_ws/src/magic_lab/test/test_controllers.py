@@ -127,11 +127,18 @@ def test_cancel_holds_and_a_new_goal_cancels_the_old_one_and_begins_where_the_ar
     assert "new incoming" in first.reason, "what has ended stays as it ended"
 
 
-def test_a_goal_may_begin_later():
-    control = controller()
-    control.begin(NAMES, [Point(1.0, [1, 1])], 10.0, stamp=12.0)
-    assert control.update(11.0, ZERO, ZERO)[0] == pytest.approx(ZERO)
-    assert control.update(12.05, ZERO, ZERO)[0] == pytest.approx([0.05, 0.05])
+def test_a_goal_with_a_stamp_runs_by_it():
+    """As joint_trajectory_controller has it: the way to the first point begins when the goal comes, a late one is entered in its middle."""
+    control = TrajectoryController(NAMES, ZERO, Tolerance(path=0.0))
+    control.begin(NAMES, [Point(1.0, [1, 1]), Point(2.0, [1, 2])], 10.0, stamp=12.0)
+    for now, there in ((10.0, [0, 0]), (11.5, [0.5, 0.5]), (13.0, [1, 1]), (13.5, [1, 1.5])):
+        assert control.update(now, np.array(there), ZERO)[0] == pytest.approx(there)
+    late = controller()
+    late.begin(NAMES, [Point(0.0, [0, 0]), Point(1.0, [1, 1]), Point(2.0, [1, 3])], 10.0, stamp=8.5)
+    assert late.update(10.0, ZERO, ZERO)[0] == pytest.approx([1, 2])
+    goal = late.goal
+    late.update(10.01, ZERO, ZERO)
+    assert goal.code == Error.PATH_TOLERANCE_VIOLATED, "the arm does not jump there"
 
 
 @pytest.mark.parametrize(

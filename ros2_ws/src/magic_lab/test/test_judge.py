@@ -1,5 +1,6 @@
 """The truth is judged as the strategy's goal says: on tracks whose end is known."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,8 +10,9 @@ from magic_core import transforms
 from magic_core.contact import OPPOSED
 from magic_core.errors import Code
 from magic_core.shapes import mug_of_set
-from magic_lab.judge import Track, judge, nearest
+from magic_lab.judge import Replay, Track, judge, nearest
 from magic_lab.scenarios import SCENARIOS, draw
+from magic_lab.world import SETTINGS
 
 
 @lru_cache
@@ -40,6 +42,33 @@ def test_a_target_that_no_tool_holds_is_not_hooked_however_far_it_went(way, code
         s, [(0, {}), (1, {"tool_1": shifted(tool, 0.05)}), (3, {"target": shifted(target, way), "tool_1": tool})], lambda _t, p: p["tool_1"]
     )
     assert judge(s, "tool_1", moved).code == code
+
+
+def test_what_the_scenario_has_pushed_no_tool_has_moved():
+    """A target that is nudged along the pull began where the nudge has put it."""
+    s = scene("hooking")
+    target, tool = s.thing("target").item.world_from_object, s.thing("tool_1").item.world_from_object
+    moves = [(0, {}), (1, {"tool_1": shifted(tool, 0.05)}), (1.05, {"target": shifted(target, -0.1), "tool_1": shifted(tool, 0.05)})]
+    moved = track(s, [*moves, (4, {"target": shifted(target, -0.25), "tool_1": tool})], lambda _t, p: p["tool_1"])
+    assert "moved 150 mm" in judge(s, "tool_1", replace(moved, put={"target": shifted(target, -0.1)})).message
+    assert "moved 250 mm" in judge(s, "tool_1", moved).message
+    samples = [
+        (t, {"hand": tool, **{n: p[k] for n, p in moved.poses.items()}, **({"target/put": target} if k > 9 else {})})
+        for k, t in enumerate(moved.times)
+    ]
+    told = Track.of(samples, "hand")
+    assert told.poses.keys() == moved.poses.keys() and told.put.keys() == {"target"}
+
+
+def test_each_step_is_looked_at():
+    """What presses is told by each step of the engine, and there are as many as the truth lasts."""
+    s = scene("hooking")
+    still = track(s, [(0, {}), (2, {})], lambda _t, p: p["tool_1"])
+    run, steps = Replay(s, "tool_1", still), 0
+    while run.time < run.duration - 1e-9:
+        run.advance()
+        steps += 1
+    assert steps == round(2.0 * SETTINGS.frequency) == run.world.steps
 
 
 def test_a_cup_on_the_rod_hangs_and_one_on_the_table_does_not():

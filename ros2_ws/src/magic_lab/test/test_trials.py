@@ -11,6 +11,7 @@ from magic_lab.trials import Seen, film, main, summary, told
 def record(name, seed, success=True, **more):
     seconds = {"perceive": 1.0, "match": 1.0, "plan": 1.0, "verify": 1.0, "execute": 2.0 + seed}
     base = {"scenario": "hooking", "object": name, "seed": seed, "success": success, "verified": True, "executed": success, "code": 0}
+    base["begun"] = True
     return {**base, "reason": "", "stage": "" if success else "truth", "attempts": 1, "seconds": seconds, **more}
 
 
@@ -18,16 +19,26 @@ def test_sums_are_by_object_and_name_each_failure():
     records = [
         record("caliper", 0),
         record("caliper", 1, False, judgement="the tool lost the target"),
-        record("hanger", 0, False, verified=False, code=int(Code.NO_MATCH), stage="match", reason="nothing like it"),
+        record("hanger", 0, False, verified=False, begun=False, code=int(Code.NO_MATCH), stage="match", reason="nothing like it"),
+        record(
+            "hanger",
+            1,
+            False,
+            begun=False,
+            code=int(Code.STALE_DATA),
+            stage="perceive",
+            reason="verified, but the scene changed before the arm moved",
+        ),
     ]
     total = summary(records)
-    assert {n: (r["good"], r["of"]) for n, r in total["objects"].items()} == {"caliper": (1, 2), "hanger": (0, 1)}
+    assert {n: (r["good"], r["of"]) for n, r in total["objects"].items()} == {"caliper": (1, 2), "hanger": (0, 2)}
     assert (total["verified_motions"]["good"], total["verified_motions"]["of"]) == (1, 2)
     assert [(f["stage"], f["code"], f["reason"]) for f in total["failures"]] == [
         ("truth", "OK", "the tool lost the target"),
         ("match", "NO_MATCH", "nothing like it"),
+        ("perceive", "STALE_DATA", "verified, but the scene changed before the arm moved"),
     ]
-    assert total["mean_seconds"]["execute"] == pytest.approx(2.33, abs=0.01)
+    assert total["mean_seconds"]["execute"] == pytest.approx(2.5)
     text = told(total)
     assert "caliper: 1 of 2 succeeded" in text and "match [NO_MATCH]: nothing like it" in text
     assert told(summary([])).startswith(":")
