@@ -18,8 +18,8 @@ from magic_perception.turned import Body, fit_to_silhouettes, seen_into, turned_
 #: Of the rim: its least and largest radius, m; four fifths of the highest points lie within this share of the radius from its circle, in this
 #: share of all directions from its middle.
 RIM, ROUND, AROUND = (0.02, 0.15), 0.10, 0.5
-#: Half of what is seen of the inner half lies below this share of the height.
-SUNK = 0.75
+#: Half of what is seen within this share of the rim's radius lies below this share of the height: a floor, or the far wall alone.
+INNER, SUNK = 0.75, 0.75
 #: What faces a camera does so by this cosine, seen from above; fewer points tell no radius of a level.
 FACING, ENOUGH = 0.35, 8
 
@@ -39,7 +39,7 @@ def hollow_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: 
         return None
     rim = high[:, :2] - axis
     around = np.unique(np.floor(np.degrees(np.arctan2(rim[:, 1], rim[:, 0])) / 10)).size / 36
-    inner = points[rho < 0.5 * radius, 2]
+    inner = points[rho < INNER * radius, 2]
     if (
         float(np.percentile(np.abs(np.linalg.norm(rim, axis=1) - radius), 80)) > ROUND * radius
         or around < AROUND
@@ -50,18 +50,24 @@ def hollow_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: 
     cosine = np.sum((eyes[:, :2] - points[:, :2]) * away, axis=1) / np.maximum(
         np.linalg.norm(eyes[:, :2] - points[:, :2], axis=1) * rho, 1e-9
     )
-    floor = float(np.clip(np.median(points[rho < 0.3 * radius, 2]) if np.any(rho < 0.3 * radius) else 0.0, 0.002, 0.8 * height))
+    middle = points[rho < 0.3 * radius, 2]
+    # Down to where the near rim lets a camera look on the axis.
+    unique = np.unique(eyes, axis=0)
+    distance = np.linalg.norm(unique[:, :2] - axis, axis=1)
+    down = float(np.min(height - radius * (unique[:, 2] - height) / np.maximum(distance - radius, 1e-3)))
+    told = len(middle) >= ENOUGH and down < float(np.median(middle)) - 0.004
+    floor = float(np.clip(np.median(middle) if told else wall, 0.002, 0.8 * height))
     levels = np.linspace(0, height, max(5, int(height / 0.006)) + 1)
     radii = np.full(len(levels), np.nan)
     for i, level in enumerate(levels):
         here = np.abs(points[:, 2] - level) < 0.005
-        told = []
+        found_here = []
         for side, thick in ((cosine > FACING, 0.0), ((cosine < -FACING) & (points[:, 2] > floor + 0.004), wall)):
             found = rho[here & side & (rho > 0.3 * radius) & (rho < 1.3 * radius)]
             if len(found) >= ENOUGH:
-                told.append(float(np.median(found)) + thick)
-        if told:
-            radii[i] = np.mean(told)
+                found_here.append(float(np.median(found)) + thick)
+        if found_here:
+            radii[i] = np.mean(found_here)
     known = np.isfinite(radii)
     if known.sum() < 3:
         return None
