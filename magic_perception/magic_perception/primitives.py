@@ -104,7 +104,7 @@ def recognise(points: NDArray[np.float64], height: float, noise: float) -> Recon
         0.006 < ball.radius < 0.12 and ball.residual < limit and abs(ball.centre[2] - ball.radius) < max(0.005, 0.2 * ball.radius)
     ):
         ball = None
-    if tin is not None and not (tin.residual < limit and tin.radius < 0.08 and tin.height > 0.3 * tin.radius):
+    if tin is not None and not (tin.residual < limit and tin.radius < 0.13 and tin.height > 0.3 * tin.radius):
         tin = None
     if ball is not None and (tin is None or ball.residual < tin.residual):
         # It touches the table: its height above it is its radius, to which both measurements count.

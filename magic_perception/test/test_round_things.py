@@ -77,6 +77,14 @@ def test_a_can_on_its_side():
     assert solid.volume == pytest.approx(truth.to_trimesh().volume, rel=0.1)
 
 
+@pytest.mark.parametrize("names", [("left",), ("left", "right")])
+def test_a_wide_tin_is_a_cylinder(names):
+    tin = trimesh.creation.cylinder(0.1, 0.068, sections=64)
+    item, shape = seen(scenes.placed(Mesh(tin.vertices, tin.faces), 0.6, 0.05).painted((120, 60, 40)), names)
+    assert shape == "cylinder"
+    assert item.mesh.extents == pytest.approx([0.2, 0.2, 0.068], abs=0.006)
+
+
 @pytest.mark.parametrize(("radius", "height", "recess"), [(0.033, 0.10, 0.003), (0.05, 0.21, 0.0), (0.042, 0.14, 0.005)])
 def test_a_lid_is_no_opening(radius, height, recess):
     rim = radius - 0.003
