@@ -437,7 +437,7 @@ class Perception(Node):
                 self.get_logger().info(f"first scene after {now - self.started:.1f} s: {self.outcome[2]}, in {seconds:.2f} s")
         except Exception as error:
             code, message = describe(self, error)
-            self.last_run = now
+            self.last_run, self.looked = now, None
             self.outcome = (DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
             self.get_logger().error(self.outcome[2], throttle_duration_sec=5.0)
 
