@@ -7,6 +7,7 @@ contact on the target that each would meet.
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -17,13 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
-from magic_core.contact import Contact, ContactCandidate, contact_frame, turned_over
+from magic_core.contact import Companion, Contact, ContactCandidate, contact_frame, turned_over
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+from magic_core.placement import Relative, placement, relative
+from magic_core.placement import mirrored as mirrored_place
 from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.shapes import section_view
 from magic_core.strategy import Strategy
-from magic_core.views import as_it_stands, own_views, square_on
+from magic_core.surface import Surface
+from magic_core.views import as_it_stands, mirrored, own_views, square_view
 from magic_matcher import contour as contours
 from magic_matcher import curvature, enclosing, global_stage, score
 from magic_matcher.contour import Contour
@@ -35,6 +40,10 @@ from magic_matcher.plausible import Demands, Refusal, demands, refusals
 OVERSAMPLING, RESERVE = 2, 5
 #: Two candidates nearer than this share of the tool's size are the same place.
 SAME_PLACE = 0.06
+#: Places of a further contact that are tried with each of the first.
+COMPANIONS = 8
+#: Places of a target that are looked at where it is met at a feature.
+FEATURES = 8
 #: What faces a direction does so within this angle (rad); narrower ways across (share of the object's size) are the raster's.
 FACING, LEAST_ACROSS = np.deg2rad(30.0), 0.03
 #: By so much a match in another view must be better for the tool to be turned for it.
@@ -62,7 +71,8 @@ class Tool:
     """A tool to consider: its id, the view in which contacts are matched, and what draws further ones, where it can be turned.
 
     askew: the view is not square to the tool, and stands back behind the others.  seen_share: how much of its surface was seen;
-    unseen_side: the level direction (2,), in the world, that the rest of it faces, where that is known.
+    unseen_side: the level direction (2,), in the world, that the rest of it faces, where that is known.  told_in: the view in which what is
+    found in ``view`` is told, where that is another.  mesh: on whose surface contacts are put, ``None`` where there are pictures alone.
     """
 
     id: str
@@ -71,15 +81,28 @@ class Tool:
     askew: bool = False
     seen_share: float = 1.0
     unseen_side: Callable[[], NDArray[np.float64] | None] = lambda: None
+    told_in: CanonicalView | None = None
+    mesh: Mesh | None = None
 
 
 @dataclass(frozen=True)
 class Target:
-    """The object to act on: its id, the view along the strategy's direction and p_O on it."""
+    """The object to act on: its id, the view along the strategy's direction and p_O on it; further: where the strategy's further contacts meet it."""
 
     id: str
     view: CanonicalView
     contact: Contact
+    further: tuple[Contact, ...] = ()
+
+
+@dataclass(frozen=True)
+class Further:
+    """A further contact of a reference: its name, the place in the reference's view, its contact, and the radius (m) that the target has there."""
+
+    name: str
+    reference: Reference
+    contact: Contact
+    target_radius: float | None
 
 
 # ---------------------------------------------------------------- views
@@ -88,20 +111,30 @@ class Target:
 def tool_of(item: SceneObject, kind: str) -> Tool:
     """An object as a tool: seen in the view of a kind as it stands, and, where that is not enough, in those of its own shape.
 
-    A hanger that lies on the table is edge-on in the side view of how it lies; the plane in which it is used is its own.
+    A hanger that lies on the table is edge-on in the side view of how it lies; the plane in which it is used is its own.  The view as
+    it stands, where it is square to the tool, says from where to look; the picture is drawn along and in the tool's own axes, so that it
+    is the same however the tool lies, and so is the place that is found in it.
     """
-    seen: dict[str, Any] = {"seen_share": item.seen_share, "unseen_side": lambda: enclosing.unseen_side(item)}
+
+    def own(apart_from: NDArray[np.float64] | None) -> Sequence[CanonicalView]:
+        return own_views(item.mesh, item.pieces, kind, apart_from)
+
+    known: dict[str, Any] = {"seen_share": item.seen_share, "unseen_side": lambda: enclosing.unseen_side(item), "mesh": item.mesh}
     try:
-        view = as_it_stands(item, kind)
+        stands = as_it_stands(item, kind)
     except MagicError as error:
         if error.code is not Code.BAD_MESH:
             raise
-        views = own_views(item.mesh, item.pieces, kind)
+        views = own(None)
         if not views:
             raise
-        return Tool(item.id, views[0], lambda: views[1:], **seen)
-    square = square_on(item.mesh, view.direction, kind)
-    return Tool(item.id, view, lambda: own_views(item.mesh, item.pieces, kind, view.direction), not square, **seen)
+        return Tool(item.id, views[0], lambda: views[1:], **known)
+    view = square_view(item, stands, kind)
+    if view is None:
+        return Tool(item.id, stands, lambda: own(None), True, **known)
+    # What lies is told as seen from right above: it is used as it lies.  Else the axis is, of whose two sides the view is on one.
+    side = view if view.direction @ stands.direction > 0 else mirrored(view)
+    return Tool(item.id, view, lambda: own(view.direction), told_in=stands if kind == "top" else side, **known)
 
 
 def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
@@ -168,10 +201,22 @@ def _middle_of_highest(contour: Contour, among: NDArray[np.int64], direction: ND
     return int(level[np.argmin(np.abs(across - middle))])
 
 
-def target_contact(strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64]) -> Contact:
+def further_of(strategy: Strategy) -> tuple[Further, ...]:
+    """The references of a strategy's contacts after the first."""
+    found = []
+    for pair in strategy.contacts:
+        alone = replace(strategy, tool_contact=pair.tool, target_contact=pair.target)
+        found.append(Further(pair.name, global_stage.from_strategy(alone), pair.tool, pair.target.radius))
+    return tuple(found)
+
+
+def target_contact(
+    strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64], matcher: Matcher | None = None
+) -> Contact:
     """p_O': where the target's silhouette reaches farthest along the strategy's target normal, with the curvature there.
 
-    For a strategy that meets its target inside, the place inside that faces that normal (:func:`inner_point`).
+    For a strategy that meets its target inside, the place inside that faces that normal (:func:`inner_point`); for one that meets
+    it at a feature, what :meth:`Matcher.feature_of` finds, by default with the features that ship.
     """
     normal = world_from_object[:3, :3].T @ strategy.target_normal
     picture = normal @ view.object_from_view[:3, :2]
@@ -180,6 +225,8 @@ def target_contact(strategy: Strategy, view: CanonicalView, world_from_object: N
             Code.BAD_STRATEGY, "target normal", strategy.target_normal.round(3).tolist(), "a direction that is seen in the target's view"
         )
     direction = picture / np.linalg.norm(picture)
+    if strategy.target_outline == "feature":
+        return (matcher or Matcher(features.load("embedded"))).feature_of(strategy, view, direction)
     contour = contours.extract(view.mask)
     place = support_point if strategy.target_outline == "outer" else inner_point
     found = curvature.estimate(contour, place(contour, direction))
@@ -291,12 +338,14 @@ class Matcher:
             raise unseen[0]
         met: Target | None = None
         if isinstance(target, SceneObject):
-            view = target_view(target, strategy)
-            met = Target(target.id, view, target_contact(strategy, view, target.world_from_object))
+            met = self.target_of(target, strategy)
         elif target is not None:
-            met = Target("", target, target_contact(strategy, target, np.eye(4)))
+            met = Target("", target, *self._contacts_on(target, strategy, np.eye(4)))
         reference = global_stage.from_strategy(strategy)
-        found = self.match_views(reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start)
+        further = further_of(strategy)
+        found = self.match_views(
+            reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start, further
+        )
         return replace(found, refused=(*found.refused, *(error.message for error in unseen)))
 
     def match_views(
@@ -309,21 +358,27 @@ class Matcher:
         heatmap: bool = False,
         reference_target_radius: float | None = None,
         start: float | None = None,
+        further: Sequence[Further] = (),
     ) -> MatchResult:
-        """As :meth:`match`, from a reference and views; reference_target_radius r(p_O) in metres."""
+        """As :meth:`match`, from a reference and views; reference_target_radius r(p_O) in metres; further: contacts that belong to it."""
         start = time.perf_counter() if start is None else start
         if top_k < 1:
             raise MagicError(Code.BAD_REQUEST, "top_k", top_k, "1 or more")
         if not tools:
             raise MagicError(Code.UNKNOWN_OBJECT, "tools", "none", "at least one object besides the target")
-        prepared = self.prepare(reference)
-        # The radius of the disc that the tool is to hold; what is flat or is met inside is no disc.
-        round_target = target is not None and np.isfinite(target.contact.radius) and not target.contact.concave
-        use_target = round_target and reference_target_radius is not None and np.isfinite(reference_target_radius)
-        asked = demands(reference, self.backend.floor)
-        reference_scale = reference_target_radius if use_target else reference.contour.size * reference.view.metres_per_pixel
-        ratio = reference.radius * reference.view.metres_per_pixel / reference_scale
-        task = _Task(reference, reference_contact, prepared, asked, ratio, target, bool(round_target), bool(use_target), top_k, heatmap)
+        if target is not None and len(target.further) != len(further):
+            raise MagicError(
+                Code.BAD_REQUEST, "contacts on the target", 1 + len(target.further), f"{1 + len(further)}, those of the strategy"
+            )
+
+        task = self._task(reference, reference_contact, target, reference_target_radius, top_k, heatmap)
+        if further:
+            places = [None] * len(further) if target is None else [replace(target, contact=c, further=()) for c in target.further]
+            tasks = [
+                (one.name, self._task(one.reference, one.contact, met, one.target_radius, top_k))
+                for one, met in zip(further, places, strict=True)
+            ]
+            task = replace(task, further=tuple(tasks))
         found: list[tuple[ContactCandidate, NDArray[np.float32] | None]] = []
         views: dict[str, CanonicalView] = {}
         failures: list[MagicError] = []
@@ -353,6 +408,53 @@ class Matcher:
             refused=tuple(failure.message for failure in failures),
         )
 
+    def _task(
+        self, reference: Reference, contact: Contact, target: Target | None, radius: float | None, top_k: int, heatmap: bool = False
+    ) -> _Task:
+        prepared = self.prepare(reference)
+        # The radius of the disc that the tool is to hold; what is flat or is met inside is no disc.
+        round_target = target is not None and np.isfinite(target.contact.radius) and not target.contact.concave
+        use_target = round_target and radius is not None and np.isfinite(radius)
+        scale = radius if use_target else reference.contour.size * reference.view.metres_per_pixel
+        ratio = reference.radius * reference.view.metres_per_pixel / scale
+        asked = demands(reference, self.backend.floor)
+        return _Task(reference, contact, prepared, asked, ratio, target, bool(round_target), bool(use_target), top_k, heatmap)
+
+    def feature_of(self, strategy: Strategy, view: CanonicalView, direction: NDArray[np.float64]) -> Contact:
+        """p_O' by analogy: the place on a target that looks most as the demonstrated one does at p_O, of those that face a picture direction (2,).
+
+        Raises ``NO_MATCH`` where none faces it.
+        """
+        shown = strategy.target_contact
+        reference = global_stage.make_reference(strategy.target_view, shown.pixel, shown.normal)
+        task = self._task(reference, shown, None, None, FEATURES)
+        seen = self._in_view(task, "the target", view)
+        facing = [c for c in seen.candidates if float(c.tool.normal @ direction) > np.cos(FACING)]
+        if not facing:
+            if not seen.candidates:
+                raise _no_match("the target", seen.refusal)
+            off = min(np.degrees(np.arccos(np.clip(float(c.tool.normal @ direction), -1, 1))) for c in seen.candidates)
+            allowed = f"at most {np.degrees(FACING):.0f} degrees"
+            raise MagicError(
+                Code.NO_MATCH, "angle of the target's likest places to the strategy's target normal", f"{off:.0f} degrees", allowed
+            )
+        return max(facing, key=lambda c: c.score).tool
+
+    def target_of(self, item: SceneObject, strategy: Strategy) -> Target:
+        """An object as the target of a strategy: its view, and where on it the strategy's contacts are."""
+        view = target_view(item, strategy)
+        return Target(item.id, view, *self._contacts_on(view, strategy, item.world_from_object))
+
+    def _contacts_on(
+        self, view: CanonicalView, strategy: Strategy, world_from_object: NDArray[np.float64]
+    ) -> tuple[Contact, tuple[Contact, ...]]:
+        further = (
+            replace(strategy, target_normal=pair.target_normal, target_outline=pair.target_outline, target_contact=pair.target)
+            for pair in strategy.contacts
+        )
+        first = target_contact(strategy, view, world_from_object, self)
+        return first, tuple(target_contact(one, view, world_from_object, self) for one in further)
+
     def _seen_best(self, task: _Task, tool: Tool) -> _Seen:
         """The tool's candidates in the one of its views that shows the contact best.
 
@@ -377,7 +479,7 @@ class Matcher:
 
         best = None if tool.askew else look(tool.view)
         if best is not None and max(c.s_dino for c in best.candidates) >= self.backend.clear:
-            return best
+            return _told(task, tool, best)
         value = -np.inf if best is None else best.candidates[0].score + WORTH_TURNING
         for view in tool.others():
             seen = look(view)
@@ -388,24 +490,67 @@ class Matcher:
         if best is None:
             error = max(failures, key=lambda failure: failure[0])[1]
             raise _not_seen(task, tool, looked, error) or error
-        return best
+        return _told(task, tool, best)
 
     def _in_view(self, task: _Task, tool_id: str, view: CanonicalView) -> _Seen:
         """The best different places of one view that can stand in for the contact."""
         contour = contours.extract(view.mask)
         radius = task.target.contact.radius / view.metres_per_pixel if task.target is not None and task.round_target else None
         proposals = self.backend.propose(task.prepared, view, contour, radius, RESERVE * task.top_k, task.heatmap)
-        first = OVERSAMPLING * task.top_k
+        # Which of several places is best together with others is not known before these: all are looked at.
+        first = len(proposals.proposals) if task.further else OVERSAMPLING * task.top_k
         refused: list[Refusal] = []
         for some in (proposals.proposals[:first], proposals.proposals[first:]):
             candidates, why = self._refine(task, tool_id, view, contour, radius, some)
             refused += why
             if candidates:
                 break
+        if task.further and candidates:
+            candidates, why = self._joined(task, tool_id, view, contour, candidates)
+            refused += why
         points = np.array([c.tool.pixel for c in candidates]).reshape(-1, 2)
         order = global_stage.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, task.top_k)
         worst = max(refused, key=lambda r: r.similarity, default=None)
         return _Seen(view, [candidates[i] for i in order], worst, proposals.heatmap)
+
+    def _joined(
+        self, task: _Task, tool_id: str, view: CanonicalView, contour: Contour, candidates: list[ContactCandidate]
+    ) -> tuple[list[ContactCandidate], list[Refusal]]:
+        """Each candidate with the further contacts that suit it best as one rigid tool, its score that of all together; and why there are none.
+
+        The score is the mean of all contacts' times how well they agree (:mod:`magic_core.placement`).
+        """
+        sizes = task.reference.contour.size * task.reference.view.metres_per_pixel, contour.size * view.metres_per_pixel
+        wanted = [
+            relative(task.reference_contact.object_from_contact, one.reference_contact.object_from_contact) for _, one in task.further
+        ]
+        choices: list[list[ContactCandidate]] = []
+        for name, one in task.further:
+            radius = one.target.contact.radius / view.metres_per_pixel if one.target is not None and one.round_target else None
+            proposals = self.backend.propose(one.prepared, view, contour, radius, RESERVE * task.top_k)
+            found, why = self._refine(one, tool_id, view, contour, radius, proposals.proposals)
+            if not found:
+                return [], [replace(refusal, what=f"{name}: {refusal.what}") for refusal in why]
+            points = np.array([c.tool.pixel for c in found])
+            order = global_stage.suppress(points, np.array([c.score for c in found]), SAME_PLACE * contour.size, COMPANIONS)
+            choices.append([found[i] for i in order])
+        joined = []
+        for candidate in candidates:
+            frame = candidate.tool.object_from_contact
+
+            def seen(other: ContactCandidate, frame: NDArray[np.float64] = frame, over: bool = candidate.flipped) -> Relative:
+                place = relative(frame, other.tool.object_from_contact)
+                return mirrored_place(place) if over else place
+
+            best, chosen = -1.0, ()
+            for others in itertools.product(*choices):
+                agreed = placement(wanted, [seen(other) for other in others], sizes).agreement
+                score = agreed * float(np.mean([candidate.score, *(other.score for other in others)]))
+                if score > best:
+                    best, chosen = score, others
+            companions = tuple(Companion(name, c.tool, c.target) for (name, _), c in zip(task.further, chosen, strict=True))
+            joined.append(replace(candidate, score=best, companions=companions))
+        return joined, []
 
     def _refine(
         self, task: _Task, tool_id: str, view: CanonicalView, contour: Contour, radius: float | None, proposals: Sequence[Proposal]
@@ -453,7 +598,8 @@ class Matcher:
 
 @dataclass(frozen=True)
 class _Task:
-    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); round_target: the target is a disc that the tool is to hold."""
+    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); round_target: the target is a disc that the tool is to hold;
+    further: the same for further contacts, by name."""
 
     reference: Reference
     reference_contact: Contact
@@ -465,6 +611,7 @@ class _Task:
     use_target: bool
     top_k: int
     heatmap: bool
+    further: tuple[tuple[str, _Task], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -475,6 +622,79 @@ class _Seen:
     candidates: list[ContactCandidate]
     refusal: Refusal | None
     heatmap: NDArray[np.float32] | None
+
+
+def _told(task: _Task, tool: Tool, seen: _Seen) -> _Seen:
+    """What was found in one view of a tool, on the surface of its mesh, and told in the view in which it is wanted.
+
+    That is, where the tool says nothing else, the view itself, of one and its opposite that which looks down, of level ones along -y, then -x: a view
+    of the tool's own shape is looked at from the side that turns with it, while how it is to be held follows from which face is up.
+    """
+    view = seen.view
+    if tool.mesh is not None:
+        surface = Surface(tool.mesh)
+        seen = replace(seen, candidates=[_on_surface(surface, view, task.reference_contact, c) for c in seen.candidates])
+        if view is tool.view and tool.told_in is not None:
+            return seen if tool.told_in is view else _retold(task, seen, tool.told_in)
+        if next((v for v in view.direction[::-1] if abs(v) > 1e-6), -1.0) > 0:
+            return _retold(task, seen, mirrored(view))
+    return seen
+
+
+def _on_surface(surface: Surface, view: CanonicalView, reference: Contact, candidate: ContactCandidate) -> ContactCandidate:
+    """The candidate with its frame as deep along the line of sight as the surface is, and the surface's own frame there.
+
+    A section's plane cuts the surface where the contact is.
+    """
+
+    def put(contact: Contact) -> Contact:
+        frame = contact.object_from_contact.copy()
+        depth = 0.0 if view.kind == "section" else surface.depth_of_edge(view, contact.pixel, contact.normal)
+        if depth is not None:
+            frame[:3, 3] += depth * view.direction
+        return replace(contact, object_from_contact=frame, surface=surface.principal_frame(frame))
+
+    candidate = _with_companions(candidate, put)
+    return _with_contact(candidate, put(candidate.tool), candidate.flipped, candidate.rotation, reference)
+
+
+def _with_contact(candidate: ContactCandidate, contact: Contact, flipped: bool, rotation: float, reference: Contact) -> ContactCandidate:
+    frame = turned_over(contact.object_from_contact) if flipped else contact.object_from_contact
+    aligned = frame @ transforms.inverse(reference.object_from_contact)
+    return replace(candidate, tool=contact, flipped=flipped, rotation=rotation, tool_from_reference=aligned)
+
+
+def _with_companions(candidate: ContactCandidate, changed: Callable[[Contact], Contact]) -> ContactCandidate:
+    return replace(candidate, companions=tuple(replace(c, tool=changed(c.tool)) for c in candidate.companions))
+
+
+def _retold(task: _Task, seen: _Seen, view: CanonicalView) -> _Seen:
+    """What was found in one view as it is in another along nearly the same direction, or nearly the opposite one: mirrored there."""
+    over = bool(seen.view.direction @ view.direction < 0)
+
+    def there(contact: Contact) -> Contact:
+        frame = contact.object_from_contact
+        point, across = frame[:3, 3], frame[:3, 0] - (frame[:3, 0] @ view.direction) * view.direction
+        normal = transforms.unit(across @ view.object_from_view[:3, :2])
+        return replace(
+            contact, pixel=view.pixels(point), normal=normal, object_from_contact=transforms.frame(point, across, view.direction)
+        )
+
+    def told(candidate: ContactCandidate) -> ContactCandidate:
+        contact, flipped = there(candidate.tool), candidate.flipped != over
+        rotation = global_stage.rotation_between(task.reference.normal, contact.normal, flipped)
+        return _with_contact(_with_companions(candidate, there), contact, flipped, rotation, task.reference_contact)
+
+    heatmap = seen.heatmap
+    if heatmap is not None:
+        import cv2
+
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        moved = view.pixels(seen.view.points(corners)).astype(np.float32)
+        height, width = view.mask.shape
+        heatmap = cv2.warpAffine(heatmap, cv2.getAffineTransform(corners.astype(np.float32), moved), (width, height))
+        heatmap = np.where(view.mask, np.clip(heatmap, 0, 1), 0).astype(np.float32)
+    return replace(seen, view=view, candidates=[told(c) for c in seen.candidates], heatmap=heatmap)
 
 
 def _no_match(tool_id: str, refusal: Refusal | None) -> MagicError:
@@ -571,12 +791,14 @@ def _cut_off(tools: Sequence[SceneObject]) -> MagicError:
 
 
 __all__ = [
+    "Further",
     "MatchResult",
     "Matcher",
     "Proposal",
     "Target",
     "Tool",
     "choose_target",
+    "further_of",
     "likeness",
     "match",
     "select",

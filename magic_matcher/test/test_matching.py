@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from scipy import ndimage
 
@@ -13,7 +14,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import from_trimesh
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.views import find_view, view_of_contact
-from magic_matcher import contour, features, jobs, matching, plain, plausible
+from magic_matcher import contour, curvature, features, jobs, matching, plain, plausible
 from magic_matcher.cache import Cache
 from magic_matcher.global_stage import make_reference
 
@@ -215,7 +216,105 @@ def test_the_contact_follows_the_tool_in_any_attitude(matcher, demonstration, fa
         assert (again.mask == result.views["tool"].mask).mean() > 0.999
 
 
+# ---------------------------------------------------------------- several contacts
+
+
+def trough(bump: float, fillet: int = 0) -> CanonicalView:
+    """A U of one thickness, 260 px wide, with a round bump of 12 px under its floor at a share of the width, its right inner corner rounded."""
+    mask = np.zeros((384, 384), bool)
+    mask[120:260, 62:322] = True
+    mask[120:230, 92:292] = False
+    v, u = np.mgrid[:384, :384]
+    mask |= np.hypot(u - (62 + 260 * bump), v - 259) < 12
+    mask |= (u > 292 - fillet) & (u < 292) & (v > 230 - fillet) & (v < 230) & (np.hypot(u - 292 + fillet, v - 230 + fillet) > fillet)
+    return CanonicalView(np.where(mask[..., None], 150, 0).astype(np.uint8).repeat(3, axis=2), mask, 0.001, np.eye(4), "top")
+
+
+def test_the_second_contact_decides_against_what_the_first_alone_prefers(matcher):
+    shown = trough(0.25)
+
+    def part(pixel):
+        reference = make_reference(shown, np.array(pixel, float))
+        return reference, matching.to_contact(shown, curvature.estimate(reference.contour, reference.contour.nearest(reference.pixel)))
+
+    (corner, contact), (bump, below) = part((92, 229)), part((62 + 0.25 * 260, 271))
+    further = [matching.Further("bump", bump, below, None)]
+    tool = matching.Tool("t", trough(0.75, 30))  # the reference mirrored, but for the corner that should be found
+    alone = matcher.match_views(corner, contact, [tool], None, 4).candidates
+    assert np.hypot(*(alone[0].tool.pixel - [92, 229])) < 12
+    both = matcher.match_views(corner, contact, [tool], None, 4, further=further).candidates
+    assert np.hypot(*(both[0].tool.pixel - [283, 221])) < 12 and both[0].flipped
+    assert np.hypot(*(both[0].companions[0].tool.pixel - [62 + 0.75 * 260, 271])) < 6 and both[0].companions[0].name == "bump"
+    left = max(c.score for c in both if np.hypot(*(c.tool.pixel - [92, 229])) < 12)
+    assert both[0].score > left + 0.03
+    # Turned in the picture, the companion follows.
+    view, linear, middle = moved(tool.view, 2.0, False)
+    turned = matcher.match_views(corner, contact, [matching.Tool("t", view)], None, 1, further=further).candidates[0]
+    for pixel, at in ((turned.tool.pixel, (283, 221)), (turned.companions[0].tool.pixel, (62 + 0.75 * 260, 271))):
+        assert np.hypot(*(pixel - (linear @ (np.array(at) - middle) + middle + 100))) < 12
+
+
+def test_a_tool_without_the_second_contact_is_refused(matcher):
+    shown = trough(0.25)
+    corner = make_reference(shown, np.array([92.0, 229.0]))
+    contact = matching.to_contact(shown, curvature.estimate(corner.contour, corner.contour.nearest(corner.pixel)))
+    # The second place is concave, which a disc is nowhere; the first is asked of a disc as a place outside.
+    disc = moved(trough(0.5), 0.0, False)[0]
+    v, u = np.mgrid[: disc.mask.shape[0], : disc.mask.shape[1]]
+    round_tool = replace(disc, mask=np.hypot(u - 280, v - 280) < 100)
+    outside = make_reference(shown, np.array([62.0 + 0.25 * 260, 271.0]))
+    below = matching.to_contact(shown, curvature.estimate(outside.contour, outside.contour.nearest(outside.pixel)))
+    with pytest.raises(MagicError) as error:
+        matcher.match_views(
+            outside, below, [matching.Tool("disc", round_tool)], None, 3, further=[matching.Further("corner", corner, contact, None)]
+        )
+    assert error.value.code is Code.NO_MATCH and "corner" in error.value.message
+
+
 # ---------------------------------------------------------------- targets
+
+
+def plate_with_notch(at: float, radius: float = 0.011):
+    """A plate 0.06 x 0.1 m lying, with a round notch in its far side (+x), at a place along that side (m)."""
+    outline = shapely.box(-0.03, -0.05, 0.03, 0.05).difference(shapely.Point(0.03, at).buffer(radius))
+    return from_trimesh(trimesh.creation.extrude_polygon(outline, 0.02))
+
+
+def as_target(mesh, yaw=0.0):
+    pose = transforms.from_rpy(0, 0, yaw, (0.5, 0.1, 0.0))
+    return SceneObject("o", mesh, (mesh,), pose, find_view(mesh, None, "top"), source="known")
+
+
+@pytest.mark.parametrize(("at", "yaw"), [(0.02, 0.0), (-0.03, 0.0), (0.01, 0.3), (-0.025, -0.35)])
+def test_a_target_is_met_at_the_feature_that_was_shown(matcher, demonstration, at, yaw):
+    shown = as_target(plate_with_notch(-0.015))
+    strategy = replace(demonstration, target_outline="feature", target_normal=np.array([1.0, 0.0, 0.0]))
+    seen = matching.target_view(shown, strategy)
+    floor = seen.pixels([0.019, -0.015, 0.0])
+    edge = contour.extract(seen.mask)
+    contact = matching.to_contact(seen, curvature.estimate(edge, edge.nearest(floor)))
+    strategy = replace(strategy, target_view=seen, target_contact=contact)
+    item = as_target(plate_with_notch(at, 0.013), yaw)
+    found = matching.target_contact(strategy, matching.target_view(item, strategy), item.world_from_object, matcher)
+    place, normal = found.object_from_contact[:3, 3], found.object_from_contact[:3, 0]
+    np.testing.assert_allclose(place[:2], [0.017, at], atol=0.003)
+    assert normal[0] > 0.95
+    # The rule of the outer side would meet the plate beside the notch.
+    beside = matching.target_contact(replace(strategy, target_outline="outer"), seen, np.eye(4))
+    assert beside.object_from_contact[0, 3] > 0.028
+
+
+def test_a_feature_on_the_far_side_of_the_tool_is_no_place(matcher, demonstration):
+    shown = as_target(plate_with_notch(0.0))
+    strategy = replace(demonstration, target_outline="feature", target_normal=np.array([1.0, 0.0, 0.0]))
+    seen = matching.target_view(shown, strategy)
+    edge = contour.extract(seen.mask)
+    contact = matching.to_contact(seen, curvature.estimate(edge, edge.nearest(seen.pixels([0.019, 0.0, 0.0]))))
+    strategy = replace(strategy, target_view=seen, target_contact=contact)
+    item = as_target(shown.mesh, 1.5)
+    with pytest.raises(MagicError) as error:
+        matching.target_contact(strategy, matching.target_view(item, strategy), item.world_from_object, matcher)
+    assert error.value.code is Code.NO_MATCH and "30 degrees" in error.value.message
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 2.7])

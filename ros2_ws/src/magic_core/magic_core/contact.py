@@ -1,7 +1,7 @@
 """Contacts: a point on an object's silhouette with its normal and curvature.
 
-The contact frame, the same for tool and target: origin at the contact point on
-the mid-plane of the canonical view, x along the outward normal n (out of the
+The contact frame, the same for tool and target: origin at the contact point, on
+the mid-plane of the canonical view or on the mesh's surface, x along the outward normal n (out of the
 material), z along the view direction v, y = z cross x.  Two objects touch
 squarely when their x axes oppose and their z axes agree, see :data:`OPPOSED`.
 """
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.scene import CanonicalView
+from magic_core.surface import PrincipalFrame
 
 #: target_contact_from_tool_contact when the two surfaces touch squarely: half a turn about z.
 OPPOSED = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -27,7 +28,10 @@ class Contact:
     pixel (2,) float (u, v) in the canonical view; normal (2,) unit, outward, in
     picture coordinates (u right, v down); radius r of curvature in metres (inf on
     a straight edge); concave: the centre of curvature lies outside the material;
-    scale: the motion functional scale s_j in metres; object_from_contact (4, 4).
+    scale: the motion functional scale s_j in metres; object_from_contact (4, 4): its origin is as
+    deep along z as the surface is where the mesh is known, else on the view's plane; surface: the
+    point of the mesh with its normal and both principal curvatures, ``None`` where there is no mesh
+    or it has an edge there.
     """
 
     pixel: NDArray[np.float64]
@@ -36,11 +40,21 @@ class Contact:
     concave: bool
     scale: float
     object_from_contact: NDArray[np.float64]
+    surface: PrincipalFrame | None = None
 
     @property
     def signed_curvature(self) -> float:
         """kappa = 1 / r in 1/m, positive where convex, negative where concave."""
         return (-1.0 if self.concave else 1.0) / self.radius
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A further contact of a candidate: its name in the strategy, where it is on the tool, and the contact on the target that it would meet."""
+
+    name: str
+    tool: Contact
+    target: Contact | None
 
 
 @dataclass(frozen=True)
@@ -51,7 +65,8 @@ class ContactCandidate:
     and whether it was mirrored, under which the reference looked most like the new
     tool.  s_dino is the global score, s_curv the local one, score their combination.
     tool_from_reference (4, 4) carries the reference tool's frame onto the new tool's
-    frame by aligning the contact frames.
+    frame by aligning the contact frames.  companions: the further contacts of a strategy
+    with several, in its order; score is then that of all together.
     """
 
     tool_id: str
@@ -63,6 +78,7 @@ class ContactCandidate:
     s_curv: float
     score: float
     tool_from_reference: NDArray[np.float64]
+    companions: tuple[Companion, ...] = ()
 
 
 def contact_frame(view: CanonicalView, pixel: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -31,11 +31,12 @@ from trajectory_msgs.msg import (
 from magic_core import depth as depths
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
-from magic_core.contact import Contact, ContactCandidate
+from magic_core.contact import Companion, Contact, ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.surface import PrincipalFrame
 from magic_core.tf import TransformBuffer
 from magic_interfaces import msg as mi
 
@@ -512,18 +513,28 @@ def carried(msg: mi.SceneObjectArray, frame_id: str, frame_from_own: NDArray[np.
 
 def contact_to_msg(contact: Contact) -> mi.Contact:
     """Contact to its message."""
-    return mi.Contact(
+    msg = mi.Contact(
         pixel=np.asarray(contact.pixel, dtype=float),
         normal=np.asarray(contact.normal, dtype=float),
         radius=float(contact.radius),
         concave=bool(contact.concave),
         scale=float(contact.scale),
         object_from_contact=pose_to_msg(contact.object_from_contact),
+        has_surface=contact.surface is not None,
     )
+    if contact.surface is not None:
+        msg.object_from_surface = pose_to_msg(contact.surface.object_from_surface)
+        msg.curvatures = np.asarray(contact.surface.curvatures, dtype=float)
+        msg.reach, msg.residue = float(contact.surface.reach), float(contact.surface.residue)
+    return msg
 
 
 def contact_from_msg(msg: mi.Contact) -> Contact:
     """Message to Contact."""
+    surface = None
+    if msg.has_surface:
+        frame = pose_from_msg(msg.object_from_surface)
+        surface = PrincipalFrame(frame, np.array(msg.curvatures), float(msg.reach), float(msg.residue))
     return Contact(
         np.array(msg.pixel),
         np.array(msg.normal),
@@ -531,7 +542,21 @@ def contact_from_msg(msg: mi.Contact) -> Contact:
         bool(msg.concave),
         float(msg.scale),
         pose_from_msg(msg.object_from_contact),
+        surface,
     )
+
+
+def companion_to_msg(companion: Companion) -> mi.FurtherContact:
+    """Companion to its message."""
+    msg = mi.FurtherContact(name=companion.name, tool=contact_to_msg(companion.tool), has_target=companion.target is not None)
+    if companion.target is not None:
+        msg.target = contact_to_msg(companion.target)
+    return msg
+
+
+def companion_from_msg(msg: mi.FurtherContact) -> Companion:
+    """Message to Companion."""
+    return Companion(msg.name, contact_from_msg(msg.tool), contact_from_msg(msg.target) if msg.has_target else None)
 
 
 def candidate_to_msg(candidate: ContactCandidate, world_from_tool: NDArray[np.float64] | None = None) -> mi.ContactCandidate:
@@ -550,6 +575,7 @@ def candidate_to_msg(candidate: ContactCandidate, world_from_tool: NDArray[np.fl
         s_curv=float(candidate.s_curv),
         score=float(candidate.score),
         tool_from_reference=pose_to_msg(candidate.tool_from_reference),
+        companions=[companion_to_msg(companion) for companion in candidate.companions],
     )
     if candidate.target is not None:
         msg.target = contact_to_msg(candidate.target)
@@ -568,6 +594,7 @@ def candidate_from_msg(msg: mi.ContactCandidate) -> ContactCandidate:
         s_curv=float(msg.s_curv),
         score=float(msg.score),
         tool_from_reference=pose_from_msg(msg.tool_from_reference),
+        companions=tuple(companion_from_msg(companion) for companion in msg.companions),
     )
 
 

@@ -78,6 +78,17 @@ class Raycaster:
         """Which rays, origins and directions each (..., 3) in world coordinates, meet any mesh: (...); quicker than :meth:`cast`."""
         return self._scene.test_occlusions(self._o3d.core.Tensor(_rays(origins, directions))).numpy().astype(bool)
 
+    def crossings(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distances (N,) at which one ray, (3,) and (3,), passes through the meshes' surfaces, ascending; where triangles meet, once."""
+        found = self._scene.list_intersections(self._o3d.core.Tensor(_rays(origin[None], direction[None])))["t_hit"].numpy()
+        found = np.sort(found.astype(np.float64))
+        return found[np.concatenate([[True], np.diff(found) > 1e-6])] if len(found) else found
+
+    def nearest(self, point: ArrayLike) -> NDArray[np.float64]:
+        """The point (3,) of the meshes' surfaces that is nearest to a point (3,)."""
+        query = self._o3d.core.Tensor(np.asarray(point, dtype=np.float32)[None])
+        return self._scene.compute_closest_points(query)["points"].numpy()[0].astype(np.float64)
+
     def occluded(self, origins: NDArray[np.float64], direction: ArrayLike) -> NDArray[np.bool_]:
         """Whether anything lies on the way from points (N, 3) in one unit direction (3,): shadows."""
         rays = np.empty((len(origins), 6), dtype=np.float32)

@@ -9,6 +9,16 @@ The folder holds ``strategy.yaml`` and what it names::
     tool.ply, target.ply             meshes in their own frames (to replay and to render)
     trajectory.csv    t, x, y, z, qx, qy, qz, qw: target_from_tool, with the target's
                       frame where it stood when the motion began
+
+``tool.contact`` and ``target.contact`` are the first pair of contacts, as a rule the only one.  Where the tool meets the target at further
+places, at once or one after the other, each is an entry of a list beside them, in pixels of the same two views::
+
+    contacts:
+    - name: back
+      tool: {pixel: [372.6, 168.8], normal: [1.0, 0.0], radius: .inf, concave: false, scale: 0.06}
+      target: {pixel: [191.5, 316.0], normal: [0.0, 1.0], radius: .inf, concave: false, scale: 0.02, normal_in_world: [-1.0, 0.0, 0.0], outline: outer}
+
+A waypoint with ``contact: back`` is a pose of that contact of the tool in the frame of that contact of the target; without it, of the first.
 """
 
 from __future__ import annotations
@@ -35,8 +45,10 @@ from magic_core.scene import CanonicalView
 MODES = ("plan", "retarget")
 REFLECTIONS = ("keep", "turn")
 #: Where the tool meets the target: outside on its silhouette, inside a hole or a notch of the silhouette, or inside what only a cut
-#: through the target's middle shows to be hollow (a ring seen from its side, a cup).
-OUTLINES = ("outer", "inner", "cut")
+#: through the target's middle shows to be hollow (a ring seen from its side, a cup).  Where on it follows from the target's normal.
+SIDES = ("outer", "inner", "cut")
+#: Or at a feature: anywhere on the outline, inner ones included, where it looks as at the demonstrated contact.
+OUTLINES = (*SIDES, "feature")
 
 #: libyaml's where PyYAML has it: seven times as quick, and a strategy is read for every goal.
 SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -48,13 +60,26 @@ class Waypoint:
 
     offset (3,) metres from the target's contact frame, in axes of that frame: x
     along the target's outward normal, z along the view direction.  ``phase`` names
-    the part of the motion that ends here; speed in m/s.
+    the part of the motion that ends here; speed in m/s.  contact: the name of the pair
+    of contacts whose frames are meant, '' for the first.
     """
 
     name: str
     offset: NDArray[np.float64]
     phase: str
     speed: float = 0.1
+    contact: str = ""
+
+
+@dataclass(frozen=True)
+class ContactPair:
+    """A further place at which the tool meets the target, in the strategy's two views; target_normal and target_outline as there."""
+
+    name: str
+    tool: Contact
+    target: Contact
+    target_normal: NDArray[np.float64]
+    target_outline: str = "outer"
 
 
 @dataclass(frozen=True)
@@ -77,9 +102,11 @@ class Strategy:
     side on which the tool acts); target_view_direction (3,): world direction in which
     the target is looked at, and with which the tool's view direction is made to agree.
     target_outline: one of OUTLINES; "cut" has
-    the target drawn as cut through its middle.  reflections: what to do with mirrored matches, in
+    the target drawn as cut through its middle, "feature" has p_O found by the matching that finds p_T, among the places
+    that face the target's normal.  reflections: what to do with mirrored matches, in
     order of trial: ``keep`` the tool's face or ``turn`` it over.  environment: names
-    and numbers of fixed things around (for the scene set-ups).
+    and numbers of fixed things around (for the scene set-ups).  contacts: the pairs of
+    contacts after the first.
     """
 
     name: str
@@ -104,6 +131,7 @@ class Strategy:
     releases: bool = False
     simulatable: bool = True
     environment: dict[str, Any] = field(default_factory=dict)
+    contacts: tuple[ContactPair, ...] = ()
 
 
 def _read_image(path: Path) -> NDArray[np.uint8]:
@@ -130,6 +158,17 @@ def _contact(view: CanonicalView, data: dict[str, Any]) -> Contact:
     return Contact(pixel, normal, float(data["radius"]), bool(data["concave"]), float(data["scale"]), contact_frame(view, pixel, normal))
 
 
+def _pair(tool_view: CanonicalView, target_view: CanonicalView, data: dict[str, Any]) -> ContactPair:
+    target = data["target"]
+    return ContactPair(
+        str(data["name"]),
+        _contact(tool_view, data["tool"]),
+        _contact(target_view, target),
+        transforms.unit(target["normal_in_world"]),
+        str(target.get("outline", "outer")),
+    )
+
+
 def _check(strategy: Strategy) -> None:
     """Refuse numbers with which nothing can be matched, planned or simulated; raises ValueError that names them."""
     times, physics = strategy.times, strategy.physics
@@ -154,16 +193,27 @@ def _check(strategy: Strategy) -> None:
         **{f"{name}: above 0": numbers[name] > 0 for name in positive},
         "friction: 0 or more": physics.friction >= 0,
     }
+    pairs = [("", strategy.tool_contact, strategy.target_contact), *((f" {p.name}", p.tool, p.target) for p in strategy.contacts)]
+    names = [pair.name for pair in strategy.contacts]
+    rules[f"names of contacts {names}: each once, none empty"] = len(set(names)) == len(names) and "" not in names
+    if names:
+        rules["mode of a strategy with several contacts: 'plan'"] = strategy.mode == "plan"
+    for pair in strategy.contacts:
+        if strategy.target_outline == "cut" or pair.target_outline == "cut":
+            same = pair.target_outline == strategy.target_outline
+            rules[f"outline of {pair.name}: {strategy.target_outline!r}, as the first, where one is of a cut"] = same
+        rules[f"outline of {pair.name} {pair.target_outline!r}: one of {OUTLINES}"] = pair.target_outline in OUTLINES
+    for waypoint in strategy.waypoints:
+        rules[f"contact of waypoint {waypoint.name} {waypoint.contact!r}: one of {names}"] = waypoint.contact in ("", *names)
     for name, contact, view in (
-        ("tool", strategy.tool_contact, strategy.tool_view),
-        ("target", strategy.target_contact, strategy.target_view),
+        (f"{body}'s contact{which}", contact, view)
+        for which, *both in pairs
+        for body, contact, view in zip(("tool", "target"), both, (strategy.tool_view, strategy.target_view), strict=True)
     ):
         height, width = view.mask.shape
-        rules[f"pixel of the {name}'s contact: within {width} x {height}"] = bool(
-            np.all((contact.pixel >= -0.5) & (contact.pixel < [width, height]))
-        )
-        rules[f"radius of the {name}'s contact: above 0"] = contact.radius > 0
-        rules[f"scale of the {name}'s contact: above 0, finite"] = 0 < contact.scale < np.inf
+        rules[f"pixel of the {name}: within {width} x {height}"] = bool(np.all((contact.pixel >= -0.5) & (contact.pixel < [width, height])))
+        rules[f"radius of the {name}: above 0"] = contact.radius > 0
+        rules[f"scale of the {name}: above 0, finite"] = 0 < contact.scale < np.inf
     broken = [rule for rule, kept in rules.items() if not kept]
     if broken:
         raise ValueError("; ".join(broken))
@@ -208,7 +258,7 @@ def load(folder: str | Path) -> Strategy:
             tool_mesh=load_mesh(folder / "tool.ply"),
             target_mesh=load_mesh(folder / "target.ply"),
             waypoints=tuple(
-                Waypoint(w["name"], np.array(w["offset"], dtype=float), w["phase"], float(w.get("speed", 0.1)))
+                Waypoint(w["name"], np.array(w["offset"], dtype=float), w["phase"], float(w.get("speed", 0.1)), str(w.get("contact", "")))
                 for w in data.get("waypoints", [])
             ),
             goal=goals.from_data(data["goal"], f"{path}: goal"),
@@ -218,6 +268,7 @@ def load(folder: str | Path) -> Strategy:
             releases=bool(data.get("releases", False)),
             simulatable=bool(data.get("simulatable", True)),
             environment=dict(data.get("environment", {})),
+            contacts=tuple(_pair(tool_view, target_view, entry) for entry in data.get("contacts", [])),
         )
         _check(strategy)
         return strategy
@@ -266,14 +317,28 @@ def _view_data(view: CanonicalView, contact: Contact) -> dict[str, Any]:
             "position": _floats(view.object_from_view[:3, 3]),
             "orientation": _floats(transforms.quaternion_xyzw(view.object_from_view)),
         },
-        "contact": {
-            "pixel": _floats(contact.pixel),
-            "normal": _floats(contact.normal),
-            "radius": float(contact.radius),
-            "concave": bool(contact.concave),
-            "scale": float(contact.scale),
-        },
+        "contact": _contact_data(contact),
     }
+
+
+def _contact_data(contact: Contact) -> dict[str, Any]:
+    return {
+        "pixel": _floats(contact.pixel),
+        "normal": _floats(contact.normal),
+        "radius": float(contact.radius),
+        "concave": bool(contact.concave),
+        "scale": float(contact.scale),
+    }
+
+
+def _pair_data(pair: ContactPair) -> dict[str, Any]:
+    target = {**_contact_data(pair.target), "normal_in_world": _floats(pair.target_normal), "outline": pair.target_outline}
+    return {"name": pair.name, "tool": _contact_data(pair.tool), "target": target}
+
+
+def _waypoint_data(waypoint: Waypoint) -> dict[str, Any]:
+    data = {"name": waypoint.name, "offset": _floats(waypoint.offset), "phase": waypoint.phase, "speed": waypoint.speed}
+    return {**data, "contact": waypoint.contact} if waypoint.contact else data
 
 
 def _depth(value: Any) -> int:
@@ -325,7 +390,8 @@ def save(strategy: Strategy, folder: str | Path) -> None:
         "reflections": list(strategy.reflections),
         "releases": strategy.releases,
         "simulatable": strategy.simulatable,
-        "waypoints": [{"name": w.name, "offset": _floats(w.offset), "phase": w.phase, "speed": w.speed} for w in strategy.waypoints],
+        **({"contacts": [_pair_data(pair) for pair in strategy.contacts]} if strategy.contacts else {}),
+        "waypoints": [_waypoint_data(w) for w in strategy.waypoints],
         "goal": goals.to_data(strategy.goal),
         "physics": {
             "friction": strategy.physics.friction,

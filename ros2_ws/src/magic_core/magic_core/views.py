@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -75,16 +76,18 @@ def along(
 ) -> CanonicalView:
     """Draw an object in a view of a kind along a direction (3,) of its own frame: a silhouette, or (``section``) the cut across it.
 
-    Up in the picture is the object's z, or its y where that is what is looked along.  The same direction gives the same
-    picture, so that a contact's frame, whose z is the view's direction, tells in which picture it was found.
+    Up in the picture is the long one of the object's own axes (:func:`own_axes`), or the next where that is what is looked along: a
+    turned object looked at along the turned direction gives the same picture.  The same direction gives the same
+    picture, so that a contact's frame, whose z is the view's direction, tells in which picture it was found; the opposite one gives its mirror image.
     Raises ``BAD_MESH`` where there is nothing to see: a sheet seen edge-on, a cut that is empty.
     """
     _check(mesh)
     direction = transforms.unit(direction)
-    up = np.array([0.0, 1.0, 0.0]) if abs(direction[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    axes, centroid = own_axes(mesh)
+    up = axes[1] if abs(direction @ axes[0]) > 0.9 else axes[0]
     if kind == "section":
         y = transforms.unit((direction @ up) * direction - up)
-        return _cut_across(mesh, pieces, _moments(mesh)[1], np.cross(y, direction), y, size, confidence)
+        return _cut_across(mesh, pieces, centroid, np.cross(y, direction), y, size, confidence)
     return _drawn(mesh, direction, up, kind, size, confidence)
 
 
@@ -112,12 +115,12 @@ def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]
     Silhouettes: of the principal axes of the surface and of directions all over the sphere, those in which holes and
     notches show most, at most ``count`` and well apart; none for what is convex from everywhere.  A hole shows in the topology of the mask
     (:func:`holes_of`), how much it tells is its area.  ``section``: the three principal axes; a plane of symmetry is across one of them.
-    They turn with the object; of a direction and its opposite, whose pictures mirror each other, the one that looks down is given.
+    They turn with the object; of a direction and its opposite, whose pictures mirror each other, the one nearer to :func:`own_axes` is given.
     """
     _check(mesh)
-    axes = _moments(mesh)[0]
+    axes = own_axes(mesh)[0]
     if kind == "section":
-        return _downwards(axes)
+        return axes
     caster = Raycaster([mesh])
     # Fibonacci's spiral in the object's own axes.
     k = np.arange(_SPHERE) + 0.5
@@ -139,33 +142,64 @@ def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]
         if all(abs(direction @ other) < np.cos(_APART) for other in found):
             found.append(direction)
         left &= (np.abs(tried @ direction) < np.cos(_APART)) & (np.abs(tried @ tried[best]) < np.cos(_APART))
-    return _downwards(np.array(found).reshape(-1, 3))
+    chosen = np.array(found).reshape(-1, 3)
+    along_axes = chosen @ axes.T
+    largest = np.take_along_axis(along_axes, np.abs(along_axes).argmax(axis=1)[:, None], axis=1)
+    return chosen * np.where(largest < 0, -1.0, 1.0)
 
 
 def square_on(mesh: Mesh, direction: ArrayLike, kind: str) -> bool:
-    """Whether a direction (3,) looks at an object squarely: along a principal axis of its surface, to 12 degrees.
+    """Whether a direction (3,) looks at an object squarely: :func:`square_axis` gives an axis."""
+    return square_axis(mesh, direction, kind) is not None
+
+
+def square_axis(mesh: Mesh, direction: ArrayLike, kind: str) -> NDArray[np.float64] | None:
+    """The principal axis (3,) of an object's surface along which, or against which, a direction (3,) looks, to 12 degrees; ``None`` where it is askew.
 
     What is seen askew is drawn shorter than it is, and a contact found there lies beside the surface.  A section is square
     only if the object is as heavy on one side of the plane as on the other, which a spoon is across its plane of symmetry alone.
     """
     direction = transforms.unit(direction)
-    axes, centroid = _moments(mesh)
-    if np.abs(axes @ direction).max() < np.cos(0.5 * _APART):
-        return False
-    if kind != "section":
-        return True
-    corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
-    across = (corners.mean(axis=1) - centroid) @ direction
-    second, third = (float(np.average(across**n, weights=area)) for n in (2, 3))
-    return abs(third) < _SKEW * second**1.5
+    axes, centroid = own_axes(mesh)
+    nearest = int(np.abs(axes @ direction).argmax())
+    if abs(axes[nearest] @ direction) < np.cos(0.5 * _APART):
+        return None
+    if kind == "section":
+        corners = mesh.vertices[mesh.faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
+        across = (corners.mean(axis=1) - centroid) @ direction
+        second, third = (float(np.average(across**n, weights=area)) for n in (2, 3))
+        if abs(third) >= _SKEW * second**1.5:
+            return None
+    return axes[nearest]
+
+
+def square_view(item: SceneObject, view: CanonicalView, kind: str) -> CanonicalView | None:
+    """The view along the principal axis to which a view of an object is square, drawn in the object's own axes; ``None`` where it is askew.
+
+    Where nothing can be drawn along the axis it is the view itself.
+    """
+    axis = square_axis(item.mesh, view.direction, kind)
+    if axis is None:
+        return None
+    try:
+        return along(item.mesh, item.pieces, kind, axis, confidence=view.confidence)
+    except MagicError as error:
+        if error.code is not Code.BAD_MESH:
+            raise
+        return view
 
 
 def own_views(
     mesh: Mesh, pieces: Sequence[Mesh] | None, kind: str, apart_from: ArrayLike | None = None, size: int = VIEW_SIZE
 ) -> list[CanonicalView]:
-    """The views of a kind along :func:`own_directions`, but for those that show what ``apart_from`` (3,) shows already."""
+    """The views of a kind along :func:`own_directions`, but for those that show what ``apart_from`` (3,) shows already.
+
+    What tells of no direction is seen along its principal axes.
+    """
     directions = own_directions(mesh, kind)
+    if not len(directions):
+        directions = own_axes(mesh)[0][::-1]
     if apart_from is not None:
         known = transforms.unit(apart_from)
         directions = directions[np.abs(directions @ known) < np.cos(0.4 * _APART)]
@@ -177,12 +211,6 @@ def own_views(
             if error.code is not Code.BAD_MESH:
                 raise
     return result
-
-
-def _downwards(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions (K, 3), turned round where they look up; level ones where they look along -y, then -x."""
-    sign = [-np.sign(next((v for v in d[::-1] if abs(v) > 1e-6), 1.0)) for d in directions]
-    return directions * np.array(sign).reshape(-1, 1)
 
 
 def _told(caster: Raycaster, mesh: Mesh, directions: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -215,16 +243,31 @@ def _refined(caster: Raycaster, mesh: Mesh, direction: NDArray[np.float64], axes
     return direction, value
 
 
-def _moments(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The principal axes (3, 3) of a mesh's surface as rows, the longest first, and its centroid (3,)."""
+def own_axes(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The principal axes (3, 3) of a mesh's surface as rows, the longest first, right-handed, and its centroid (3,).
+
+    They turn with the mesh: an axis points to where the surface reaches farther out (its third moment is positive).  Two of them settle
+    the third; along an axis across which the surface is symmetric either way is the same.
+    """
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
     centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
     middles = (corners + np.roll(corners, 1, axis=1)) / 2 - centroid
     axes = np.linalg.eigh(np.einsum("n,nki,nkj->ij", area, middles, middles))[1].T[::-1].copy()
+    along_axes = middles @ axes.T
+    second, third = (np.einsum("n,nki->i", area, along_axes**n) / (3 * area.sum()) for n in (2, 3))
+    skew = third / np.maximum(second, 1e-30) ** 1.5
+    axes[skew < 0] *= -1
     if np.linalg.det(axes) < 0:
-        axes[2] *= -1
+        axes[int(np.argmin(np.abs(skew)))] *= -1
     return axes, centroid
+
+
+def mirrored(view: CanonicalView) -> CanonicalView:
+    """The silhouette as seen from behind: the mirror image, for the opposite direction.  The picture remains that of the front, the depth is not known."""
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0])
+    image, mask = (np.ascontiguousarray(a[:, ::-1]) for a in (view.image, view.mask))
+    return replace(view, image=image, mask=mask, depth=None, object_from_view=view.object_from_view @ behind)
 
 
 def _check(mesh: Mesh) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import struct
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,11 +18,12 @@ from magic_core import conversions as cv
 from magic_core import shapes
 from magic_core import transforms as tf
 from magic_core.camera import Intrinsics
-from magic_core.contact import Contact, ContactCandidate, contact_frame
+from magic_core.contact import Companion, Contact, ContactCandidate, contact_frame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.scene import CanonicalView, Scene, SceneObject
+from magic_core.surface import PrincipalFrame
 
 number = st.floats(-5, 5, allow_nan=False)
 poses = st.builds(lambda r, t: tf.from_rotvec(r, t), st.tuples(number, number, number), st.tuples(number, number, number))
@@ -353,6 +355,23 @@ def test_candidates(with_target):
     assert after.tool.signed_curvature == pytest.approx(-1 / 0.012)
     np.testing.assert_allclose([msg.point.x, msg.point.y, msg.point.z], (pose @ before.tool.object_from_contact)[:3, 3])
     assert math.isnan(cv.candidate_to_msg(before).point.x)
+    assert after.companions == () and after.tool.surface is None
+
+
+def test_candidates_with_a_surface_and_further_contacts():
+    surface = PrincipalFrame(tf.from_rpy(0.1, 0.2, 0.3, [0.01, 0.02, 0.03]), np.array([20.0, -5.0]), 0.004, 1e-5)
+    further = (Companion("heel", replace(contact(), surface=surface), contact()), Companion("tip", contact(), None))
+    before = ContactCandidate(
+        "object_1", replace(contact(), surface=surface), contact(), 1.5, True, 0.5, 0.25, 0.75, np.eye(4), companions=further
+    )
+    after = cv.candidate_from_msg(cv.candidate_to_msg(before))
+    assert [(c.name, c.target is None) for c in after.companions] == [("heel", False), ("tip", True)]
+    for found in (after.tool.surface, after.companions[0].tool.surface):
+        np.testing.assert_allclose(found.object_from_surface, surface.object_from_surface, atol=1e-9)
+        np.testing.assert_allclose(found.curvatures, [20.0, -5.0])
+        assert (found.reach, found.residue) == (0.004, 1e-5)
+    assert after.companions[1].tool.surface is None and after.target.surface is None
+    np.testing.assert_allclose(after.companions[0].target.object_from_contact, contact().object_from_contact, atol=1e-9)
 
 
 def plan(variant):

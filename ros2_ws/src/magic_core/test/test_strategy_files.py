@@ -1,5 +1,7 @@
 """Strategies as folders: what is saved comes back, and what is wrong is named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -10,7 +12,7 @@ from magic_core.contact import Contact, contact_frame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView
-from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import ContactPair, Goal, Physics, Strategy, Waypoint
 
 
 def make():
@@ -91,6 +93,58 @@ def test_everything_comes_back(folder):
         (w.name, w.phase, w.speed, w.offset.tolist()) for w in before.waypoints
     ]
     np.testing.assert_allclose(after.target_mesh.extents, 2 * after.tool_mesh.extents, rtol=1e-6)
+
+
+def several():
+    """With two contacts more, one of which a waypoint names."""
+    one = make()
+    pixel, normal = np.array([8.5, 12.0]), np.array([-0.6, 0.8])
+    tool, target = (
+        Contact(pixel, normal, 0.03, False, 0.01, contact_frame(view, pixel, normal)) for view in (one.tool_view, one.target_view)
+    )
+    pairs = (ContactPair("heel", tool, target, np.array([-1.0, 0, 0]), "inner"), ContactPair("tip", target, tool, np.array([0, 1.0, 0])))
+    return replace(one, contacts=pairs, waypoints=(*one.waypoints, Waypoint("levered", np.array([0, 0.01, 0]), "goal", 0.1, "heel")))
+
+
+def test_several_contacts_come_back(tmp_path):
+    before = several()
+    strategies.save(before, tmp_path)
+    after = strategies.load(tmp_path)
+    assert [(p.name, p.target_outline) for p in after.contacts] == [("heel", "inner"), ("tip", "outer")]
+    for a, b in zip(after.contacts, before.contacts, strict=True):
+        np.testing.assert_allclose(a.target_normal, b.target_normal)
+        for found, wanted in ((a.tool, b.tool), (a.target, b.target)):
+            np.testing.assert_allclose(found.object_from_contact, wanted.object_from_contact, atol=1e-7)
+            assert (found.radius, found.concave, found.scale) == (wanted.radius, wanted.concave, wanted.scale)
+    assert [w.contact for w in after.waypoints] == ["", "", "heel"]
+    # A single contact is written as it always was.
+    strategies.save(make(), tmp_path / "one")
+    text = (tmp_path / "one" / "strategy.yaml").read_text()
+    assert "contacts:" not in text and "contact: heel" not in text
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda d: d["contacts"][0].pop("target"), "target"),
+        (lambda d: d["contacts"][1].update(name="heel"), "each once"),
+        (lambda d: d["contacts"][1].update(name=""), "each once"),
+        (lambda d: d["waypoints"][2].update(contact="toe"), "contact of waypoint levered 'toe'"),
+        (lambda d: d["contacts"][0]["tool"].update(pixel=[99.0, 1.0]), "pixel of the tool's contact heel"),
+        (lambda d: d["contacts"][1]["target"].update(radius=-1.0), "radius of the target's contact tip"),
+        (lambda d: d["contacts"][0]["target"].update(outline="under"), "outline of heel 'under'"),
+        (lambda d: d["contacts"][0]["target"].update(outline="cut"), "as the first"),
+        (lambda d: d["contacts"][0]["target"].pop("normal_in_world"), "normal_in_world"),
+        (lambda d: d.update(mode="retarget"), "several contacts"),
+        (lambda d: d.update(contacts=3), "TypeError"),
+    ],
+)
+def test_wrong_contacts_are_named(tmp_path, change, says):
+    strategies.save(several(), tmp_path)
+    edit(tmp_path, change)
+    with pytest.raises(MagicError, match=says) as error:
+        strategies.load(tmp_path)
+    assert error.value.code == Code.BAD_STRATEGY
 
 
 def test_found_by_name_and_by_path(folder):
