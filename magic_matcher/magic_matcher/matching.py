@@ -32,6 +32,7 @@ from magic_core.views import as_it_stands, mirrored, own_views, square_view
 from magic_matcher import contour as contours
 from magic_matcher import curvature, enclosing, global_stage, score
 from magic_matcher.contour import Contour
+from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
 from magic_matcher.plausible import Demands, Refusal, demands, refusals
 
@@ -226,7 +227,7 @@ def target_contact(
         )
     direction = picture / np.linalg.norm(picture)
     if strategy.target_outline == "feature":
-        return (matcher or Matcher(features.load("embedded"))).feature_of(strategy, view, direction)
+        return (matcher or Matcher(EmbeddedFeatures())).feature_of(strategy, view, direction)
     contour = contours.extract(view.mask)
     place = support_point if strategy.target_outline == "outer" else inner_point
     found = curvature.estimate(contour, place(contour, direction))

@@ -33,7 +33,7 @@ from magic_planner.grasps import GraspSettings
 from magic_planner.hand_moves import HandMoves
 from magic_planner.held import grasp_in_hand
 from magic_planner.margins import margins
-from magic_planner.object_motion import table_plane, tool_contact_frame, waypoint_times
+from magic_planner.object_motion import placed_contact_frame, table_plane, waypoint_times
 from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
 from magic_planner.robot import Robot
 from magic_planner.schedule import Schedule
@@ -210,7 +210,7 @@ class ArmPlanner:
 
         feedback("grasp", "looking for grasps that serve the whole motion" if held is None else "the tool is in the hand")
         failures = Failures()
-        tool_from_contact = tool_contact_frame(candidate, reflection)
+        tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
         choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact)
         lots = choice.lots() if held is None else iter([[held]])
         chosen: list[Array] = []  # grasps of the attempts before, in order

@@ -6,7 +6,10 @@ pose of the tool's contact frame in the target's:
     world_from_tool(t) = world_from_target  target_from_contact  C(t)  tool_from_contact^-1
 
 ``retarget`` takes C(t) from the demonstration, ``plan`` leads the squarely opposed
-frames through the strategy's waypoints.  Where the tool has no room to meet the target
+frames through the strategy's waypoints.  A strategy may have several pairs of contacts.  Of one that waypoints name the
+frames are led at these waypoints as those of the first are at the others; between two such waypoints the tool turns
+evenly.  One that no waypoint names is met together with the first: the tool is turned about the first contact as suits all
+of them best (:mod:`magic_core.placement`).  Where the tool has no room to meet the target
 at the contact itself, the contact slides along it (:mod:`magic_planner.sliding`); what
 the table still lacks raises the whole motion; what is still in the way is given way to
 (:mod:`magic_planner.giving_way`).
@@ -17,14 +20,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
-from magic_core.contact import OPPOSED, Contact, ContactCandidate, turned_over
+from magic_core.contact import OPPOSED, Companion, Contact, ContactCandidate, turned_over
 from magic_core.errors import Code, MagicError
 from magic_core.motion import Phase, ToolMotion
+from magic_core.placement import Pairs, pairs_of, placement, relative, waypoint_poses
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
 from magic_planner.collision import Body, grown, outer_points, solid_pieces
@@ -48,6 +53,8 @@ MARGIN = 0.0015
 #: The gap in metres that a tool keeps to a fixed target until it is let go, in order of trial: what cameras and hand do not know of
 #: where the tool is, two standard deviations, then what room there is.  It falls so far.
 GAPS = (0.006, 0.0045, 0.003, MARGIN)
+#: Where the tool turns between waypoints, what is so far from the contact (m) moves at the waypoint's speed.
+TURNING_ARM = 0.15
 #: What is no lack of room (m).
 ROUNDING = 0.0005
 #: How far beside the contact, along its tangent, that room is looked for, in order of trial (m): what is let go there slides into the
@@ -92,13 +99,14 @@ def plan_tool_motion(
     _rigid(tool.world_from_object, f"pose of {tool.id}")  # the arm starts from it
     world_from_target = _rigid(target.world_from_object, f"pose of {target.id}")
     target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
-    tool_from_contact = tool_contact_frame(candidate, reflection)
+    tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
     world_from_contact = world_from_target @ target_from_contact
+    pairs = further_pairs(strategy, candidate, reflection, tool_from_contact)
 
     if strategy.mode == "plan":
-        waypoint_motion(strategy)  # what is wrong with the waypoints is said before they are changed
-        strategy = drawn_in(strategy, tool, target, world_from_contact, transforms.inverse(tool_from_contact))
-        times, contacts, phases = waypoint_motion(strategy)
+        waypoint_motion(strategy, pairs)  # what is wrong with the waypoints is said before they are changed
+        strategy = drawn_in(strategy, tool, target, world_from_contact, transforms.inverse(tool_from_contact), pairs)
+        times, contacts, phases = waypoint_motion(strategy, pairs)
     elif strategy.mode == "retarget":
         times, contacts, phases = demonstrated_motion(strategy)
     else:
@@ -118,7 +126,7 @@ def plan_tool_motion(
                 "a first waypoint at which the tool is clear of the target and the obstacles",
             )
     direction = world_from_contact[:3, 2]
-    marks = waypoint_times(strategy)
+    marks = waypoint_times(strategy, pairs)
 
     def name(index: int) -> str:
         ahead = next((n for n, t in marks if t >= times[index] - 1e-6), marks[-1][0])
@@ -134,12 +142,55 @@ def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[
     return turned_over(tool_from_contact) if candidate.flipped and reflection == "turn" else tool_from_contact
 
 
+def placed_contact_frame(strategy: Strategy, candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:
+    """As :func:`tool_contact_frame`, turned about the contact so that further contacts, which no waypoint names, meet the target together with it.
+
+    Raises BAD_REQUEST for a candidate that lacks contacts of the strategy.
+    """
+    frame = tool_contact_frame(candidate, reflection)
+    names, given = [pair.name for pair in strategy.contacts], [companion.name for companion in candidate.companions]
+    lacking = [c.name for c in candidate.companions if c.target is None]
+    if names != given or lacking:
+        told = f"{given}, {lacking} without a target contact" if lacking else given
+        raise MagicError(Code.BAD_REQUEST, f"further contacts of the candidate on {candidate.tool_id or 'the tool'}", told, names)
+    named = {waypoint.contact for waypoint in strategy.waypoints}
+    together = [companion for companion in candidate.companions if companion.name not in named]
+    if not together or candidate.target is None:
+        return frame
+    first = _rigid(candidate.target.object_from_contact, "contact frame of the target") @ OPPOSED
+    wanted = [relative(first, c.target.object_from_contact @ OPPOSED) for c in together if c.target is not None]
+    found = [relative(frame, _further_frame(candidate, c, reflection)) for c in together]
+    size = max(float(np.hypot(*place.vector)) for place in (*wanted, *found))
+    angle = placement(wanted, found, (max(size, 1e-6), max(size, 1e-6))).angle
+    return frame @ transforms.from_rotvec([0.0, 0.0, angle])
+
+
+def _further_frame(candidate: ContactCandidate, companion: Companion, reflection: str) -> NDArray[np.float64]:
+    frame = _rigid(companion.tool.object_from_contact, f"frame of contact {companion.name}")
+    return turned_over(frame) if candidate.flipped and reflection == "turn" else frame
+
+
+def further_pairs(strategy: Strategy, candidate: ContactCandidate, reflection: str, tool_from_contact: NDArray[np.float64]) -> Pairs:
+    """The contacts that waypoints name, for :func:`magic_core.placement.waypoint_poses`."""
+    if candidate.target is None:
+        return {}
+    named = {waypoint.contact for waypoint in strategy.waypoints}
+    companions = {c.name: c for c in candidate.companions if c.name in named and c.target is not None}
+    frames = {
+        name: (_rigid(c.target.object_from_contact, f"frame of contact {name} on the target"), _further_frame(candidate, c, reflection))
+        for name, c in companions.items()
+        if c.target is not None
+    }
+    return pairs_of((candidate.target.object_from_contact, tool_from_contact), frames)
+
+
 def drawn_in(
     strategy: Strategy,
     tool: SceneObject,
     target: SceneObject,
     world_from_contact: NDArray[np.float64],
     contact_from_tool: NDArray[np.float64],
+    pairs: Pairs = MappingProxyType({}),
 ) -> Strategy:
     """The strategy with its approach and its retreat drawn in to the contact where the tool would meet the target on the way.
 
@@ -158,7 +209,7 @@ def drawn_in(
     held = Body(tool.id, solid_pieces(tool))
 
     def poses_of(changed: Strategy, until: int) -> NDArray[np.float64]:
-        times, contacts, phases = waypoint_motion(changed)
+        times, contacts, phases = waypoint_motion(changed, pairs)
         return np.asarray(world_from_contact @ contacts[times <= phases[until].end + 1e-9] @ contact_from_tool)
 
     def roomy(gap: float) -> Body:
@@ -207,17 +258,23 @@ def _scaled(strategy: Strategy, meets: int, share: float) -> Strategy:
     if share == 1:
         return strategy
     waypoints, across = list(strategy.waypoints), np.array([share, share, 1.0])
-    contact = np.asarray(waypoints[meets].offset, dtype=float)
-    goal = np.asarray(next((w.offset for w in reversed(waypoints) if w.phase == "goal"), contact), dtype=float)
+    contact = waypoints[meets]
+    goal = next((w for w in reversed(waypoints) if w.phase == "goal"), contact)
     for i, waypoint in enumerate(waypoints):
         origin = contact if i < meets else goal if waypoint.phase == "retreat" else None
-        if origin is not None:
-            waypoints[i] = replace(waypoint, offset=origin + across * (np.asarray(waypoint.offset, dtype=float) - origin))
+        if origin is not None and waypoint.contact == origin.contact:  # offsets of other contacts are in other frames
+            at = np.asarray(origin.offset, dtype=float)
+            waypoints[i] = replace(waypoint, offset=at + across * (np.asarray(waypoint.offset, dtype=float) - at))
     return replace(strategy, waypoints=tuple(waypoints))
 
 
-def waypoint_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Phase, ...]]:
-    """times (T,), C(t) (T, 4, 4) and phases of a ``plan`` strategy: straight lines, at rest at each waypoint."""
+def waypoint_motion(
+    strategy: Strategy, pairs: Pairs = MappingProxyType({})
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[Phase, ...]]:
+    """times (T,), C(t) (T, 4, 4) and phases of a ``plan`` strategy: straight lines, at rest at each waypoint.
+
+    pairs: what :func:`further_pairs` gives, for waypoints of further contacts; all C(t) are of the first contact's frames.
+    """
     waypoints = list(strategy.waypoints)
     if strategy.releases:
         last = next((i for i, w in enumerate(waypoints) if w.phase == "release"), None)
@@ -227,7 +284,8 @@ def waypoint_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np
     offsets = np.array([np.asarray(w.offset, dtype=float) for w in waypoints])
     if offsets.shape != (len(waypoints), 3) or not np.all(np.isfinite(offsets)):
         raise MagicError(Code.BAD_STRATEGY, f"offsets of the waypoints of {strategy.name}", offsets.tolist(), "three finite metres each")
-    times, points = [np.zeros(1)], [offsets[:1]]
+    poses = waypoint_poses(waypoints, pairs)
+    times, contacts = [np.zeros(1)], [poses[:1]]
     pieces: list[tuple[str, float]] = []
     now = 0.0
     for i in range(1, len(waypoints)):
@@ -236,19 +294,33 @@ def waypoint_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArray[np
             raise MagicError(
                 Code.BAD_STRATEGY, f"speed of waypoint {waypoints[i].name} of {strategy.name}", speed, "a number of m/s above 0"
             )
-        seconds, share = straight_line(float(np.linalg.norm(offsets[i] - offsets[i - 1])), speed)
+        seconds, share = straight_line(_way(poses[i - 1], poses[i]), speed)
         times.append(now + seconds)
-        points.append(offsets[i - 1] + share[:, None] * (offsets[i] - offsets[i - 1]))
+        contacts.append(_between(poses[i - 1], poses[i], share))
         now += float(seconds[-1])
         pieces.append((waypoints[i].phase, now))
     if strategy.releases and waypoints[-1].phase != "release":
         now += DWELL
         times.append(np.array([now]))
-        points.append(offsets[-1:])
+        contacts.append(poses[-1:])
         pieces.append(("release", now))
-    contacts = np.tile(np.eye(4), (sum(len(p) for p in points), 1, 1))
-    contacts[:, :3, 3] = np.concatenate(points)
-    return np.concatenate(times), contacts @ OPPOSED, join_phases(pieces)
+    return np.concatenate(times), np.concatenate(contacts), join_phases(pieces)
+
+
+def _way(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """How long the way between two poses (4, 4) is, m: of the contact, or of what is TURNING_ARM away from it if that turns farther."""
+    moved = float(np.linalg.norm(b[:3, 3] - a[:3, 3]))
+    return moved if np.array_equal(a[:3, :3], b[:3, :3]) else max(moved, TURNING_ARM * float(turning(a, b[None])[0]))
+
+
+def _between(a: NDArray[np.float64], b: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (n, 4, 4) at shares (n,) of the way from one pose (4, 4) to another: along a line, turning evenly."""
+    if np.array_equal(a[:3, :3], b[:3, :3]):
+        poses = np.tile(a, (len(share), 1, 1))
+    else:
+        poses = transforms.interpolate(np.array([0.0, 1.0]), np.stack([a, b]), share)
+    poses[:, :3, 3] = a[:3, 3] + share[:, None] * (b[:3, 3] - a[:3, 3])
+    return poses
 
 
 def straight_line(length: float, speed: float, acceleration: float = ACCELERATION) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -349,7 +421,7 @@ def turning(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float6
     return np.arctan2(np.linalg.norm(skew, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1)
 
 
-def waypoint_times(strategy: Strategy) -> tuple[tuple[str, float], ...]:
+def waypoint_times(strategy: Strategy, pairs: Pairs = MappingProxyType({})) -> tuple[tuple[str, float], ...]:
     """Names of the places the tool's motion passes and when, in seconds from its start, in order of time.
 
     A ``plan`` strategy: its waypoints, at each of which the tool is at rest.  A ``retarget`` strategy:
@@ -359,10 +431,10 @@ def waypoint_times(strategy: Strategy) -> tuple[tuple[str, float], ...]:
         return (("start", 0.0), *((f"end of {p.name}", p.end) for p in demonstrated_motion(strategy)[2]))
     waypoints = list(strategy.waypoints)
     marks, now = [(waypoints[0].name, 0.0)], 0.0
-    for before, waypoint in itertools.pairwise(waypoints):
-        if strategy.releases and before.phase == "release":
-            break
-        now += float(straight_line(float(np.linalg.norm(waypoint.offset - before.offset)), waypoint.speed)[0][-1])
+    if strategy.releases:
+        waypoints = waypoints[: next((i for i, w in enumerate(waypoints) if w.phase == "release"), len(waypoints)) + 1]
+    for (_, before), (waypoint, pose) in itertools.pairwise(zip(waypoints, waypoint_poses(waypoints, pairs), strict=True)):
+        now += float(straight_line(_way(before, pose), waypoint.speed)[0][-1])
         marks.append((waypoint.name, now))
     return tuple(marks)
 

@@ -26,7 +26,7 @@ from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.rendering import canonical_view
 from magic_core.scene import VIEW_KINDS, CanonicalView, SceneObject
 from magic_core.shapes import section_view
-from magic_core.strategy import MODES, OUTLINES, Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import MODES, SIDES, Goal, Physics, Strategy, Waypoint
 from magic_matcher import contour as contours
 from magic_matcher import curvature
 from magic_matcher.matching import target_contact, target_view, to_contact
@@ -226,7 +226,7 @@ def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: R
 def _target_contact(draft: Strategy, target: SceneObject, found: Replay) -> tuple[Strategy, float]:
     """The strategy with the first of the target's outlines whose contact is where it was shown, and how far (m) it is from there."""
     gaps: dict[str, float] = {}
-    for outline in OUTLINES:
+    for outline in SIDES:
         tried = replace(draft, target_outline=outline)
         try:
             seen = target_view(target, tried)

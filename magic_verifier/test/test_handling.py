@@ -9,7 +9,7 @@ pytest.importorskip("magic_planner.object_motion")
 
 from magic_bringup import handling
 from magic_core import transforms
-from magic_core.contact import ContactCandidate
+from magic_core.contact import Companion, ContactCandidate
 from magic_core.errors import Code
 from magic_core.motion import MotionPlan
 from magic_core.shapes import make
@@ -64,6 +64,33 @@ def test_what_only_looks_like_it_is_refused(name, change, codes, words):
     verdict = shown(name, change)
     assert not verdict.success and verdict.code in codes, verdict.message
     assert words in verdict.message
+
+
+def shunted(change=lambda w: w, contact=lambda c: c):
+    """The verdict on shunting with changed waypoints, or a changed contact on the outside."""
+    strategy = handling.STRATEGIES["shunting"]()
+    strategy = replace(strategy, waypoints=tuple(change(w) for w in strategy.waypoints))
+    target, obstacles, _ = scene_for(strategy, "demonstration")
+    entry = strategy.environment["tool"]
+    item = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("tool", transforms.make(translation=[0.4, -0.3, 0.02]))
+    further = tuple(Companion(pair.name, contact(pair.tool), pair.target) for pair in strategy.contacts)
+    candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4), further)
+    motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
+    return verify(strategy, item, target, obstacles, ev.TABLE, candidate, MotionPlan("fg", motion), repetitions=1)
+
+
+def test_shunting_takes_both_contacts():
+    verdict = shunted()
+    assert verdict.success, verdict.message
+    # Not pushed: the tool stays back by 80 mm.
+    verdict = shunted(lambda w: replace(w, offset=w.offset + [0.08, 0, 0]) if w.contact else w)
+    assert not verdict.success and "not pushed away first" in verdict.message
+    # Not pulled: it comes down beside the block's far side.
+    verdict = shunted(lambda w: w if w.contact else replace(w, offset=w.offset + [0, 0.15, 0]))
+    assert not verdict.success and "not brought nearer" in verdict.message
+    # Of the outside what is told as 90 mm behind where it is leaves the block unmoved, though the inside is right.
+    verdict = shunted(contact=lambda c: replace(c, object_from_contact=c.object_from_contact @ transforms.make(translation=[0.09, 0, 0])))
+    assert not verdict.success and "not pushed away first" in verdict.message
 
 
 def test_a_ring_is_held_to_both_sides():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Contact, contact_frame
+from magic_core.placement import Pairs, waypoint_poses
 from magic_core.rendering import VIEW_FILL, canonical_view
 from magic_core.scene import CanonicalView
 from magic_core.shapes import Shape, section_view
@@ -51,9 +53,12 @@ def target_contact(view: CanonicalView, point: NDArray[np.float64], normal: NDAr
     return Contact(pixel, picture, radius, False, scale, contact_frame(view, pixel, picture))
 
 
-def through(waypoints: tuple[Waypoint, ...]) -> tuple[NDArray[np.float64], Poses]:
-    """Times (T,) and target_contact_from_tool_contact (T, 4, 4) through waypoints, squarely opposed."""
-    times, offsets = line([w.offset for w in waypoints], 0.1)
+def through(waypoints: tuple[Waypoint, ...], pairs: Pairs = MappingProxyType({})) -> tuple[NDArray[np.float64], Poses]:
+    """Times (T,) and target_contact_from_tool_contact (T, 4, 4), of the first contact, through waypoints, squarely opposed.
+
+    Frames of further contacts (``pairs``) are those of the first, moved: the tool does not turn.
+    """
+    times, offsets = line([pose[:3, 3] for pose in waypoint_poses(waypoints, pairs)], 0.1)
     return times, np.stack([transforms.make(translation=offset) @ OPPOSED for offset in offsets])
 
 

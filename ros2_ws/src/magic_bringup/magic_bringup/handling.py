@@ -4,6 +4,7 @@ pushing       a block is pushed away along the table, straight, by the side of a
 tipping       a block that stands on its end is tipped over by a push near its top.
 pressing      a peg is pressed into a slot that holds it back.
 reaching      a thing that is far away is touched, and stays where it is.
+shunting      a block is pushed away with the outside of an L hook's tip, then pulled back and nearer with its inside.
 ring_pulling  a ring that lies on the table is pulled nearer by its inside, with the tip of an L hook that stands upright in it.
 """
 
@@ -17,12 +18,14 @@ from magic_bringup.demonstrating import demonstrated, made_of, target_contact, t
 from magic_bringup.striking import DOWN, OUT, PEG, REFERENCE, SLOT
 from magic_core import transforms
 from magic_core.goal import shipped
+from magic_core.placement import pairs_of
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import pose_data
-from magic_core.strategy import Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import ContactPair, Goal, Physics, Strategy, Waypoint
 
 #: The side on which the tool acts: that of the robot, which pushes away.
 NEAR_SIDE = np.array([-1.0, 0.0, 0.0])
+OUTWARDS = -NEAR_SIDE
 #: Tools that have a straight side: of the demonstration's kind, and others.
 STRAIGHT = {
     "own": {"each": [f"mallet:{{}},form={form}" for form in "TLX"] + ["hammer:{}"], "first": 70_000, "count": 12},
@@ -170,4 +173,62 @@ def ring_pulling() -> Strategy:
     )
 
 
-STRATEGIES = {"pushing": pushing, "tipping": tipping, "pressing": pressing, "reaching": reaching, "ring_pulling": ring_pulling}
+def shunting() -> Strategy:
+    """A block is pushed away by 60 mm, then pulled back by 160 mm: two contacts, one after the other."""
+    tool = make("l_hook", 0, length=0.25, tip=0.07, width=0.02, thickness=0.018, inner_radius=0.012, bend=np.pi / 2)
+    target = make("block", 0, length=0.04, breadth=0.05, height=0.04)
+    tool_view = tool.view("top")
+    inside = tool.contact("tip_inner", tool_view)
+    middle, across = inside.object_from_contact[:3, 3], inside.object_from_contact[:3, 0]
+    outside = target_contact(tool_view, middle - 0.02 * across, -across, float("inf"))
+    seen = target_view(target, "top", DOWN)
+    far, near = (target_contact(seen, np.array([x, 0.0, 0.0]), np.sign(x) * OUTWARDS, float("inf")) for x in (0.02, -0.02))
+    pushed = -0.06
+    waypoints = (
+        Waypoint("above", np.array([0.05, 0, -0.12]), "approach", contact="outside"),
+        Waypoint("before", np.array([0.05, 0, 0]), "approach", contact="outside"),
+        Waypoint("touch", np.array([0.0, 0, 0]), "contact", 0.05, "outside"),
+        Waypoint("pushed", np.array([pushed, 0, 0]), "push", 0.1, "outside"),
+        Waypoint("apart", np.array([pushed + 0.03, 0, 0]), "over", 0.1, "outside"),
+        Waypoint("lifted", np.array([pushed + 0.03, 0, -0.12]), "over", 0.1, "outside"),
+        Waypoint("beyond", np.array([0.03 - pushed, 0, -0.12]), "over"),
+        Waypoint("behind", np.array([0.03 - pushed, 0, 0]), "over"),
+        Waypoint("met", np.array([-pushed, 0, 0]), "goal", 0.05),
+        Waypoint("pulled", np.array([-0.1, 0, 0]), "goal"),
+        Waypoint("clear", np.array([-0.07, 0, 0]), "retreat"),
+        Waypoint("up", np.array([-0.07, 0, -0.12]), "retreat"),
+    )
+    frames = {"outside": (near.object_from_contact, outside.object_from_contact)}
+    times, contacts = through(waypoints, pairs_of((far.object_from_contact, inside.object_from_contact), frames))
+    return Strategy(
+        name="shunting",
+        description="The outside of an L hook's tip pushes a block away, then its inside pulls the block nearer.",
+        view="top",
+        mode="plan",
+        **demonstrated(tool, tool_view, inside, target, seen, far, OUTWARDS, DOWN, times, contacts),
+        contacts=(ContactPair("outside", outside, near, NEAR_SIDE),),
+        waypoints=waypoints,
+        goal=shipped("shunt"),
+        physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
+        environment={
+            "world_from_target": pose_data(transforms.make(translation=[0.55, 0.0, 0.02])),
+            "tool": made_of(tool),
+            "target": made_of(target),
+            "evaluation": {
+                "sets": {
+                    "own": {"each": ["l_hook:{}", "j_hook:{}", "hammer:{}"], "first": 70_000, "count": 12},
+                    "unseen": unseen("l_hook", "j_hook"),
+                },
+            },
+        },
+    )
+
+
+STRATEGIES = {
+    "shunting": shunting,
+    "pushing": pushing,
+    "tipping": tipping,
+    "pressing": pressing,
+    "reaching": reaching,
+    "ring_pulling": ring_pulling,
+}

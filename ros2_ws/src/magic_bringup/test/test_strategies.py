@@ -10,7 +10,7 @@ import pytest
 from magic_bringup import make_strategies
 from magic_core import strategy as strategies
 from magic_core import transforms
-from magic_core.contact import ContactCandidate
+from magic_core.contact import Companion, ContactCandidate
 from magic_core.motion import MotionPlan
 from magic_core.shapes import make, mug_set
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures
@@ -38,7 +38,8 @@ def replay(
     from magic_planner.object_motion import plan_tool_motion
     from magic_verifier.verification import verify
 
-    candidate = ContactCandidate("tool", tool_contact, target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
+    further = tuple(Companion(pair.name, pair.tool, pair.target) for pair in strategy.contacts)
+    candidate = ContactCandidate("tool", tool_contact, target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4), further)
     obstacles = tuple(fixtures(strategy.environment, (world_from_target @ target_contact.object_from_contact)[:3, 3]))
     target_object = target.as_object("target", world_from_target)
     motion = plan_tool_motion(strategy, tool.as_object("tool", np.eye(4)), target_object, candidate, obstacles=obstacles)
@@ -93,7 +94,8 @@ def test_the_target_contact_is_the_support_point_along_the_normal(strategy: Stra
 
 
 def test_the_contacts_lie_on_the_outlines(strategy: Strategy) -> None:
-    for view, contact in ((strategy.tool_view, strategy.tool_contact), (strategy.target_view, strategy.target_contact)):
+    further = [side for p in strategy.contacts for side in ((strategy.tool_view, p.tool), (strategy.target_view, p.target))]
+    for view, contact in ((strategy.tool_view, strategy.tool_contact), (strategy.target_view, strategy.target_contact), *further):
         u, v = np.round(contact.pixel - 1.2 * contact.normal).astype(int)
         assert view.mask[v, u]
         u, v = np.round(contact.pixel + 1.5 * contact.normal).astype(int)

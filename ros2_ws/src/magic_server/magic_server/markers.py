@@ -20,6 +20,8 @@ KEPT = ColorRGBA(r=0.16, g=0.65, b=0.27, a=1.0)
 DROPPED = ColorRGBA(r=0.86, g=0.20, b=0.18, a=0.9)
 PENDING = ColorRGBA(r=0.95, g=0.77, b=0.06, a=0.9)
 PATH = ColorRGBA(r=0.13, g=0.45, b=0.85, a=1.0)
+#: How far to either side of a contact its surface's bends are drawn (m).
+BEND = 0.008
 AXES = (ColorRGBA(r=0.9, a=1.0), ColorRGBA(g=0.8, a=1.0), ColorRGBA(b=0.95, a=1.0))
 
 
@@ -47,6 +49,15 @@ class _Builder:
         for axis, color in enumerate(AXES):
             marker = self.add(ns, Marker.ARROW, color, (0.003, 0.006, 0.008))
             marker.points = [_point(world_from_frame[:3, 3]), _point(world_from_frame[:3, 3] + length * world_from_frame[:3, axis])]
+
+    def bends(self, ns: str, world_from_surface: NDArray[np.float64], curvatures: NDArray[np.float64]) -> None:
+        """The surface along its two principal directions, BEND metres to either side, as far as the curvature tells."""
+        away = np.linspace(-BEND, BEND, 13)
+        for axis, (curvature, color) in enumerate(zip(curvatures, AXES[1:], strict=True), start=1):
+            places = np.zeros((len(away), 3))
+            places[:, axis], places[:, 0] = away, -0.5 * curvature * away**2
+            line = self.add(ns, Marker.LINE_STRIP, color, (0.001, 0.0, 0.0))
+            line.points = [_point(place) for place in transforms.apply(world_from_surface, places)]
 
 
 def describe(reports: list[Report]) -> tuple[str, ColorRGBA]:
@@ -81,6 +92,12 @@ def run_markers(
         label.pose.position = _point(world_from_contact[:3, 3] + [0.0, 0.0, 0.05 + 0.025 * index])
         label.text = f"{index + 1}: score {candidate.score:.3f}, {text}"
         build.axes("tool_contacts", world_from_contact, 0.04)
+        if candidate.tool.has_surface:
+            build.bends(
+                "curvatures", world_from_tool @ conversions.pose_from_msg(candidate.tool.object_from_surface), candidate.tool.curvatures
+            )
+        for further in candidate.companions:
+            build.axes("further_contacts", world_from_tool @ conversions.pose_from_msg(further.tool.object_from_contact), 0.03)
         if index == 0 and candidate.has_target and target_id in objects:
             world_from_target = conversions.pose_from_msg(objects[target_id].pose)
             build.axes("target_contact", world_from_target @ conversions.pose_from_msg(candidate.target.object_from_contact), 0.05)
