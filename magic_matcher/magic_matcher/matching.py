@@ -389,7 +389,7 @@ class Matcher:
                 views[tool.id] = seen.view
                 found.extend((candidate, seen.heatmap) for candidate in seen.candidates)
             except MagicError as error:
-                views[tool.id] = tool.view
+                views[tool.id] = tool.told_in or tool.view
                 failures.append(error)
         if not found:
             if len(failures) == 1:
