@@ -28,7 +28,7 @@ from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.shapes import section_view
 from magic_core.strategy import Strategy
 from magic_core.surface import Surface
-from magic_core.views import as_it_stands, mirrored, own_views, square_view
+from magic_core.views import as_it_stands, mirrored, own_views, same_direction, square_view
 from magic_matcher import contour as contours
 from magic_matcher import curvature, enclosing, global_stage, score
 from magic_matcher.contour import Contour
@@ -135,7 +135,8 @@ def tool_of(item: SceneObject, kind: str) -> Tool:
         return Tool(item.id, stands, lambda: own(None), True, **known)
     # What lies is told as seen from right above: it is used as it lies.  Else the axis is, of whose two sides the view is on one.
     side = view if view.direction @ stands.direction > 0 else mirrored(view)
-    return Tool(item.id, view, lambda: own(view.direction), told_in=stands if kind == "top" else side, **known)
+    told_in = stands if kind == "top" or same_direction(side.direction, stands.direction) else side
+    return Tool(item.id, view, lambda: own(view.direction), told_in=told_in, **known)
 
 
 def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:

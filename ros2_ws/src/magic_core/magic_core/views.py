@@ -96,12 +96,17 @@ def as_it_stands(item: SceneObject, kind: str) -> CanonicalView:
     return item.view if item.view.kind == kind else find_view(item.mesh, item.pieces, kind)
 
 
+def same_direction(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Whether two unit directions (3,) are one but for rounding: to a tenth of a degree."""
+    return bool(a @ b > 1 - 1e-6)
+
+
 def view_of_contact(item: SceneObject, kind: str, object_from_contact: NDArray[np.float64]) -> CanonicalView:
     """The view of a kind in which a contact with this frame (4, 4) was found: its z is the view's direction."""
     direction = object_from_contact[:3, 2]
     try:
         view = as_it_stands(item, kind)
-        if view.direction @ direction > 1 - 1e-6:
+        if same_direction(view.direction, direction):
             return view
     except MagicError as error:
         if error.code is not Code.BAD_MESH:
