@@ -313,10 +313,11 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     unseen = other & ~valid
     result = clusters.connected(core | unseen, core)
     result = _fill_bowls(result, looked, other, parameters)
-    result = smear.cleared(
-        result, looked.frame.color, looked.frame.depth, table, shaded, inside & (distance > 9), looked.frame.intrinsics.fx
-    )
-    result = _two_colors(result, looked, table)
+    color, depth, focal = looked.frame.color, looked.frame.depth, looked.frame.intrinsics.fx
+    # Where depth goes on beyond a thing's edge it was not carried there.
+    firm = result & ~(jump := smear.falls_back(result, depth, focal))
+    result = smear.cleared(result, color, depth, table, shaded, inside & (distance > 9), jump, focal)
+    result = _two_colors(result, looked, table, firm)
     return open_by_two(result)
 
 
@@ -357,11 +358,11 @@ def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_
     return result
 
 
-def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], reach: int = 3) -> NDArray[np.bool_]:
+def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], firm: NDArray[np.bool_], reach: int = 3) -> NDArray[np.bool_]:
     """Move a mask's edge to where the colour is half way between the thing's and the table's next to it.
 
     Depth fattens edges by some pixels and a threshold on colour by one; pixels within ``reach`` of the edge are judged
-    anew by the share of the thing's colour in theirs, wherever the two colours differ enough to tell.
+    anew by the share of the thing's colour in theirs, wherever the two colours differ enough to tell; those of ``firm`` (H, W) stay.
     """
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     small = mask.astype(np.uint8)
@@ -395,7 +396,7 @@ def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_
         # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
         rest = _total((offset - part[..., None] * difference) ** 2)
         before = mask[cut][where]
-        told = ((rest < 9.0**2) | ~before) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
+        told = ~(firm[cut][where] & before) & ((rest < 9.0**2) | ~before) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
         # Grow only into what depth does not contradict, and by what touches the mask.
         with np.errstate(invalid="ignore"):
             possible = ~(looked.heights[cut][where] <= -0.006)

@@ -25,6 +25,8 @@ TABLE, THING, HOLE = 1.0, 1.5, 2.5
 LIKE = 25.0
 #: A hole is hollow in depth, by so many metres, or it has the table's colour to so many squared standard deviations.
 HOLLOW, SAME = 0.004, 4.0
+#: Depth falls back beyond an outline by so many metres more than a surface at 45 degrees would, looked for so many pixels beside it.
+STEP, BESIDE = 0.005, 3
 #: Least pixels of a hole, and of either kind for its histogram to tell anything.
 LEAST, SAMPLE = 12, 150
 #: Widths of the histograms' bins in lightness and in the two colour axes, of 256.
@@ -73,29 +75,36 @@ def cleared(
     table: NDArray[np.bool_],
     unlike: NDArray[np.float32],
     possible: NDArray[np.bool_],
+    jump: NDArray[np.bool_],
     focal: float,
 ) -> NDArray[np.bool_]:
     """The mask (H, W) with smear taken out and lost rims put back.
 
     color (H, W, 3) RGB; depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W): squared distance of the colour from
-    that of the table around, in the light or in a shadow, in standard deviations; possible (H, W): where the mask may grow; focal: focal length, pixels.
+    that of the table around, in the light or in a shadow, in standard deviations; possible (H, W): where the mask may grow; jump (H, W): :func:`falls_back`; focal: focal length, pixels.
     """
     scale = focal / 615
-    reach, deep = max(3, round(REACH * scale)), round(DEEP * scale)
+    most, deep = max(3, round(REACH * scale)), round(DEEP * scale)
     result = mask.copy()
     lab = cv2.cvtColor(cv2.GaussianBlur(color, (3, 3), 0), cv2.COLOR_RGB2LAB)
     wide = cv2.dilate(mask.view(np.uint8), np.ones((5, 5), np.uint8))
     _, regions, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
+    judged = []
     for number, (x, y, w, h, _) in enumerate(stats[1:], 1):
-        margin = 3 * reach
+        margin = 3 * most
         cut = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
         mine = mask[cut] & (regions[cut] == number)
-        result[cut][mine] = False
         others = mask[cut] & ~mine
         # What lies farther around than smear reaches, be it the table or the room behind it, is not the thing's either.
-        beyond = cv2.dilate(mine.view(np.uint8), np.ones((2 * reach + 7,) * 2, np.uint8)) == 0
-        near = _Near(mine, lab[cut], depth[cut], unlike[cut], table[cut] | (beyond & ~others), possible[cut] & ~others)
-        result[cut] |= _judged(near, reach, deep)
+        beyond = cv2.dilate(mine.view(np.uint8), np.ones((2 * most + 7,) * 2, np.uint8)) == 0
+        near = _Near(mine, lab[cut], depth[cut], unlike[cut], table[cut] | (beyond & ~others), possible[cut] & ~others, jump[cut])
+        told = _told(near, most, deep)
+        if told is not None:
+            judged.append((cut, near, told))
+    reach = _width([told for _, _, told in judged], most)
+    for cut, near, told in judged:
+        result[cut][near.mine] = False
+        result[cut] |= _judged(near, told, reach, most, deep)
     return result
 
 
@@ -109,41 +118,89 @@ class _Near:
     unlike: NDArray[np.float32]
     around: NDArray[np.bool_]
     possible: NDArray[np.bool_]
+    jump: NDArray[np.bool_]
 
 
-def _judged(near: _Near, reach: int, deep: int) -> NDArray[np.bool_]:
-    """The region as colour has it."""
+@dataclass(frozen=True)
+class _Told:
+    """Of one region in its window: log of how much likelier each pixel's colour is around the thing than on it; its distance from the outside, pixels;
+    and for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind them."""
+
+    field: NDArray[np.float32]
+    within: NDArray[np.float32]
+    widths: NDArray[np.float32]
+
+
+def _told(near: _Near, most: int, deep: int) -> _Told | None:
+    """What colour and depth tell of a region; ``None`` where they tell too little."""
     mine = near.mine
     if np.count_nonzero(mine) < SAMPLE or np.count_nonzero(near.around) < SAMPLE:
-        return mine
+        return None
     index = _index(near.lab)
-    within = cv2.distanceTransform(np.pad(mine, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     ground = _shaded(near.lab[near.around])
+    within = cv2.distanceTransform(np.pad(mine, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
 
     def field(own: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log of how much likelier each pixel's colour is around the thing than on it, of which ``own`` is a sample."""
         return cv2.blur(np.log((ground + EVEN) / (_density(index[own]) + EVEN))[index], (3, 3))
 
-    inner = mine & (within > min(reach, 0.6 * float(within.max())))
+    inner = mine & (within > min(most, 0.6 * float(within.max())))
     other = inner & (near.unlike >= LIKE)
     first = field(other if np.count_nonzero(other) > max(SAMPLE, 0.3 * np.count_nonzero(inner)) else inner)
     # What looks like the table near the edge says nothing of the thing's own colours.
     sure = mine & ~((first > TABLE) & (within < deep))
     if np.count_nonzero(sure) < 0.3 * np.count_nonzero(mine):
-        return mine
+        return None
     told = field(sure)
-    kept = mine & ~_smeared(near, told, within, reach, deep)
+    edge = near.jump & mine & (within < 1.5) & (cv2.dilate((~mine & (told > TABLE)).view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+    own = cv2.distanceTransform((~(mine & (told < -THING))).view(np.uint8), cv2.DIST_L2, 3)
+    return _Told(told, within, own[edge])
+
+
+def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float) -> NDArray[np.bool_]:
+    """Pixels (H, W) of a mask beyond whose nearest outline depth falls back, or is mostly missing: only there does stereo carry it past an edge.
+
+    Where a thing meets the table towards the camera depth goes on.
+    """
+    size = (2 * BESIDE + 1,) * 2
+    seen = ~mask & np.isfinite(depth)
+    far = cv2.dilate(np.where(seen, depth, np.float32(0)).astype(np.float32), np.ones(size, np.uint8))
+    outside = cv2.blur((~mask).astype(np.float32), size)
+    far[cv2.blur(seen.astype(np.float32), size) < 0.5 * outside] = np.inf
+    # Beyond the picture's border nothing is known.
+    within, nearest = cv2.distanceTransformWithLabels(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    table = np.empty(int(nearest.max()) + 1, np.float32)
+    table[nearest[~np.pad(mask, 1)]] = np.pad(far, 1, constant_values=np.inf)[~np.pad(mask, 1)]
+    with np.errstate(invalid="ignore"):
+        goes_on = table[nearest[1:-1, 1:-1]] - depth < STEP + within[1:-1, 1:-1] * depth / focal
+    return mask & ~goes_on
+
+
+def _width(told: list[_Told], most: int) -> int:
+    """How far smear reaches in a picture, pixels, at most ``most``: where the thing's colour begins behind most of the outlines past which depth falls back."""
+    widths = np.concatenate([t.widths for t in told]) if told else np.zeros(0)
+    widths = widths[widths <= 2 * most]
+    if len(widths) < LEAST:
+        return most
+    return int(np.clip(np.ceil(np.percentile(widths, 75)) + 2, 3, most))
+
+
+def _judged(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArray[np.bool_]:
+    """The region as colour has it."""
+    mine = near.mine
+    kept = mine & ~_smeared(near, told, reach, deep)
     # Grow step by step, so that nothing is reached across the table.
-    like = near.possible & ~mine & (told < -THING)
+    like = near.possible & ~mine & (told.field < -THING)
     grown = kept
-    for _ in range(reach):
+    for _ in range(most):
         grown = grown | (cv2.dilate(grown.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & like)
     return grown | _enclosed(like & ~grown & np.isfinite(near.depth), grown)
 
 
-def _smeared(near: _Near, told: NDArray[np.float32], within: NDArray[np.float32], reach: int, deep: int) -> NDArray[np.bool_]:
+def _smeared(near: _Near, told: _Told, reach: int, deep: int) -> NDArray[np.bool_]:
     """Of a region's pixels those that colour gives to the table: a rim of it no wider than smear is, and holes that it encloses."""
-    empty = near.mine & (told > TABLE) & (near.unlike < LIKE)
+    within = told.within
+    empty = near.mine & (told.field > TABLE) & (near.unlike < LIKE)
     outside = cv2.dilate((~near.mine).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
     removed = np.zeros_like(empty)
     _, parts, stats, _ = cv2.connectedComponentsWithStats(empty.view(np.uint8), connectivity=4)
@@ -152,11 +209,11 @@ def _smeared(near: _Near, told: NDArray[np.float32], within: NDArray[np.float32]
             continue
         cut = (slice(max(y - 4, 0), y + h + 4), slice(max(x - 4, 0), x + w + 4))
         part = parts[cut] == i
-        if float(within[cut][part].max()) < deep and _hole(near, part, empty[cut], told[cut][part], cut):
+        if float(within[cut][part].max()) < deep and _hole(near, part, empty[cut], told.field[cut][part], cut):
             removed[cut] |= part
     # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
     own = _around(empty & ~removed & (within > reach + 1), reach + 1)
-    return removed | connected(empty & (within <= reach) & ~own, outside)
+    return removed | connected(empty & (within <= reach) & near.jump & ~own, outside)
 
 
 def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: NDArray[np.float32], cut: tuple[slice, slice]) -> bool:
@@ -164,11 +221,26 @@ def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: 
     if float(told.mean()) < HOLE:
         return False
     ring = (cv2.dilate(part.view(np.uint8), np.ones((7, 7), np.uint8)) > 0) & near.mine[cut] & ~empty
-    inside, rim = near.depth[cut][part], near.depth[cut][ring]
-    inside, rim = inside[np.isfinite(inside)], rim[np.isfinite(rim)]
-    if len(inside) < 0.7 * len(told) or (len(rim) > 8 and float(np.median(inside)) > float(np.median(rim)) + HOLLOW):
+    inside, rim = part & np.isfinite(near.depth[cut]), ring & np.isfinite(near.depth[cut])
+    if np.count_nonzero(inside) < 0.7 * len(told):
         return True
+    if np.count_nonzero(rim) > 8:
+        # Behind its rim, and more so than a slope explains.
+        back = float(np.median(near.depth[cut][inside]) - np.median(near.depth[cut][rim]))
+        if back > HOLLOW and _behind_plane(near.depth[cut], inside, rim) > HOLLOW:
+            return True
     return float(np.median(near.unlike[cut][part])) < SAME
+
+
+def _behind_plane(depth: NDArray[np.float32], inside: NDArray[np.bool_], rim: NDArray[np.bool_]) -> float:
+    """How far the middle pixel of a patch lies behind the plane through its rim, m: of a plane the inverse depth is linear in the picture."""
+
+    def rows(where: NDArray[np.bool_]) -> NDArray[np.float64]:
+        v, u = np.nonzero(where)
+        return np.column_stack([u, v, np.ones(len(u))])
+
+    plane = np.linalg.lstsq(rows(rim), 1 / depth[rim].astype(float), rcond=None)[0]
+    return float(np.median(depth[inside] - 1 / np.maximum(rows(inside) @ plane, 1e-3)))
 
 
 def _around(mask: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:
