@@ -463,8 +463,51 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
         for mask, looked in zip(masks, looks, strict=True)
     ]
     cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
-    instance = clusters.cluster(cloud, parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
+    between = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]
+    instance = clusters.cluster(np.concatenate([cloud, *between]), parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
+    # A cluster of nothing but bridges is none.
+    instance = instance[: len(cloud)]
+    instance[instance >= 0] = np.unique(instance[instance >= 0], return_inverse=True)[1]
     return Clusters(masks, fixed, spots, cloud, instance)
+
+
+#: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise, m.
+STEEP, NOISE = 1.0, 0.004
+
+
+def _bridges(looked: Looked, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Points (N, 3), world, across the gaps in a mask's depth, along rows and along columns: what colour shows to be one thing is not two for want of depth."""
+    depth = looked.frame.depth
+    lost = mask & ~np.isfinite(depth)
+    x, y, w, h = cv2.boundingRect(lost.view(np.uint8))
+    if w == 0:
+        return np.zeros((0, 3), np.float32)
+    cut = (slice(max(y - 1, 0), y + h + 1), slice(max(x - 1, 0), x + w + 1))
+    k, pose = looked.frame.intrinsics, looked.frame.world_from_camera
+    found = []
+    for axis, focal in ((1, k.fx), (0, k.fy)):
+        own, gap, z = (np.moveaxis(image[cut], axis, 1) for image in (mask, lost, depth))
+        column = np.arange(own.shape[1])
+        solid = own & ~gap
+        # The nearest pixels with depth before and after, unless the mask ends before them.
+        before = np.maximum.accumulate(np.where(solid, column, -1), axis=1)
+        after = np.minimum.accumulate(np.where(solid, column, len(column))[:, ::-1], axis=1)[:, ::-1]
+        ended = np.maximum.accumulate(np.where(~own, column, -1), axis=1)
+        begins = np.minimum.accumulate(np.where(~own, column, len(column))[:, ::-1], axis=1)[:, ::-1]
+        rows, columns = np.nonzero(gap & (before > ended) & (after < begins))
+        if len(rows) == 0:
+            continue
+        low, high = before[rows, columns], after[rows, columns]
+        z0, z1 = z[rows, low], z[rows, high]
+        even = np.abs(z1 - z0) < STEEP * (high - low) * np.minimum(z0, z1) / focal + NOISE
+        rows, columns, low, high, z0, z1 = (a[even] for a in (rows, columns, low, high, z0, z1))
+        share = (columns - low) / (high - low)
+        middle = 1 / ((1 - share) / z0 + share / z1)
+        v, u = (rows, columns) if axis == 1 else (columns, rows)
+        v, u = v + cut[0].start, u + cut[1].start
+        local = np.column_stack([(u - k.cx) / k.fx * middle, (v - k.cy) / k.fy * middle, middle])
+        found.append(transforms.apply(pose, local).astype(np.float32))
+    return np.concatenate(found) if found else np.zeros((0, 3), np.float32)
 
 
 #: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
@@ -537,7 +580,8 @@ class DepthSegmenter:
         labels = _with_depth(labels, looks, parameters)
         for image, known_pixels in zip(labels, found.fixed, strict=True):
             image[known_pixels] = -1
-        return _behind_one(_attached(labels, looks, parameters), looks, parameters)
+        labels = _behind_one(_attached(labels, looks, parameters), looks, parameters)
+        return [_on_surfaces(image, looked) for image, looked in zip(labels, looks, strict=True)]
 
 
 def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.int64]:
@@ -736,6 +780,91 @@ def _part(look: Looked, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], f
     lab = cv2.cvtColor(np.ascontiguousarray(look.frame.color[rows, columns][None]), cv2.COLOR_RGB2LAB)[0].astype(int)
     histogram = np.bincount((np.clip(lab[:, 1] - 64, 0, 127) // 8) * 16 + np.clip(lab[:, 2] - 64, 0, 127) // 8, minlength=256) / len(lab)
     return look.points(rows, columns), float(np.percentile(look.heights[rows, columns], 95)), histogram
+
+
+#: Pixels beside the seam of two labels that are judged anew, and half the window around them in which surfaces are fitted; standard deviations of depth
+#: from which a pixel is not of its own surface, and within which it is of another; least share of the window that tells of a surface.
+BAND, FITTED, OFF, ON, SUPPORT = 6, 14, 2.5, 1.5, 0.06
+
+
+def _on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:
+    """Labels (H, W) whose seams follow the surfaces on either side: parts come in voxels, several pixels wide.
+
+    Near a seam a pixel that lies off the plane through its own label's pixels farther in, and on that of the other's, is the other's.  Of a plane the inverse
+    depth is linear in the picture, so that moments over a window fit all planes at once.
+    """
+    meets = np.zeros(labels.shape, bool)
+    for axis in range(2):
+        one, two = (np.moveaxis(labels, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        seam = (one != two) & (one > 0) & (two > 0)
+        np.moveaxis(meets, axis, 0)[:-1] |= seam
+        np.moveaxis(meets, axis, 0)[1:] |= seam
+    if not meets.any():
+        return labels
+    size = 2 * BAND + 1
+    near = cv2.dilate(meets.view(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
+    depth = look.frame.depth
+    band = near & (labels > 0) & np.isfinite(depth)
+    sigma = np.maximum(look.sigma, np.float32(0.0015))
+    best, winner = np.full(labels.shape, np.inf, np.float32), labels.copy()
+    own = np.full(labels.shape, np.inf, np.float32)
+    for label in (int(i) for i in np.unique(labels[meets])):
+        x, y, w, h = cv2.boundingRect((meets & (labels == label)).view(np.uint8))
+        margin = BAND + FITTED + 1
+        cut = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+        core = (labels[cut] == label) & ~near[cut] & np.isfinite(depth[cut])
+        reach = cv2.dilate((labels[cut] == label).view(np.uint8), np.ones((size, size), np.uint8)) > 0
+        rows, columns = np.nonzero(band[cut] & reach)
+        off = _off_plane(depth[cut], core, rows, columns) / sigma[cut][rows, columns]
+        mine = labels[cut][rows, columns] == label
+        own[cut][rows[mine], columns[mine]] = off[mine]
+        better = ~mine & (off < best[cut][rows, columns])
+        best[cut][rows[better], columns[better]] = off[better]
+        winner[cut][rows[better], columns[better]] = label
+    changed = band & (own > OFF) & np.isfinite(own) & (best < ON)
+    result = np.where(changed, winner, labels)
+    return _smooth_seams(result, near)
+
+
+def _off_plane(depth: NDArray[np.float32], core: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How far pixels (N,) lie from the plane through those of ``core`` (H, W) around each, m; infinite where too few tell."""
+    height, width = depth.shape
+    v, u = np.mgrid[0:height, 0:width].astype(float)
+    v, u = v - height / 2, u - width / 2
+    weight = core.astype(float)
+    inverse = np.where(core, 1 / np.where(core, depth, 1), 0.0)
+    size = (2 * FITTED + 1,) * 2
+
+    def at(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return cv2.boxFilter(values, cv2.CV_64F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)[rows, columns]
+
+    n, su, sv = at(weight), at(weight * u), at(weight * v)
+    suu, suv, svv = at(weight * u * u), at(weight * u * v), at(weight * v * v)
+    sq, suq, svq = at(inverse), at(inverse * u), at(inverse * v)
+    enough = n > SUPPORT * size[0] * size[1]
+    safe = np.maximum(n, 1)
+    mu, mv, mq = su / safe, sv / safe, sq / safe
+    # A ridge of one pixel's spread: along a thin strip the plane across it is not told.
+    cuu, cuv, cvv = suu / safe - mu**2 + 1, suv / safe - mu * mv, svv / safe - mv**2 + 1
+    cuq, cvq = suq / safe - mu * mq, svq / safe - mv * mq
+    det = cuu * cvv - cuv**2
+    a, b = (cvv * cuq - cuv * cvq) / det, (cuu * cvq - cuv * cuq) / det
+    told = mq + a * (u[rows, columns] - mu) + b * (v[rows, columns] - mv)
+    return np.where(enough, np.abs(depth[rows, columns] - 1 / np.maximum(told, 1e-3)), np.inf)
+
+
+def _smooth_seams(labels: NDArray[np.int32], near: NDArray[np.bool_], size: int = 7) -> NDArray[np.int32]:
+    """Labels (H, W) with each labelled pixel of ``near`` given to the label that most of its neighbours have."""
+    best, winner = np.zeros(labels.shape, np.float32), labels.copy()
+    x, y, w, h = cv2.boundingRect(near.view(np.uint8))
+    cut = (slice(max(y - size, 0), y + h + size), slice(max(x - size, 0), x + w + size))
+    part = labels[cut]
+    for label in (int(i) for i in np.unique(part[near[cut] & (part > 0)])):
+        share = cv2.blur((part == label).astype(np.float32), (size, size), borderType=cv2.BORDER_CONSTANT)
+        more = share > best[cut]
+        best[cut][more] = share[more]
+        winner[cut][more] = label
+    return np.where(near & (labels > 0), winner, labels)
 
 
 def _sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
