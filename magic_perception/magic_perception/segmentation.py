@@ -716,11 +716,12 @@ def _attached(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: 
 
 #: Two parts on both sides of what hides the middle of one thing: how much nearer that is, and how far the tops may differ in height, m; least
 #: common share of their histograms of colour; and so many pixels are between what is compared across an edge, of which there are so many at least.
-NEARER, LEVEL, COMMON, ACROSS, EDGES = 0.012, 0.015, 0.5, 8, 8
+NEARER, LEVEL, COMMON, ACROSS, EDGES = 0.012, 0.015, 0.5, (8, 20), 8
 
 
 def _behind_one(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
-    """Labels with the parts of one thing that another hides in its middle joined: of one colour, equally high, and nothing but that other between."""
+    """Labels with the parts of one thing that another hides in its middle joined: of one colour or with an upright face in one plane, equally high,
+    and nothing but that other between."""
     from scipy.spatial import cKDTree
 
     top = max((int(image.max()) for image in labels), default=0)
@@ -734,7 +735,9 @@ def _behind_one(labels: list[NDArray[np.int32]], looks: list[Looked], parameters
                     if owner[a] == owner[b]:
                         continue
                     one, two = (_part(look, image == label) for label in (a, b))
-                    if min(len(one[0]), len(two[0])) < 40 or abs(one[1] - two[1]) > LEVEL or np.minimum(one[2], two[2]).sum() < COMMON:
+                    if min(len(one[0]), len(two[0])) < 40 or abs(one[1] - two[1]) > LEVEL:
+                        continue
+                    if np.minimum(one[2], two[2]).sum() < COMMON and not _one_face(look, image, a, b):
                         continue
                     distance, nearest = cKDTree(two[0]).query(one[0])
                     order = np.argsort(distance)[:20]
@@ -752,22 +755,59 @@ def _behind_one(labels: list[NDArray[np.int32]], looks: list[Looked], parameters
     return _sizeable([owner[image] for image in labels], looks, parameters)
 
 
+#: Two upright faces are in one plane where their directions differ by less, degrees, and 80 % of both lie so near to it, m; so many pixels each,
+#: and such a share of a part's, make a face.
+PARALLEL, FLAT, FACE, FACE_SHARE = 8.0, 0.004, 60, 0.15
+
+
+def _one_face(look: Looked, image: NDArray[np.int32], a: int, b: int) -> bool:
+    """Whether upright faces of two labels lie in one plane, as those of a box do that something hides in its middle."""
+    x, y, w, h = cv2.boundingRect(((image == a) | (image == b)).view(np.uint8))
+    cut = (slice(max(y - 8, 0), y + h + 8), slice(max(x - 8, 0), x + w + 8))
+    points = look.points(*np.mgrid[cut])
+    normal = convexity.normals(points, look.frame.world_from_camera[:3, 3])
+    up = look.normal.astype(np.float32)
+    faces = []
+    for label in (a, b):
+        mine = (image[cut] == label) & np.isfinite(normal[..., 0]) & np.isfinite(points[..., 0])
+        upright = mine & (np.abs(normal @ up) < 0.35)
+        way = normal[upright][:: max(1, np.count_nonzero(upright) // 300)]
+        if len(way) == 0:
+            return False
+        # The direction that most of them share.
+        agree = way @ way.T > np.cos(np.radians(15))
+        main = way[agree[np.argmax(agree.sum(axis=1))]].mean(axis=0)
+        face = upright & (normal @ (main / np.linalg.norm(main)) > np.cos(np.radians(15)))
+        if np.count_nonzero(face) < max(FACE, FACE_SHARE * np.count_nonzero(mine)):
+            return False
+        faces.append((main / np.linalg.norm(main), points[face][:: max(1, np.count_nonzero(face) // 500)]))
+    (one, p), (two, q) = faces
+    if one @ two < np.cos(np.radians(PARALLEL)):
+        return False
+    # As many of either, so that the larger does not decide alone.
+    count = min(len(p), len(q))
+    both = np.concatenate([p[np.linspace(0, len(p) - 1, count).astype(int)], q[np.linspace(0, len(q) - 1, count).astype(int)]])
+    middle = both.mean(axis=0)
+    plane = np.linalg.svd(both - middle, full_matrices=False)[2][2]
+    return all(float(np.percentile(np.abs((face - middle) @ plane), 80)) < FLAT for face in (p, q))
+
+
 def _hides(image: NDArray[np.int32], depth: NDArray[np.float32]) -> list[tuple[int, int]]:
-    """Pairs of labels (behind, before) that meet in a picture along an edge where the second is nearer."""
+    """Pairs of labels (behind, before) that meet in a picture along an edge where the second is nearer; what is behind may have lost its depth there."""
     found: dict[tuple[int, int], int] = {}
-    for axis in range(2):
-        first, second = (np.moveaxis(image, axis, 0)[part] for part in (slice(None, -ACROSS), slice(ACROSS, None)))
+    for axis, across in ((axis, across) for axis in range(2) for across in ACROSS):
+        first, second = (np.moveaxis(image, axis, 0)[part] for part in (slice(None, -across), slice(across, None)))
         rows, columns = np.nonzero((first != second) & (first > 0) & (second > 0))
         if len(rows) == 0:
             continue
         z = np.moveaxis(depth, axis, 0)
-        step = z[rows + ACROSS, columns] - z[rows, columns]
+        step = z[rows + across, columns] - z[rows, columns]
         for sign, pair in ((1, (second, first)), (-1, (first, second))):
             far = sign * step > NEARER
             keys, counts = np.unique(np.stack([p[rows[far], columns[far]] for p in pair]), axis=1, return_counts=True)
             for (back, front), count in zip(keys.T, counts, strict=True):
-                found[int(back), int(front)] = found.get((int(back), int(front)), 0) + int(count)
-    return [pair for pair, count in found.items() if count >= EDGES * ACROSS]
+                found[int(back), int(front)] = max(found.get((int(back), int(front)), 0), int(count) // across)
+    return [pair for pair, count in found.items() if count >= EDGES]
 
 
 def _part(look: Looked, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float, NDArray[np.float64]]:
