@@ -358,7 +358,9 @@ def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_
     return result
 
 
-def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], firm: NDArray[np.bool_], reach: int = 3) -> NDArray[np.bool_]:
+def _two_colors(
+    mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], firm: NDArray[np.bool_], reach: int = 3
+) -> NDArray[np.bool_]:
     """Move a mask's edge to where the colour is half way between the thing's and the table's next to it.
 
     Depth fattens edges by some pixels and a threshold on colour by one; pixels within ``reach`` of the edge are judged
@@ -475,39 +477,37 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
 STEEP, NOISE = 1.0, 0.004
 
 
-def _bridges(looked: Looked, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Points (N, 3), world, across the gaps in a mask's depth, along rows and along columns: what colour shows to be one thing is not two for want of depth."""
-    depth = looked.frame.depth
-    lost = mask & ~np.isfinite(depth)
-    x, y, w, h = cv2.boundingRect(lost.view(np.uint8))
-    if w == 0:
+def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> NDArray[np.float32]:
+    """Points (N, 3), world, across the gaps in a mask's depth: what colour shows to be one thing is not two for want of depth.
+
+    Each pixel without depth goes to the nearest that has it; where two of these regions meet, straight lines join the pixels they go to.
+    """
+    x, y, w, h = cv2.boundingRect((mask & ~np.isfinite(looked.frame.depth)).view(np.uint8))
+    # As wide a margin as a pixel without depth may be from one with it.
+    cut = (slice(max(y - 16, 0), y + h + 16), slice(max(x - 16, 0), x + w + 16))
+    own, z = mask[cut], looked.frame.depth[cut]
+    seen = own & np.isfinite(z)
+    if w == 0 or not seen.any():
         return np.zeros((0, 3), np.float32)
-    cut = (slice(max(y - 1, 0), y + h + 1), slice(max(x - 1, 0), x + w + 1))
-    k, pose = looked.frame.intrinsics, looked.frame.world_from_camera
-    found = []
-    for axis, focal in ((1, k.fx), (0, k.fy)):
-        own, gap, z = (np.moveaxis(image[cut], axis, 1) for image in (mask, lost, depth))
-        column = np.arange(own.shape[1])
-        solid = own & ~gap
-        # The nearest pixels with depth before and after, unless the mask ends before them.
-        before = np.maximum.accumulate(np.where(solid, column, -1), axis=1)
-        after = np.minimum.accumulate(np.where(solid, column, len(column))[:, ::-1], axis=1)[:, ::-1]
-        ended = np.maximum.accumulate(np.where(~own, column, -1), axis=1)
-        begins = np.minimum.accumulate(np.where(~own, column, len(column))[:, ::-1], axis=1)[:, ::-1]
-        rows, columns = np.nonzero(gap & (before > ended) & (after < begins))
-        if len(rows) == 0:
-            continue
-        low, high = before[rows, columns], after[rows, columns]
-        z0, z1 = z[rows, low], z[rows, high]
-        even = np.abs(z1 - z0) < STEEP * (high - low) * np.minimum(z0, z1) / focal + NOISE
-        rows, columns, low, high, z0, z1 = (a[even] for a in (rows, columns, low, high, z0, z1))
-        share = (columns - low) / (high - low)
-        middle = 1 / ((1 - share) / z0 + share / z1)
-        v, u = (rows, columns) if axis == 1 else (columns, rows)
-        v, u = v + cut[0].start, u + cut[1].start
-        local = np.column_stack([(u - k.cx) / k.fx * middle, (v - k.cy) / k.fy * middle, middle])
-        found.append(transforms.apply(pose, local).astype(np.float32))
-    return np.concatenate(found) if found else np.zeros((0, 3), np.float32)
+    _, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    source = np.zeros(int(index.max()) + 1, np.int64)
+    source[index[seen]] = np.flatnonzero(seen)
+    goes, flat = source[index], cv2.connectedComponents(own.view(np.uint8), connectivity=8)[1].ravel()
+    meetings = []
+    for axis in range(2):
+        one, two, here, there = (np.moveaxis(image, axis, 0)[part] for image in (goes, own) for part in (slice(None, -1), slice(1, None)))
+        meet = here & there & (one != two)
+        meetings.append(np.column_stack([one[meet], two[meet]]))
+    a, b = np.unique(np.sort(np.concatenate(meetings), axis=1), axis=0).T
+    (v0, u0), (v1, u1) = (np.divmod(i, own.shape[1]) for i in (a, b))
+    z0, z1, apart = z.ravel()[a].astype(float), z.ravel()[b].astype(float), np.hypot(u1 - u0, v1 - v0)
+    k = looked.frame.intrinsics
+    even = (apart > 2) & (flat[a] == flat[b]) & (np.abs(z1 - z0) < STEEP * apart * np.minimum(z0, z1) / k.fx + NOISE)
+    t = np.linspace(0, 1, samples)[1:-1, None]
+    u, v = (((1 - t) * p[even] + t * q[even]).ravel() for p, q in ((u0, u1), (v0, v1)))
+    middle = (1 / ((1 - t) / z0[even] + t / z1[even])).ravel()
+    local = np.column_stack([(u + cut[1].start - k.cx) / k.fx * middle, (v + cut[0].start - k.cy) / k.fy * middle, middle])
+    return transforms.apply(looked.frame.world_from_camera, local).astype(np.float32)
 
 
 #: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
@@ -866,7 +866,9 @@ def _on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:
     return _smooth_seams(result, near)
 
 
-def _off_plane(depth: NDArray[np.float32], core: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _off_plane(
+    depth: NDArray[np.float32], core: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """How far pixels (N,) lie from the plane through those of ``core`` (H, W) around each, m; infinite where too few tell."""
     height, width = depth.shape
     v, u = np.mgrid[0:height, 0:width].astype(float)

