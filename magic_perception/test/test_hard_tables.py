@@ -18,7 +18,7 @@ from magic_core.camera import RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import DepthSegmenter
+from magic_perception.segmentation import DepthSegmenter, _on_surfaces
 
 RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
 POSE = scenes.pose([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
@@ -134,3 +134,18 @@ def test_a_box_that_another_hides_in_its_middle_is_one_whatever_its_print():
         parts = [box(left, 0.60, 0.065, RED), box(right, 0.60 - aside, -0.065, BLUE), box(post, 0.50, 0.0, (40, 140, 60))]
         frame, truth = seen(parts, pose=pose)
         check(frame, np.where((truth == 2) & (count == 2), 1, truth))
+
+
+def test_a_seam_in_steps_follows_the_surfaces():
+    """Two boxes, one on the other, whose labels were cut some pixels beside their seam."""
+    frame, truth = seen([box((0.16, 0.16, 0.06), 0.5, 0.0, RED), box((0.08, 0.08, 0.08), 0.5, 0.0, RED, 0.06)])
+    look = evaluate.looked_at(frame, PARAMETERS)
+    stepped = np.where(truth > 0, cv2.resize(truth[2::5, 2::5].astype(np.uint8), (640, 480), interpolation=cv2.INTER_NEAREST), 0).astype(
+        np.int32
+    )
+    stepped[(truth > 0) & (stepped == 0)] = 1
+    stepped = np.where(truth > 0, stepped, 0)
+    sharp = _on_surfaces(stepped, look)
+    seams = [(image != truth) & (truth > 0) for image in (stepped, sharp)]
+    assert np.count_nonzero(seams[1]) < 0.7 * np.count_nonzero(seams[0])
+    assert np.array_equal(sharp > 0, stepped > 0)

@@ -29,9 +29,10 @@ def picture(thing: np.ndarray, color: tuple[int, int, int] = THING, seed: int = 
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.6), 0, 255).astype(np.uint8)
 
 
-def cleared(mask: np.ndarray, color: np.ndarray, depth: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def cleared(mask: np.ndarray, color: np.ndarray, depth: np.ndarray, seen: np.ndarray, unlike: float = 0.0) -> np.ndarray:
     table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
-    return smear.cleared(mask, color, depth, table, np.where(seen, 100, 0).astype(np.float32), np.ones(mask.shape, bool), 615.0)
+    everywhere = np.ones(mask.shape, bool)
+    return smear.cleared(mask, color, depth, table, np.where(seen, 100, unlike).astype(np.float32), everywhere, everywhere, 615.0)
 
 
 @pytest.mark.parametrize("hollow", [0.0, 0.02])
@@ -58,6 +59,32 @@ def test_what_has_the_colour_of_the_table_keeps_its_mask() -> None:
     # A face of the table's colour that goes on farther in than smear reaches is no smear.
     striped = truth & (np.mgrid[0:200, 0:200][0] > 85)
     assert overlap(truth, cleared(truth, picture(striped), depth, striped)) > 0.9
+
+
+def test_where_depth_goes_on_beyond_an_edge_it_was_not_carried_there() -> None:
+    # A face of the table's colour at the foot of a thing: towards the camera depth goes on, away from it falls back.
+    mask = np.zeros((200, 200), bool)
+    mask[60:140, 60:140] = True
+    rows = np.arange(200)[:, None] * np.ones((1, 200))
+    depth = (0.9 - 0.0015 * (rows - 60)).astype(np.float32)
+    depth[mask] = (0.70 + 0.001 * (rows - 60))[mask]
+    depth[139:, :] = 0.78
+    jump = smear.falls_back(mask, depth, 615.0)
+    assert jump[62, 100] and jump[100, 62] and not jump[136, 100]
+    depth[:57] = np.nan
+    assert smear.falls_back(mask, depth, 615.0)[62, 100]
+    assert not smear.falls_back(mask, depth, 615.0)[~mask].any()
+
+
+@pytest.mark.parametrize("wide, shade, kept", [(2, 7, True), (6, 3, False)])
+def test_how_far_smear_reaches_is_measured_in_each_picture(wide: int, shade: int, kept: bool) -> None:
+    # On one side a rim of the thing is in the shade and has almost the table's colour: 9 pixels of it, with the smear beyond.
+    truth, shaded = ring(50, 0), np.mgrid[0:200, 0:200][1] > 150 - shade
+    smeared = ring(50 + wide, 0)
+    depth = np.where(smeared, 0.6, 0.8).astype(np.float32)
+    found = cleared(smeared, picture(truth & ~shaded), depth, truth & ~shaded, unlike=10.0)
+    assert overlap(truth & ~shaded, found & ~shaded) > 0.95
+    assert bool(found[97:104, 152 - shade : 150].all()) == kept and bool(found[97:104, 152 - shade : 150].any()) == kept
 
 
 def test_depth_of_the_table_in_a_high_thing_is_not_its_own() -> None:
