@@ -7,6 +7,8 @@ cameras look again: the earlier views of it have to be dropped, those of the oth
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,10 +79,13 @@ def _at(scene: Scene, mesh: Mesh) -> SceneObject | None:
     return found[0] if len(found) == 1 else None
 
 
-def measure(count: int, seed: int) -> dict[str, object]:
-    """Over ``count`` scenes: by the number of views what of the surfaces is there, and by how far a thing was moved what became of its earlier views."""
+def measure(count: int, seed: int, moves: tuple[float, ...] = MOVES, said: Callable[[str], None] = lambda _: None) -> dict[str, object]:
+    """Over ``count`` scenes: by the number of views what of the surfaces is there, and by how far a thing was moved what became of its earlier views.
+
+    moves: by how much one thing is moved, m; said: is told of each scene that is done.
+    """
     surfaces: dict[int, list[tuple[float, float, float] | None]] = {1: [], 2: [], 5: []}
-    moved: dict[float, list[tuple[bool, int, float | None]]] = {move: [] for move in MOVES}
+    moved: dict[float, list[tuple[bool, int, float | None]]] = {move: [] for move in moves}
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         meshes = []
@@ -96,7 +101,7 @@ def measure(count: int, seed: int) -> dict[str, object]:
                 item = _at(scene, mesh)
                 surfaces[views_used].append((item.seen_share, *compared(item, mesh)) if item is not None else None)
         way = rng.uniform(-np.pi, np.pi)
-        for move in MOVES:
+        for move in moves:
             now = [meshes[0].transformed(transforms.make(translation=[move * np.cos(way), move * np.sin(way), 0])), *meshes[1:]]
             report = Report()
             scene = perceive(views(now, STATION, 2.0, int(rng.integers(2**31))), (), REGION, None, report, earlier)
@@ -109,6 +114,7 @@ def measure(count: int, seed: int) -> dict[str, object]:
                     compared(item, now[0])[1] if item is not None else None,
                 )
             )
+        said(f"views: scene {number + 1} of {count}")
     return {
         "scenes": count,
         "seed": seed,
@@ -116,9 +122,9 @@ def measure(count: int, seed: int) -> dict[str, object]:
             views_used: {
                 "things": len(rows),
                 "found": len(told := [r for r in rows if r is not None]),
-                "seen": round(float(np.mean([r[0] for r in told])), 3),
-                "there": round(float(np.mean([r[1] for r in told])), 3),
-                "off_mm": round(1000 * float(np.mean([r[2] for r in told])), 2),
+                "seen": _mean([r[0] for r in told], 3),
+                "there": _mean([r[1] for r in told], 3),
+                "off_mm": _mean([1000 * r[2] for r in told], 2),
             }
             for views_used, rows in surfaces.items()
         },
@@ -128,11 +134,16 @@ def measure(count: int, seed: int) -> dict[str, object]:
                 "others_dropped": sum(r[1] for r in rows),
                 "of": len(rows) * len(WRIST) * (len(PLACES) - 1),
                 "found": len(offs := [r[2] for r in rows if r[2] is not None]),
-                "off_mm": round(1000 * float(np.mean(offs)), 2) if offs else None,
+                "off_mm": _mean([1000 * off for off in offs], 2),
             }
             for move, rows in moved.items()
         },
     }
+
+
+def _mean(values: list[float], digits: int) -> float | None:
+    """``None`` of nothing."""
+    return round(float(np.mean(values)), digits) if values else None
 
 
 def _blind_at(frame: RgbdFrame, mesh: Mesh) -> bool:
@@ -155,6 +166,8 @@ def markdown(result: dict) -> str:
     ]
     lines += [
         f"| {n} | {r['found']} of {r['things']} | {r['seen']:.1%} | {r['there']:.1%} | {r['off_mm']:.2f} |"
+        if r["found"]
+        else f"| {n} | 0 of {r['things']} | | | |"
         for n, r in result["surfaces"].items()
     ]
     lines += [

@@ -3,7 +3,7 @@
 Three parts, each left out, and said so, where its data are absent:
 
 osd       Segmentation of the OSD scenes by the field's measures (:mod:`magic_perception.measures`).
-captures  Single RealSense captures: how many objects, and their sizes beside those read from the images by hand.
+captures  RealSense captures: how many objects, whether what is one thing stays one, and sizes beside those read from the images by hand.
 meshes    Ray-cast captures of scanned and modelled objects by two D435s (:mod:`magic_core.sensor`): mask IoU, and for the
           paper's reconstruction and this one side by side the Chamfer distance, the volumetric IoU and the holes that are open.
 
@@ -96,10 +96,11 @@ def looked_at(frame: RgbdFrame, parameters: Parameters) -> Looked:
 
 
 def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:
-    """Best IoU of each labelled object, and the field's measures."""
+    """Best IoU of each labelled object, and the field's measures; ``with_depth``: the same at pixels with depth alone, since only those have labels."""
     scenes: dict[str, object] = {}
     everything: list[float] = []
     measured: list[measures.Measures] = []
+    with_depth: list[measures.Measures] = []
     parameters = replace(OSD_PARAMETERS, split=split)
     for name, frame, truth in osd_scenes(folder):
         start = time.process_time()
@@ -107,6 +108,7 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
         seconds = time.process_time() - start
         scores = measures.best_ious(labels, truth)
         measured.append(measures.measure(labels, truth))
+        with_depth.append(measures.measure(np.where(np.isfinite(frame.depth), labels, 0), truth))
         scenes[name] = {
             "objects": len(scores),
             "found": int(labels.max()),
@@ -123,6 +125,7 @@ def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path |
         "above_0.75": round(float(np.mean(np.array(everything) > 0.75)), 4),
         "objects": len(everything),
         "measures": {key: round(value, 4) for key, value in asdict(measures.mean(measured)).items()},
+        "with_depth": {key: round(value, 4) for key, value in asdict(measures.mean(with_depth)).items()},
         "scenes": scenes,
     }
 
@@ -140,19 +143,23 @@ def tinted(color: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.ui
 
 
 def captures(folder: Path, segmenter: Segmenter) -> dict[str, object]:
-    """Objects and sizes of the single captures; the region is cut at 1.3 m before the camera."""
-    frames = []
-    single = folder / "realsense_single"
-    if single.is_dir():
-        for name, k in json.loads((single / "intrinsics.json").read_text()).items():
-            frames.append(
-                read_frame(
-                    single / f"{name}_color.png",
-                    single / f"{name}_depth_mm.png",
-                    Intrinsics(k["width"], k["height"], k["fx"], k["fy"], k["cx"], k["cy"]),
-                    name,
-                )
-            )
+    """Objects and sizes of the captures in every folder but ``osd``; the region is cut at 1.3 m before the camera.
+
+    Those whose name does not begin with ``cluttered`` show one object alone.
+    """
+    frames, alone = [], []
+    for file in sorted(folder.glob("*/intrinsics.json")):
+        if file.parent.name == "osd":
+            continue
+        for name, k in json.loads(file.read_text()).items():
+            color = file.parent / f"{name}_color.png"
+            if not color.is_file():
+                continue
+            height, width = cv2.imread(str(color)).shape[:2]
+            intrinsics = Intrinsics(width, height, k["fx"], k["fy"], k["cx"], k["cy"])
+            frames.append(read_frame(color, file.parent / f"{name}_depth_mm.png", intrinsics, name))
+            if not name.startswith("cluttered"):
+                alone.append(name)
     if (folder / "mallet").is_dir():
         k = json.loads((folder / "mallet/realsense_intrinsic.json").read_text())
         m = k["intrinsic_matrix"]
@@ -177,6 +184,8 @@ def captures(folder: Path, segmenter: Segmenter) -> dict[str, object]:
         if frame.camera in SIZES and sizes:
             row["read_mm"] = SIZES[frame.camera]
             row["largest_error_mm"] = round(float(np.max(np.abs(np.array(sizes[0]) - np.sort(SIZES[frame.camera])[::-1]))), 1)
+        if frame.camera in alone:
+            row["one_object"] = len(sizes) == 1
         if frame.camera in TOGETHER:
             mine, others = ([int(report.labels[0][pixel]) for pixel in pixels] for pixels in TOGETHER[frame.camera])
             row["one_object"] = len(set(mine)) == 1 and mine[0] > 0 and mine[0] not in others
@@ -357,12 +366,15 @@ def markdown(result: dict) -> str:
     lines = ["# Perception, measured", ""]
     if "osd" in result:
         part = result["osd"]
-        m = part["measures"]
         lines += [
             f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects of {len(part['scenes'])} scenes; above 0.75: {part['above_0.75']:.1%}.",
-            "Mean of the scenes, in percent: overlap P {:.1f}, R {:.1f}, F {:.1f}; boundary P {:.1f}, R {:.1f}, F {:.1f}; F@.75 {:.1f}.".format(
-                *(100 * m[f"{kind}_{what}"] for kind in ("overlap", "boundary") for what in ("precision", "recall", "f")),
-                100 * m["detected"],
+            *(
+                "{}, mean of the scenes, in percent: overlap P {:.1f}, R {:.1f}, F {:.1f}; boundary P {:.1f}, R {:.1f}, F {:.1f}; F@.75 {:.1f}.".format(
+                    where,
+                    *(100 * m[f"{kind}_{what}"] for kind in ("overlap", "boundary") for what in ("precision", "recall", "f")),
+                    100 * m["detected"],
+                )
+                for where, m in (("Whole pictures", part["measures"]), ("Where there is depth, as the labels are", part["with_depth"]))
             ),
             "",
             "| scene | objects | found | best IoU | CPU s |",
@@ -377,7 +389,10 @@ def markdown(result: dict) -> str:
     if "speed" in result:
         lines.append(speed.markdown(result["speed"]))
     if "captures" in result:
+        alone = [row["one_object"] for row in result["captures"].values() if "one_object" in row]
         lines += [
+            f"{sum(alone)} of {len(alone)} real captures in which one thing can fall apart show it as one.",
+            "",
             "| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |",
             "| --- | --- | --- | --- | --- | --- |",
         ]
@@ -456,7 +471,7 @@ def main(args: list[str] | None = None) -> None:
         if given.speed:
             result["speed"] = speed.measure(given.frames, segmenter, given.seed, given.workers)
         if given.views:
-            result["views"] = coverage.measure(given.views, given.seed)
+            result["views"] = coverage.measure(given.views, given.seed, said=lambda text: print(text, file=sys.stderr, flush=True))
         for part, folder in (
             ()
             if given.speed or given.views

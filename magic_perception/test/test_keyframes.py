@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from magic_core.mesh import Mesh
 from magic_core.scene import PICTURE, UNSEEN, Scene
 from magic_core.sensor import SMEARED, STATION, capture, looking_at
 from magic_core.shapes import make
+from magic_perception import coverage, evaluate
 from magic_perception.coverage import REGION, WRIST, compared, views
 from magic_perception.keyframes import Keyframes
 from magic_perception.pipeline import Report, perceive
@@ -202,3 +205,19 @@ def test_what_hangs_or_comes_before_the_robot_is_carried(table):
     ):
         (found,) = tracker.update(Scene((item(x, **told),), np.array([0.0, 0.0, 1.0, 0.0]), stamp)).objects
         assert found.id == "object_1" and tracker.carried(found) == carried
+
+
+def test_what_several_views_bring_is_measured(tmp_path, monkeypatch, capsys):
+    """The command on one scene and one move, to its end and its files."""
+    monkeypatch.setattr(coverage, "measure", partial(coverage.measure, moves=(0.02,)))
+    with pytest.raises(SystemExit) as end:
+        evaluate.main(["--views", "1", "--out", str(tmp_path)])
+    assert end.value.code == 0
+    told = json.loads((tmp_path / "evaluation.json").read_text())["views"]
+    one, two, five = (told["surfaces"][n] for n in ("1", "2", "5"))
+    assert one["things"] == five["things"] == 4 and five["found"] >= 3
+    assert one["seen"] <= two["seen"] + 0.02 and two["seen"] < five["seen"]
+    moved = told["moved"]["20"]
+    assert moved["dropped"] == 1 and moved["of"] == 9 and moved["others_dropped"] <= 2
+    assert "| 20 | 1 of 1 |" in (tmp_path / "evaluation.md").read_text()
+    assert "scene 1 of 1" in capsys.readouterr().err
