@@ -495,10 +495,12 @@ def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> NDArr
     goes, flat = source[index], cv2.connectedComponents(own.view(np.uint8), connectivity=8)[1].ravel()
     meetings = []
     for axis in range(2):
-        one, two, here, there = (np.moveaxis(image, axis, 0)[part] for image in (goes, own) for part in (slice(None, -1), slice(1, None)))
-        meet = here & there & (one != two)
-        meetings.append(np.column_stack([one[meet], two[meet]]))
-    a, b = np.unique(np.sort(np.concatenate(meetings), axis=1), axis=0).T
+        one, two, here, there, first, second = (
+            np.moveaxis(image, axis, 0)[part] for image in (goes, own, seen) for part in (slice(None, -1), slice(1, None))
+        )
+        meet = here & there & (one != two) & ~(first & second)
+        meetings.append(np.minimum(one[meet], two[meet]) * own.size + np.maximum(one[meet], two[meet]))
+    a, b = np.divmod(np.unique(np.concatenate(meetings)), own.size)
     (v0, u0), (v1, u1) = (np.divmod(i, own.shape[1]) for i in (a, b))
     z0, z1, apart = z.ravel()[a].astype(float), z.ravel()[b].astype(float), np.hypot(u1 - u0, v1 - v0)
     k = looked.frame.intrinsics

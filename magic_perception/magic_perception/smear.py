@@ -163,17 +163,21 @@ def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float
     Where a thing meets the table towards the camera depth goes on.
     """
     size = (2 * BESIDE + 1,) * 2
-    seen = ~mask & np.isfinite(depth)
-    far = cv2.dilate(np.where(seen, depth, np.float32(0)).astype(np.float32), np.ones(size, np.uint8))
-    outside = cv2.blur((~mask).astype(np.float32), size)
-    far[cv2.blur(seen.astype(np.float32), size) < 0.5 * outside] = np.inf
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    cut = (slice(max(y - BESIDE, 0), y + h + BESIDE), slice(max(x - BESIDE, 0), x + w + BESIDE))
+    own, z = mask[cut], depth[cut]
+    seen = ~own & np.isfinite(z)
+    far = cv2.dilate(np.where(seen, z, np.float32(0)).astype(np.float32), np.ones(size, np.uint8))
+    far[cv2.blur(seen.astype(np.float32), size) < 0.5 * cv2.blur((~own).astype(np.float32), size)] = np.inf
     # Beyond the picture's border nothing is known.
-    within, nearest = cv2.distanceTransformWithLabels(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    within, nearest = cv2.distanceTransformWithLabels(np.pad(own, 1).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    outside = ~np.pad(own, 1)
     table = np.empty(int(nearest.max()) + 1, np.float32)
-    table[nearest[~np.pad(mask, 1)]] = np.pad(far, 1, constant_values=np.inf)[~np.pad(mask, 1)]
+    table[nearest[outside]] = np.pad(far, 1, constant_values=np.inf)[outside]
+    result = np.zeros_like(mask)
     with np.errstate(invalid="ignore"):
-        goes_on = table[nearest[1:-1, 1:-1]] - depth < STEP + within[1:-1, 1:-1] * depth / focal
-    return mask & ~goes_on
+        result[cut] = own & ~(table[nearest[1:-1, 1:-1]] - z < STEP + within[1:-1, 1:-1] * z / focal)
+    return result
 
 
 def _width(told: list[_Told], most: int) -> int:
