@@ -865,7 +865,8 @@ def _on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:
         winner[cut][rows[better], columns[better]] = label
     changed = band & (own > OFF) & np.isfinite(own) & (best < ON)
     result = np.where(changed, winner, labels)
-    return _smooth_seams(result, near)
+    # A thin bar before another thing is none of that: its pixels lie off the other's surface.
+    return np.where(best < 2 * OFF, _smooth_seams(result, near), result)
 
 
 def _off_plane(

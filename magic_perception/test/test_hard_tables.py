@@ -14,11 +14,11 @@ import scenes
 import trimesh
 
 from magic_core import sensor, transforms
-from magic_core.camera import RgbdFrame
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import DepthSegmenter, _on_surfaces
+from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces
 
 RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
 POSE = scenes.pose([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
@@ -149,3 +149,15 @@ def test_a_seam_in_steps_follows_the_surfaces():
     seams = [(image != truth) & (truth > 0) for image in (stepped, sharp)]
     assert np.count_nonzero(seams[1]) < 0.7 * np.count_nonzero(seams[0])
     assert np.array_equal(sharp > 0, stepped > 0)
+
+
+def test_a_thin_bar_before_another_thing_keeps_its_width():
+    depth = np.full((200, 200), 0.7, np.float32) + 0.0003 * np.arange(200, dtype=np.float32)[:, None]
+    labels = np.zeros((200, 200), np.int32)
+    labels[40:160, 40:160] = 1
+    labels[98:102, 30:170] = 2
+    depth[98:102, 30:170] -= 0.03
+    depth += np.random.default_rng(0).normal(0, 0.001, depth.shape).astype(np.float32)
+    frame = RgbdFrame(np.zeros((200, 200, 3), np.uint8), depth, Intrinsics(200, 200, 600.0, 600.0, 100.0, 100.0), np.eye(4), "camera")
+    look = Looked(frame, depth, depth, np.ones_like(labels, bool), np.full_like(depth, 0.0015))
+    assert np.array_equal(_on_surfaces(labels, look), labels)
