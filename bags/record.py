@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from magic_core.sensor import D435, SMEARED, STATION, DepthModel, capture, looki
 from magic_core.shapes import Shape, make
 from magic_core.shapes.fixtures import demonstrated_pose, fixtures, pose_data
 from magic_core.strategy import Physics, Strategy, Waypoint
+from magic_core.testing.hand import coming, hand
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,8 @@ PICKED_UP_FROM = {
 }
 LYING_FRAMES = 2
 REST, TAKE = 0.6, 3.4
+#: By a bare hand: it comes so long (s) before the tool moves.
+HAND_COMES = 0.3
 
 #: Where the cameras stand.
 CAMERAS = STATION
@@ -290,8 +294,37 @@ def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, 
 # ---------------------------------------------------------------- demonstrations
 
 
-def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array], model: DepthModel) -> None:
-    """The tool lying, taken up and in use: its pose and the target's over time, the target moved by physics, seen by both cameras."""
+@dataclass(frozen=True)
+class Bare:
+    """A demonstration by a bare hand: tool_from_grip (4, 4), where it holds the tool and its frame there (:mod:`magic_core.testing.hand`);
+    thick: the handle's thickness (m); pictures a second."""
+
+    tool_from_grip: Array
+    thick: float
+    rate: float = 10.0
+
+
+def gripped(tool: Shape) -> tuple[Array, float]:
+    """Where a hand takes a tool that lies, by its end farthest from its middle of mass; and how thick it is there (m)."""
+    vertices, middle = tool.mesh.vertices, tool.mesh.to_trimesh().center_mass
+    level = vertices[:, :2] - middle[:2]
+    away = np.linalg.norm(level, axis=1)
+    end = level[int(np.argmax(away))] / away.max()
+    far = vertices[level @ end > away.max() - 0.05]
+    low, high = far.min(axis=0), far.max(axis=0)
+    x = np.array([-end[0], -end[1], 0.0])
+    across = far @ np.array([-x[1], x[0], 0.0])
+    place = (low + high) / 2 + 0.02 * x
+    return transforms.frame(place, x, [0.0, 0.0, 1.0]), float(max(np.ptp(across), high[2] - low[2]))
+
+
+def record_demonstration(
+    path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array], model: DepthModel, bare: Bare | None = None
+) -> None:
+    """The tool lying, taken up and in use: its pose and the target's over time, the target moved by physics, seen by both cameras.
+
+    bare: by a hand, all of the time and with nothing that tells the tool's pose.
+    """
     made = {
         key: make(strategy.environment[key]["family"], strategy.environment[key]["seed"], **strategy.environment[key]["parameters"])
         for key in ("tool", "target")
@@ -350,6 +383,8 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
                 np.linspace(begin / POSE_PERIOD, len(poses) - 1, DEMONSTRATION_FRAMES),
             ]
         )
+        if bare is not None:
+            seen = np.arange(0, len(poses), max(1, round(1 / (bare.rate * POSE_PERIOD))))
         for index, k in enumerate(seen.round().astype(int)):
             t, tool_pose, target_pose = poses[k]
             meshes = [
@@ -357,6 +392,9 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
                 target.mesh.transformed(target_pose),
                 *(i.mesh.transformed(i.world_from_object) for i in obstacles),
             ]
+            if bare is not None and t > REST - HAND_COMES:
+                grip = tool_pose @ bare.tool_from_grip @ transforms.make(translation=coming(t - REST + HAND_COMES, HAND_COMES))
+                meshes.append(hand(bare.thick).transformed(grip))
             caster = scene_raycaster(meshes)
             frames = [
                 capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=START + 0.1 + t, raycaster=caster, model=model)
@@ -366,11 +404,10 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
             events += [(f.stamp, bag.frame, (f,)) for f in frames]
         for t, tool_pose, target_pose in poses:
             stamp = START + 0.1 + t
-            events += [
-                (stamp, bag.pose, ("/demonstration/tool_pose", tool_pose, stamp)),
-                (stamp, bag.pose, ("/demonstration/target_pose", target_pose, stamp)),
-                (stamp, bag.joints, (stamp,)),
-            ]
+            if bare is None:
+                events.append((stamp, bag.pose, ("/demonstration/tool_pose", tool_pose, stamp)))
+                events.append((stamp, bag.pose, ("/demonstration/target_pose", target_pose, stamp)))
+            events.append((stamp, bag.joints, (stamp,)))
         bag.cameras(first, START)
         known: list[SceneObject] = list(obstacles)
         if strategy.physics.target_is_fixed:
@@ -381,11 +418,13 @@ def record_demonstration(path: Path, strategy: Strategy, seed: int, cameras: dic
             action(*arguments)
     things = [Thing("tool", tool, poses[0][1]), Thing("target", target, world_from_target, strategy.physics.target_is_fixed)]
     things += [Thing(item.id, shapes[item.id], item.world_from_object, True) for item in obstacles]
-    _write_truth(path, seed, things)
+    _write_truth(path, seed, things, poses if bare is not None else [])
 
 
-def _write_truth(path: Path, seed: int, things: list[Thing]) -> None:
-    data = {"seed": seed, "objects": [t.truth() for t in things]}
+def _write_truth(path: Path, seed: int, things: list[Thing], poses: Sequence[tuple[float, Array, Array]] = ()) -> None:
+    data: dict[str, object] = {"seed": seed, "objects": [t.truth() for t in things]}
+    if poses:
+        data["tool"] = [{"stamp": START + 0.1 + t, "world_from_object": pose_data(tool_pose)} for t, tool_pose, _ in poses]
     (path / "truth.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
 
 
@@ -402,22 +441,29 @@ NAMES = (*SCENES, *(f"{name}_demonstration" for name in SCENES))
 OTHERS = ("toppling", "toppling_demonstration")
 
 
-def record(name: str, out: Path, seed: int = 0) -> Path:
+def record(name: str, out: Path, seed: int = 0, bare: bool = False) -> Path:
     """Record one bag of :data:`NAMES` or :data:`OTHERS` into a folder of its name; an older one is replaced."""
     path = out / name
     if path.exists():
         shutil.rmtree(path)
     out.mkdir(parents=True, exist_ok=True)
+
+    def by_hand(strategy: Strategy) -> Bare | None:
+        made = strategy.environment["tool"]
+        tool = make(made["family"], made["seed"], **made["parameters"])
+        return Bare(*gripped(tool)) if bare else None
+
     if name in SCENES:
         scene, cameras, model = SCENES[name]
         record_scene(path, scene(seed), seed, cameras, model)
     elif name == "toppling":
         record_scene(path, toppling_scene(seed), seed, CAMERAS, SMEARED)
     elif name == "toppling_demonstration":
-        record_demonstration(path, toppling(), seed, CAMERAS, SMEARED)
+        record_demonstration(path, toppling(), seed, CAMERAS, SMEARED, by_hand(toppling()))
     else:
         task = name.removesuffix("_demonstration")
-        record_demonstration(path, make_strategies.STRATEGIES[task](), seed, SCENES[task][1], DepthModel())
+        strategy = make_strategies.STRATEGIES[task]()
+        record_demonstration(path, strategy, seed, SCENES[task][1], SMEARED if bare else DepthModel(), by_hand(strategy))
     return path
 
 
@@ -426,18 +472,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Record the bags of this folder.")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder that gets one folder for each bag")
     parser.add_argument("--seed", type=int, default=0, help="seed of objects and sensor noise, from 0 up")
+    parser.add_argument("--bare-hand", action="store_true", help="demonstrations by a hand, seen by cameras alone")
     parser.add_argument(
-        "names",
-        nargs="*",
-        metavar="NAME",
-        help=f"which of {', '.join(NAMES)}; all of them by default; or of {', '.join(OTHERS)}",
+        "names", nargs="*", metavar="NAME", help=f"which of {', '.join(NAMES)}; all of them by default; or of {', '.join(OTHERS)}"
     )
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in (*NAMES, *OTHERS)]
     if unknown:
         parser.error(f"unknown bag {unknown[0]!r} (allowed: {', '.join((*NAMES, *OTHERS))})")
     for name in options.names or NAMES:
-        path = record(name, options.out, options.seed)
+        path = record(name, options.out, options.seed, options.bare_hand)
         size = sum(f.stat().st_size for f in path.iterdir())
         print(f"recorded {path}: {size / 1e6:.1f} MB")
     return 0

@@ -3,7 +3,9 @@
 How to record one: tool and target lie apart on the table, both cameras see them; start the recording; take the tool and use it; stop.
 The bag holds the cameras' topics, the static transforms, calibrated fixtures on ``known_objects`` if there are any, and the
 motion of the tool: stamped poses of any frame that is fixed to it (a marker, a motion capture body) on a topic, or a frame of
-/tf (a marker's, or the hand's, with robot_state_publisher running, where the arm is led by hand with the tool in the gripper).
+/tf (a marker's, or the hand's, with robot_state_publisher running, where the arm is led by hand with the tool in the gripper).  Where
+neither is in the bag (or with --track) the tool's own shape is followed through the pictures: a bare hand will do, pictures at 10 a
+second or more, and the hand not over all of the tool.
 
 The folder is written when all of it is known to be a strategy, trial included, and not before.  Exit status: 0 it is; 1 the strategy
 does not do its own task, with what to change (--keep-failed leaves it as OUT.failed); 2 nothing could be learned, with what is wrong.
@@ -13,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import heapq
 import os
 import re
 import shutil
@@ -40,6 +43,8 @@ Array = NDArray[np.float64]
 COLOR, DEPTH, INFO = "color/image_raw", "aligned_depth_to_color/image_raw", "aligned_depth_to_color/camera_info"
 #: So many pictures of a topic are read: the first colour and the depth that goes with it are among them.
 PICTURES = 5
+#: Colour and depth belong together whose stamps differ by no more (s); so many of a topic wait for their other half.
+TOGETHER, WAITING = 0.02, 4
 #: Of the depth pictures after them every tenth, and of these no more than so many, evenly over the bag.
 EVERY, LATER = 10, 60
 #: The tool's track and the tool as it was first seen belong together if they are so near each other (m); so far where the tool is named.
@@ -161,6 +166,69 @@ def frames_of(bag: Recorded, world: str) -> list[RgbdFrame]:
             )
         )
     return frames
+
+
+def every_frame(bag: Recorded, world: str) -> Iterator[RgbdFrame]:
+    """Every colour picture of a bag with the depth that goes with it, of all cameras, by their stamps."""
+    from magic_bags import bag_messages
+    from magic_core import conversions
+
+    buffer, _, _ = bag.transforms()
+    cameras = _cameras(bag)
+    intrinsics = {camera: conversions.intrinsics_from_msg(bag.of(f"{camera}/{INFO}")[0]) for camera in cameras}
+    kinds = {f"{camera}/{kind}": (camera, kind) for camera in cameras for kind in (COLOR, DEPTH)}
+    waiting: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in kinds}
+    ready: list[tuple[float, int, RgbdFrame]] = []
+    for count, (topic, _, message) in enumerate(bag_messages.messages(bag.path, lambda topic, _kind: topic in kinds)):
+        camera, kind = kinds[topic]
+        stamp = conversions.time_from_msg(message.header.stamp)
+        other = f"{camera}/{DEPTH if kind == COLOR else COLOR}"
+        near = [entry for entry in waiting[other] if abs(entry[0] - stamp) <= TOGETHER]
+        if not near:
+            waiting[topic] = [*waiting[topic][-WAITING:], (stamp, message)]
+            continue
+        found = min(near, key=lambda entry: abs(entry[0] - stamp))
+        waiting[other] = [entry for entry in waiting[other] if entry[0] > found[0]]
+        color, depth = (message, found[1]) if kind == COLOR else (found[1], message)
+        at = conversions.time_from_msg(depth.header.stamp)
+        pose = buffer.lookup(world, depth.header.frame_id, at)
+        frame = RgbdFrame(conversions.color_from_msg(color), conversions.depth_from_msg(depth), intrinsics[camera], pose, camera, at)
+        heapq.heappush(ready, (at, count, frame))
+        if len(ready) > WAITING * len(cameras):
+            yield heapq.heappop(ready)[2]
+    while ready:
+        yield heapq.heappop(ready)[2]
+
+
+def left_first(scene: Scene, frames: list[RgbdFrame]) -> str:
+    """Id of the object that is the first not to be where it was: the one that a hand took.  Raises BAD_MOTION where none leaves its place."""
+    from magic_perception.following import FEWEST, THROUGH, Follower
+
+    seen = [item for item in scene.objects if item.source == "camera"]
+    followers = {item.id: Follower(item.mesh, item.world_from_object, scene.table) for item in seen}
+    for frame in sorted(frames, key=lambda f: f.stamp):
+        gone = {}
+        for item in seen:
+            on, through, _ = followers[item.id].looked_at([frame], item.world_from_object)
+            if through > max(FEWEST, THROUGH * (on + through)):
+                gone[item.id] = through / (on + through)
+        if gone:
+            return max(gone, key=lambda name: gone[name])
+    raise MagicError(Code.BAD_MOTION, "the tool", "nothing leaves its place", "a tool that a hand takes while the cameras look, or --tool")
+
+
+def followed(bag: Recorded, world: str, tool: SceneObject, table: Array) -> tuple[Array, Array]:
+    """Times (T,) in seconds and world_from_tool (T, 4, 4), by nothing but pictures; raises BAD_MOTION where the tool is lost."""
+    from magic_perception.following import follow
+
+    found = follow(tool.mesh, tool.world_from_object, table, every_frame(bag, world))
+    print(
+        f"followed {tool.id} through {len(found.times)} moments, found in {found.seen}; known to {1000 * found.shift.max():.1f} mm and "
+        f"{np.degrees(found.turn.max()):.1f} degrees or better"
+    )
+    times, poses = found.times, found.world_from_tool
+    track.check_motion(f"track of {tool.id}", times, poses)
+    return times, poses
 
 
 def later_frames(bag: Recorded, world: str) -> list[RgbdFrame]:
@@ -307,6 +375,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal")
     parser.add_argument("--tool-pose", help=f"topic with the poses of a frame fixed to the tool (default {TOOL_POSE})")
     parser.add_argument("--tool-frame", help="a frame of /tf fixed to the tool, instead")
+    parser.add_argument("--track", action="store_true", help="follow the tool itself, whatever else the bag has of its motion")
     parser.add_argument("--world", default="panda_link0", help="the arm's base frame")
     parser.add_argument("--tool", default="", help="id of the tool among the objects; by default the one that the track begins at")
     parser.add_argument("--target", default="", help="id of the target; by default the only other object")
@@ -369,7 +438,8 @@ def check_given(given: argparse.Namespace) -> None:
     for key, (what, least, greatest) in RANGES.items():
         value = getattr(given, key)
         require(least <= value <= greatest, what, value, f"{least:g} to {greatest:g}")
-    require(given.tool_pose is None or given.tool_frame is None, "--tool-pose and --tool-frame", "both", "one of them")
+    ways = [name for name in ("tool_pose", "tool_frame") if getattr(given, name) is not None] + ["track"] * given.track
+    require(len(ways) <= 1, " and ".join(f"--{name.replace('_', '-')}" for name in ways), "both", "one of them")
     for option, value, pattern in (
         ("--tool-pose", given.tool_pose, TOPIC),
         ("--tool-frame", given.tool_frame, FRAME),
@@ -409,23 +479,30 @@ def _learn(given: argparse.Namespace) -> int:
     bag = Recorded(given.bag)
     frames = frames_of(bag, given.world)
     seen = max(frame.stamp for frame in frames)
-    times, poses = track_of(bag, given.world, topic, given.tool_frame or "", since=min(frame.stamp for frame in frames))
-    if not times[0] - APART <= seen <= times[-1]:
-        raise MagicError(
-            Code.STALE_DATA,
-            "the tool's track begins after the pictures, s",
-            round(times[0] - seen, 2),
-            f"at most {APART:g}, and ends after them",
-        )
-    what = f"frame {given.tool_frame}" if given.tool_frame else topic
-    track.check_still(what, times, poses, min(frame.stamp for frame in frames), max(seen, times[0]))
+    bare = given.track or (given.tool_pose is None and given.tool_frame is None and topic not in bag.topics)
+    what = "the tool's own track" if bare else f"frame {given.tool_frame}" if given.tool_frame else topic
+    times = poses = None
+    if not bare:
+        times, poses = track_of(bag, given.world, topic, given.tool_frame or "", since=min(frame.stamp for frame in frames))
+        if not times[0] - APART <= seen <= times[-1]:
+            raise MagicError(
+                Code.STALE_DATA,
+                "the tool's track begins after the pictures, s",
+                round(times[0] - seen, 2),
+                f"at most {APART:g}, and ends after them",
+            )
+        track.check_still(what, times, poses, min(frame.stamp for frame in frames), max(seen, times[0]))
     known = conversions.scene_from_msg(bag.of("/known_objects")[-1]).objects if "/known_objects" in bag.topics else ()
     scene = perceive(frames, tuple(known))
     print(f"objects: {', '.join(item.id for item in scene.objects)}")
     for note in scene.notes:
         print(f"note: {note}")
-    first = transforms.interpolate(times, poses, [seen])[0]
-    tool, target = choose(scene, given.tool, given.target, first[:3, 3])
+    if times is None:
+        taken = given.tool or left_first(scene, later_frames(bag, given.world))
+        tool, target = choose(scene, taken, given.target, scene.find(taken).world_from_object[:3, 3])
+    else:
+        first = transforms.interpolate(times, poses, [seen])[0]
+        tool, target = choose(scene, given.tool, given.target, first[:3, 3])
     for item in (tool, target):
         if item.cut_off:
             raise MagicError(
@@ -437,6 +514,9 @@ def _learn(given: argparse.Namespace) -> int:
     fixed = given.fixed_target or target.source != "camera"
     if fixed and given.goal in ("hook", "scoop"):
         raise MagicError(Code.BAD_REQUEST, f"target of --goal {given.goal}", f"{target.id} is a known fixture", "a target that can move")
+    if times is None:
+        times, poses = followed(bag, given.world, tool, scene.table)
+        first = transforms.interpolate(times, poses, [seen])[0]
     # What is tracked is fixed to the tool, wherever on it.
     later = times > seen
     times = np.concatenate([[seen], times[later]])

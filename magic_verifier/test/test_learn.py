@@ -31,7 +31,7 @@ from magic_matcher.features import load as load_features
 from magic_matcher.matching import Matcher
 from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
-from magic_verifier.learn import Recorded, choose, main, track_of, write
+from magic_verifier.learn import Recorded, choose, every_frame, left_first, main, track_of, write
 from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import verify
 
@@ -249,9 +249,55 @@ def test_what_is_not_clear_is_asked_for():
     assert error.value.code == Code.NO_OBJECTS
 
 
+TINY = Intrinsics(106, 60, 76.9, 76.9, 53.0, 30.0)
+STATION = {"left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
+
+
+def test_the_tool_is_what_leaves_its_place_first():
+    scene = scene_of(("object_1", 0.4), ("object_2", 0.6))
+    meshes = {item.id: item.mesh.transformed(item.world_from_object) for item in scene.objects}
+    there = {0.0: ("object_1", "object_2"), 1.0: ("object_1", "object_2"), 2.0: ("object_1",), 3.0: ()}
+    frames = [
+        capture(
+            [meshes[name] for name in names], Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0), pose, [1, n], camera=camera, stamp=stamp
+        )
+        for stamp, names in there.items()
+        for n, (camera, pose) in enumerate(STATION.items())
+    ]
+    assert left_first(scene, frames[::-1]) == "object_2"  # in whatever order they come
+    with pytest.raises(MagicError, match="nothing leaves its place"):
+        left_first(scene, frames[:4])
+
+
+def test_every_picture_finds_its_depth_and_its_place_in_time(tmp_path):
+    """Two cameras that are not in step; of one the colour comes last, and one picture never gets its depth."""
+    from magic_bags.recording import Recording
+
+    caster = scene_raycaster([])
+    frames = [
+        capture([], TINY, pose, [k, n], camera=name, stamp=100.0 + 0.1 * k + 0.033 * n, raycaster=caster)
+        for k in range(8)
+        for n, (name, pose) in enumerate(STATION.items())
+    ]
+    with Recording(tmp_path / "bag") as bag:
+        bag.cameras(frames[:2], 99.9)
+        for index, frame in enumerate(frames):
+            messages = list(conversions.frame_to_msgs(frame).items())
+            for topic, message in messages[:: -1 if frame.camera == "left" else 1]:
+                if index != 5 or "depth" not in topic or "info" in topic:
+                    bag.write(f"/camera/{frame.camera}/{topic}", message, frame.stamp)
+    found = list(every_frame(Recorded(tmp_path / "bag"), "panda_link0"))
+    wanted = [frame for index, frame in enumerate(frames) if index != 5]
+    assert [(f.camera, round(f.stamp, 3)) for f in found] == [(f"/camera/{f.camera}", round(f.stamp, 3)) for f in wanted]
+    for read, written in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(read.color, written.color)
+        np.testing.assert_allclose(read.depth, written.depth, atol=1e-6)
+        np.testing.assert_allclose(read.world_from_camera, written.world_from_camera, atol=1e-6)
+
+
 def test_a_ring_that_the_cameras_see_is_pulled_by_its_inside():
     shown = ring_pulling()
-    cameras = {"left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
+    cameras = STATION
     caster = scene_raycaster([item.mesh.transformed(item.world_from_object) for item in (shown.tool, shown.target)])
     small = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
     frames = [capture([], small, pose, [3, n], camera=name, raycaster=caster) for n, (name, pose) in enumerate(cameras.items())]

@@ -1,0 +1,427 @@
+"""Where a tool is while a hand uses it, by nothing but pictures: its own mesh is followed through RGB-D frames.
+
+The tool lies and is seen whole first; its mesh and pose there are known.  From frame to frame the pose is predicted (constant
+velocity, disturbed as a hand disturbs it) and corrected by what the frame shows of the tool:
+
+* measured points near the surface lie on it: their signed distance s(p) is a residual, its gradient the direction;
+* where the model should be seen and the camera looks through to what is behind, the model's point is moved to the nearest pixel
+  that is not background: a flat tool that slides in its own plane is held by its outline.
+
+What is nearer to the camera than the model hides it and says nothing: that is the hand, and whatever else comes between.  Points of
+the hand that touch the tool are told by their colour, where the tool has another, and by a loss that gives up what is far (Geman and
+McClure).  Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  An extended
+Kalman filter on SE(3) with velocities goes forward, a Rauch-Tung-Striebel smoother back.
+
+The track is lost, and refused, where too much of the model is looked through, or where what is seen leaves it as uncertain as
+:data:`UNSURE`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from magic_core import transforms
+from magic_core.camera import RgbdFrame
+from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
+
+Array = NDArray[np.float64]
+#: Spectral densities of a hand's accelerations: m^2/s^3 and rad^2/s^3.  It takes up 0.5 m/s and 3 rad/s within a quarter of a second.
+JERKY, TWISTY = 1.0, 36.0
+#: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).
+START = (0.001, 0.005, 0.01, 0.05)
+#: Standard deviation (m) of a measured point from the reconstructed surface, and of an outline; errors hold together over a patch, so
+#: that the points of a frame count as so many at most.
+NOISE, OUTLINE, WORTH = 0.004, 0.005, 60.0
+#: Points farther from the surface than this are not the tool's (m): when the search begins, and when it ends.
+REACH, CLOSE = 0.030, 0.010
+ROUNDS = 10
+#: ... and where that does not find the tool; so few points looked through say that it is found.
+FAR, CLEAR = 0.06, 0.10
+#: Pictures whose stamps differ by no more (s) are of one moment.
+AT_ONCE = 0.01
+#: Measured points used of a frame, and points of the surface that stand for the model.
+USED, SURFACE = 700, 900
+#: A camera looks through where it measures more than this (m) behind the model; what is so much nearer hides it.
+BEHIND = 0.012
+#: What is nearer to the table than this is taken for it (m).
+TABLE = 0.004
+#: How far from the outline a point that is looked through may be (pixels).
+ASTRAY = 25
+#: A point has another colour than the tool beyond so many standard deviations of the tool's own (L*a*b*, without L*), each at least FAINT.
+OTHER, FAINT = 4.0, 5.0
+#: Of the points that should be seen, so many may be looked through; fewer than FEWEST say nothing.
+THROUGH, FEWEST = 0.35, 25
+#: A frame in which the tool was not found is left out; so long (s) none may be.
+BLIND = 0.4
+#: As unsure as a track may be: standard deviations, m and rad.
+UNSURE = (0.006, np.deg2rad(4.0))
+
+
+@dataclass(frozen=True)
+class Followed:
+    """times (T,) of the moments, s; world_from_tool (T, 4, 4); shift (T,) m and turn (T,) rad: standard deviations, of the worst direction;
+    seen: moments in which the tool was found."""
+
+    times: Array
+    world_from_tool: Array
+    shift: Array
+    turn: Array
+    seen: int
+
+
+@dataclass
+class _State:
+    """Pose (4, 4) and velocity (6,): of the middle, and the rotation vector's, in the world; covariance (12, 12)."""
+
+    pose: Array
+    velocity: Array
+    covariance: Array
+
+    def moved(self, middle: Array, change: Array) -> _State:
+        """Changed by (12,), at the middle (3,) of the tool, in the tool's frame."""
+        return _State(_moved(self.pose, middle, change[:6]), self.velocity + change[6:], self.covariance)
+
+
+def _moved(pose: Array, middle: Array, change: Array) -> Array:
+    """The pose with the tool's middle shifted by change[:3] and the tool turned about it by change[3:]."""
+    turned = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
+    centre = transforms.apply(pose, middle) + change[:3]
+    return transforms.make(turned, centre - turned @ middle)
+
+
+def _apart(pose: Array, other: Array, middle: Array) -> Array:
+    """(6,): what takes ``other`` to ``pose``; the inverse of :func:`_moved`."""
+    shift = transforms.apply(pose, middle) - transforms.apply(other, middle)
+    return np.concatenate([shift, Rotation.from_matrix(pose[:3, :3] @ other[:3, :3].T).as_rotvec()])
+
+
+def _predicted(state: _State, middle: Array, step: float) -> tuple[_State, Array]:
+    """The state ``step`` seconds later, and the transition (12, 12)."""
+    transition = np.eye(12)
+    transition[:6, 6:] = step * np.eye(6)
+    density = np.repeat([JERKY, TWISTY], 3)
+    noise = np.block(
+        [[np.diag(density * step**3 / 3), np.diag(density * step**2 / 2)], [np.diag(density * step**2 / 2), np.diag(density * step)]]
+    )
+    pose = _moved(state.pose, middle, step * state.velocity)
+    return _State(pose, state.velocity.copy(), transition @ state.covariance @ transition.T + noise), transition
+
+
+class Follower:
+    """One tool's mesh, ready to be found in frames.
+
+    mesh: closed, in its own frame; world_from_tool (4, 4) where it lies; table (4,): plane with its unit normal up.
+    """
+
+    def __init__(self, mesh: Mesh, world_from_tool: Array, table: Array, seed: int = 0) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        sampled = mesh.to_trimesh()
+        rng = np.random.default_rng(seed)
+        corners = np.asarray(sampled.triangles)
+        crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(crosses, axis=1)
+        face = rng.choice(len(areas), SURFACE, p=areas / areas.sum())
+        self._points = np.einsum("ni,nij->nj", rng.dirichlet(np.ones(3), SURFACE), corners[face])
+        self._normals = crosses[face] / areas[face][:, None]
+        self.middle = mesh.bounds.mean(axis=0)
+        self._radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
+        self._table = np.asarray(table, dtype=float)
+        self._lying = np.asarray(world_from_tool, dtype=float)
+        self._color: tuple[Array, Array] | None = None
+        self._rng = rng
+
+    # ------------------------------------------------------------ one frame
+
+    def learn_color(self, frame: RgbdFrame) -> None:
+        """Take the tool's colour from a frame in which it lies as it was first seen; one whose colour varies much is told by none."""
+        lab, found = _lab(frame), []
+        points, pixels = self._measured(frame, self._lying)
+        if len(points):
+            near = np.abs(self._distance(points, self._lying)[0]) < CLOSE / 2
+            found = lab[pixels[near, 1], pixels[near, 0], 1:]
+        if len(found) >= FEWEST:
+            spread = 1.48 * np.median(np.abs(found - np.median(found, axis=0)), axis=0)
+            self._color = np.median(found, axis=0), np.maximum(spread, FAINT)
+
+    def _distance(self, points: Array, pose: Array) -> tuple[Array, Array]:
+        """Signed distance (N,) of world points from the surface, and its gradient (N, 3) in the world."""
+        local = transforms.apply(transforms.inverse(pose), points).astype(np.float32)
+        tensor = o3d.core.Tensor(local)
+        closest = self._scene.compute_closest_points(tensor)
+        foot = closest["points"].numpy().astype(float)
+        signed = self._scene.compute_signed_distance(tensor).numpy().astype(float)
+        away = local - foot
+        length = np.linalg.norm(away, axis=1)
+        gradient = np.where(
+            length[:, None] > 2e-4,
+            np.sign(signed)[:, None] * away / np.maximum(length, 1e-9)[:, None],
+            closest["primitive_normals"].numpy(),
+        )
+        return signed, gradient @ pose[:3, :3].T
+
+    def _measured(self, frame: RgbdFrame, pose: Array) -> tuple[Array, NDArray[np.int64]]:
+        """World points (N, 3) above the table about the tool, and their pixels (N, 2)."""
+        camera = transforms.apply(transforms.inverse(frame.world_from_camera), transforms.apply(pose, self.middle))
+        if camera[2] < 0.1:
+            return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
+        centre = frame.intrinsics.project(camera)
+        reach = (self._radius + FAR) * frame.intrinsics.fx / camera[2] * 1.2
+        height, width = frame.depth.shape
+        u0, v0 = np.maximum(np.floor(centre - reach), 0).astype(int)
+        u1, v1 = np.minimum(np.ceil(centre + reach), [width - 1, height - 1]).astype(int)
+        if u1 <= u0 or v1 <= v0:
+            return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
+        depth = frame.depth[v0 : v1 + 1, u0 : u1 + 1]
+        v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
+        z = depth[v, u].astype(float)
+        pixels = np.column_stack([u + u0, v + v0])
+        rays = np.column_stack(
+            [
+                (pixels[:, 0] - frame.intrinsics.cx) / frame.intrinsics.fx,
+                (pixels[:, 1] - frame.intrinsics.cy) / frame.intrinsics.fy,
+                np.ones(len(z)),
+            ]
+        )
+        points = transforms.apply(frame.world_from_camera, rays * z[:, None])
+        about = np.linalg.norm(points - transforms.apply(pose, self.middle), axis=1) < self._radius + FAR
+        about &= points @ self._table[:3] + self._table[3] > TABLE
+        return points[about], pixels[about]
+
+    def _own_color(self, frame: RgbdFrame, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
+        if self._color is None or not len(pixels):
+            return np.ones(len(pixels), bool)
+        seen = _lab(frame)[pixels[:, 1], pixels[:, 0], 1:]
+        return np.linalg.norm((seen - self._color[0]) / self._color[1], axis=1) < OTHER * np.sqrt(2)
+
+    def _model(self, frame: RgbdFrame, pose: Array) -> tuple[Array, Array, NDArray[np.int64], Array]:
+        """Points of the surface that face the camera and that the tool itself does not hide, in the picture: world (N, 3), depth (N,), pixels (N, 2), pixels
+        as numbers (N, 2)."""
+        points = transforms.apply(pose, self._points)
+        eye = frame.world_from_camera[:3, 3]
+        facing = ((eye - points) * (self._normals @ pose[:3, :3].T)).sum(axis=1) > 0
+        local = transforms.apply(transforms.inverse(pose), eye)
+        rays = np.concatenate([np.tile(local, (len(self._points), 1)), self._points - local], axis=1).astype(np.float32)
+        first = self._scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+        points = points[facing & (first > 1 - 2e-3)]
+        camera = transforms.apply(transforms.inverse(frame.world_from_camera), points)
+        fine = camera[:, 2] > 0.1
+        points, camera = points[fine], camera[fine]
+        places = frame.intrinsics.project(camera)
+        pixels = np.round(places).astype(int)
+        height, width = frame.depth.shape
+        inside = (pixels >= 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
+        return points[inside], camera[inside, 2], pixels[inside], places[inside]
+
+    def looked_at(self, frames: Sequence[RgbdFrame], pose: Array) -> tuple[int, int, int]:
+        """Points of the model by what the frames show there: the tool, what is behind it, what hides it."""
+        counts = np.zeros(3, dtype=int)
+        for frame in frames:
+            _, depth, pixels, _ = self._model(frame, pose)
+            seen = frame.depth[pixels[:, 1], pixels[:, 0]]
+            known = np.isfinite(seen) & (seen > 0)
+            gap = seen[known] - depth[known]
+            counts += [(np.abs(gap) <= BEHIND).sum(), (gap > BEHIND).sum(), (gap < -BEHIND).sum()]
+        on, through, hidden = (int(count) for count in counts)
+        return on, through, hidden
+
+    def _information(self, frame: RgbdFrame, pose: Array, measured: tuple[Array, NDArray[np.bool_]], reach: float) -> tuple[Array, Array]:
+        """What a frame says at a pose: (6, 6) and (6,), of a change of the pose as :func:`_moved` takes it."""
+        middle = transforms.apply(pose, self.middle)
+        points, own = measured
+        matrix, vector = np.zeros((6, 6)), np.zeros(6)
+        if len(points):
+            signed, gradient = self._distance(points, pose)
+            near = (np.abs(signed) < reach) & own
+            if near.sum() >= 6:
+                # Points move with the tool's frame the other way: a shift of the tool by d lowers the distance by gradient . d.
+                jacobian = np.concatenate([gradient[near], np.cross(points[near] - middle, gradient[near])], axis=1)
+                matrix, vector = _add(matrix, vector, jacobian, signed[near], NOISE, reach)
+        on, depth, pixels, places = self._model(frame, pose)
+        if len(on):
+            crop = _crop(pixels, frame.depth.shape, ASTRAY)
+            v0, v1, u0, u1 = crop
+            seen = frame.depth[v0:v1, u0:u1]
+            # Background: measured, and behind all of the tool that may be near; what is lost or nearer is not.
+            plane = _plane_depth(frame, self._table, crop)
+            behind = np.isfinite(seen) & (seen > 0) & ((seen > depth.max() + BEHIND) | (np.abs(seen - plane) < 2 * TABLE))
+            local = pixels - [u0, v0]
+            through = behind[local[:, 1], local[:, 0]] & (frame.depth[pixels[:, 1], pixels[:, 0]] > depth + BEHIND / 2)
+            if through.any() and not behind.all():
+                away, label = cv2.distanceTransformWithLabels(behind.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+                v, u = np.nonzero(~behind)
+                nearest = np.zeros((int(label.max()) + 1, 2))
+                nearest[label[v, u]] = np.column_stack([u, v])
+                rows = local[through]
+                far = away[rows[:, 1], rows[:, 0]]
+                goal = nearest[label[rows[:, 1], rows[:, 0]]] + [u0, v0]
+                step = goal - places[through]
+                length = np.linalg.norm(step, axis=1)
+                fits = (far < ASTRAY) & (length > 0.3)
+                if fits.any():
+                    direction = step[fits] / length[fits][:, None]
+                    scale = depth[through][fits] / frame.intrinsics.fx
+                    axis = direction @ frame.world_from_camera[:3, :2].T
+                    lever = on[through][fits] - middle
+                    jacobian = np.concatenate([axis, np.cross(lever, axis)], axis=1)
+                    matrix, vector = _add(matrix, vector, jacobian, length[fits] * scale, OUTLINE, REACH)
+        return matrix, vector
+
+    def correct(self, frames: Sequence[RgbdFrame], state: _State, before: Array) -> tuple[_State, bool]:
+        """The state after the frames of one moment, and whether the tool was found in them; before (4, 4): where it was last."""
+        measured = []
+        for frame in frames:
+            points, pixels = self._measured(frame, state.pose)
+            own = self._own_color(frame, pixels)
+            if len(points) > USED:
+                chosen = self._rng.choice(len(points), USED, replace=False)
+                points, own = points[chosen], own[chosen]
+            measured.append((points, own))
+        best, least = None, 1.0
+        # A hand that stops or turns is not where it was going: then from where the tool was, and from farther off.
+        for start, reach in ((state.pose, REACH), (before, REACH), (state.pose, FAR), (before, FAR)):
+            fitted = self._fitted(frames, measured, state, start, reach)
+            on, through, _ = self.looked_at(frames, fitted.pose)
+            share = through / max(on + through, 1)
+            if on >= FEWEST and share <= THROUGH and share < least:
+                best, least = fitted, share
+            if best is not None and least < CLEAR:
+                break
+        return (state, False) if best is None else (best, True)
+
+    def _fitted(
+        self, frames: Sequence[RgbdFrame], measured: list[tuple[Array, NDArray[np.bool_]]], state: _State, start: Array, far: float
+    ) -> _State:
+        """The most likely state by what is expected and what is seen, sought from a pose (4, 4)."""
+        prior = np.linalg.inv(state.covariance)
+        pose, velocity = start, state.velocity
+        matrix = prior
+        for turn in range(ROUNDS):
+            reach = CLOSE + (far - CLOSE) * max(0.0, 1 - 2 * turn / ROUNDS)
+            off = np.concatenate([_apart(pose, state.pose, self.middle), velocity - state.velocity])
+            matrix, vector = prior.copy(), -prior @ off
+            for frame, seen in zip(frames, measured, strict=True):
+                information, pull = self._information(frame, pose, seen, reach)
+                matrix[:6, :6] += information
+                vector[:6] += pull
+            change = np.linalg.solve(matrix, vector)
+            pose, velocity = _moved(pose, self.middle, change[:6]), velocity + change[6:]
+            if reach == CLOSE and np.abs(change[:6]).max() < 2e-5:
+                break
+        return _State(pose, velocity, np.linalg.inv(matrix))
+
+
+def _add(matrix: Array, vector: Array, jacobian: Array, residual: Array, noise: float, reach: float) -> tuple[Array, Array]:
+    weight = (1 / (1 + (residual / (reach / 2)) ** 2)) ** 2 / noise**2
+    weight *= min(1.0, WORTH / len(residual))
+    return matrix + (jacobian * weight[:, None]).T @ jacobian, vector + (jacobian * weight[:, None]).T @ residual
+
+
+def _lab(frame: RgbdFrame) -> NDArray[np.float32]:
+    return cv2.cvtColor(frame.color, cv2.COLOR_RGB2LAB).astype(np.float32)
+
+
+def _crop(pixels: NDArray[np.int64], shape: tuple[int, ...], margin: int) -> tuple[int, int, int, int]:
+    (u0, v0), (u1, v1) = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin + 1
+    return max(int(v0), 0), min(int(v1), shape[0]), max(int(u0), 0), min(int(u1), shape[1])
+
+
+def _plane_depth(frame: RgbdFrame, plane: Array, crop: tuple[int, int, int, int]) -> Array:
+    """Depth (h, w) of a plane of the world in a part of a picture."""
+    v0, v1, u0, u1 = crop
+    u, v = np.meshgrid(np.arange(u0, u1), np.arange(v0, v1))
+    k = frame.intrinsics
+    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u, dtype=float)], axis=-1) @ frame.world_from_camera[:3, :3].T
+    down = rays @ plane[:3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -(frame.world_from_camera[:3, 3] @ plane[:3] + plane[3]) / down
+    return np.where(depth > 0, depth, np.inf)
+
+
+def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame]) -> Followed:
+    """The tool's track through frames in the order of their stamps, of the first of which it is known that it lies at ``world_from_tool``.
+
+    Raises BAD_MOTION where it is lost, with the moment and what was seen; NO_FRAMES without two frames.
+    """
+    follower = Follower(mesh, world_from_tool, table)
+    middle = follower.middle
+    deviations = np.repeat(START, 3)
+    state = _State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(deviations**2))
+    times: list[float] = []
+    after: list[_State] = []
+    before: list[tuple[_State, Array]] = []
+    last = math.nan
+    seen = 0
+    for moment in _moments(frames):
+        now = moment[-1].stamp
+        if not times:
+            last = now
+            follower.learn_color(moment[0])
+        expected, transition = _predicted(state, middle, now - times[-1] if times else 0.0)
+        state, found = follower.correct(moment, expected, state.pose)
+        times.append(now)
+        if found:
+            seen += 1
+            last = now
+        elif now - last > BLIND:
+            on, through, hidden = follower.looked_at(moment, state.pose)
+            raise MagicError(
+                Code.BAD_MOTION,
+                f"the tool is lost {last - times[0]:.2f} s after the first picture; of its surface, {now - last:.2f} s later",
+                f"{on} points seen, {through} looked through, {hidden} hidden",
+                f"at least {FEWEST} seen, at most {100 * THROUGH:.0f} % looked through: not too fast for the cameras, the hand not over all of it",
+            )
+        before.append((expected, transition))
+        after.append(state)
+    if len(times) < 2:
+        raise MagicError(Code.NO_FRAMES, "pictures to follow the tool in", len(times), "two or more")
+    smooth = _smoothed(after, before, middle)
+    shift = np.sqrt([np.linalg.eigvalsh(s.covariance[:3, :3])[-1] for s in smooth])
+    turn = np.sqrt([np.linalg.eigvalsh(s.covariance[3:6, 3:6])[-1] for s in smooth])
+    worst = int(np.argmax(np.maximum(shift / UNSURE[0], turn / UNSURE[1])))
+    if shift[worst] > UNSURE[0] or turn[worst] > UNSURE[1]:
+        raise MagicError(
+            Code.BAD_MOTION,
+            f"where the tool is {times[worst] - times[0]:.2f} s after the first picture",
+            f"known to {1000 * shift[worst]:.1f} mm and {np.degrees(turn[worst]):.1f} degrees (standard deviations)",
+            f"{1000 * UNSURE[0]:g} mm and {np.degrees(UNSURE[1]):g} degrees: more of it in sight, or more pictures a second",
+        )
+    return Followed(np.array(times), np.stack([s.pose for s in smooth]), shift, turn, seen)
+
+
+def _moments(frames: Iterable[RgbdFrame]) -> Iterator[list[RgbdFrame]]:
+    """The frames of each moment together; raises BAD_MOTION for stamps that go back."""
+    group: list[RgbdFrame] = []
+    for frame in frames:
+        if group and frame.stamp < group[-1].stamp:
+            back = f"{group[-1].stamp - frame.stamp:.3f} s back"
+            raise MagicError(Code.BAD_MOTION, f"stamp of a picture of {frame.camera}", back, "pictures in the order of their stamps")
+        if group and frame.stamp - group[0].stamp > AT_ONCE:
+            yield group
+            group = []
+        group.append(frame)
+    if group:
+        yield group
+
+
+def _smoothed(after: list[_State], before: list[tuple[_State, Array]], middle: Array) -> list[_State]:
+    """The states with what later frames say of them."""
+    result = [after[-1]]
+    for k in range(len(after) - 2, -1, -1):
+        expected, transition = before[k + 1]
+        gain = after[k].covariance @ transition.T @ np.linalg.inv(expected.covariance)
+        later = result[-1]
+        off = np.concatenate([_apart(later.pose, expected.pose, middle), later.velocity - expected.velocity])
+        covariance = after[k].covariance + gain @ (later.covariance - expected.covariance) @ gain.T
+        changed = after[k].moved(middle, gain @ off)
+        result.append(_State(changed.pose, changed.velocity, (covariance + covariance.T) / 2))
+    return result[::-1]
