@@ -27,7 +27,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
     ],
-    install_requires=["numpy<2", "scipy", "opencv-python-headless", "open3d", "shapely", "contourpy", beside("magic_core")],
+    install_requires=["numpy<2", "scipy", "opencv-python-headless", "open3d", "shapely", "contourpy", "trimesh", beside("magic_core")],
     extras_require={"dinov2": ["torch", "transformers"], "diffusion": ["torch", "transformers", "diffusers"]},
     zip_safe=False,
     maintainer="MAGIC developers",

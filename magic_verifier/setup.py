@@ -46,6 +46,7 @@ setup(
         beside("magic_bags"),
         beside("magic_server"),
     ],
+    extras_require={"maniskill": ["mani-skill", "gymnasium"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import (
@@ -12,6 +14,7 @@ from rclpy.action import (
     get_action_names_and_types,
     get_action_server_names_and_types_by_node,
 )
+from rclpy.node import NodeNameNonExistentError
 
 from magic_ros2cli import connect, messages
 from magic_ros2cli.errors import CommandError
@@ -29,6 +32,14 @@ STATUS = {
 CANCEL_TIMEOUT = 10.0
 
 
+def _of_node(ask: Callable[..., list[tuple[str, list[str]]]], node: Any, name: str, space: str) -> list[tuple[str, list[str]]]:
+    """What ``ask`` says of a node; nothing of one that has gone since it was seen."""
+    try:
+        return ask(node, name, space)
+    except NodeNameNonExistentError:
+        return []
+
+
 def action_info(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="ros2 action info", description="Print information about an action")
     parser.add_argument("action_name", help="name of the ROS action to get info (e.g. '/fibonacci')")
@@ -42,7 +53,7 @@ def action_info(arguments: list[str]) -> int:
             what: [
                 (f"{space.rstrip('/')}/{name}", types)
                 for name, space in nodes
-                for found, types in ask(node, name, space)
+                for found, types in _of_node(ask, node, name, space)
                 if found == action
             ]
             for what, ask in (

@@ -15,7 +15,9 @@ from magic_ros2cli.errors import CommandError
 def _nodes(node: Any) -> list[str]:
     """Full names of the nodes that have a lifecycle, sorted."""
     services = connect.settle(node, node.get_service_names_and_types)
-    return sorted(n.removesuffix("/get_state") for n, t in services if "lifecycle_msgs/srv/GetState" in t and n.endswith("/get_state"))
+    asked = [n for n, t in services if "lifecycle_msgs/srv/GetState" in t and n.endswith("/get_state")]
+    # A service is known by its clients, too.
+    return sorted(n.removesuffix("/get_state") for n in asked if node.count_services(n))
 
 
 def _call(node: Any, target: str, kind: Any, service: str, request: Any) -> Any:
