@@ -82,7 +82,14 @@ def test_what_is_named_is_imported(package):
 
 
 #: Imported name -> what pip calls it, where they differ.
-WHEELS = {"cv2": "opencv-python-headless", "yaml": "PyYAML", "PIL": "Pillow", "jinja2": "Jinja2", "sklearn": "scikit-learn"}
+WHEELS = {
+    "cv2": "opencv-python-headless",
+    "yaml": "PyYAML",
+    "PIL": "Pillow",
+    "jinja2": "Jinja2",
+    "sklearn": "scikit-learn",
+    "mani_skill": "mani-skill",
+}
 #: What comes with ROS, or with the workspace's build, and not from PyPI.
 OF_ROS = {"rclpy", "launch", "ament_index_python", "magic_interfaces", "rcl_interfaces", "builtin_interfaces"}
 

@@ -153,7 +153,8 @@ def test_the_node_gives_what_the_core_gives(frames):
         assert scene.frame_id == "panda_link0" and scene.stamp == pytest.approx(frames[0].stamp)
         assert [o.id for o in scene.objects] == [o.id for o in expected.objects] == ["object_1", "object_2"]
         for got, want in zip(scene.objects, expected.objects, strict=True):
-            np.testing.assert_allclose(got.mesh.vertices, want.mesh.vertices, atol=1e-6)
+            # The mean of several pictures of single precision is not each of them to the last digit: micrometres.
+            np.testing.assert_allclose(got.mesh.vertices, want.mesh.vertices, atol=1e-5)
             np.testing.assert_array_equal(got.mask, want.mask)
             assert len(got.pieces) == len(want.pieces) and got.view.kind == want.view.kind
         assert bench.markers[-1].markers[0].action == Marker.DELETEALL

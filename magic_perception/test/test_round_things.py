@@ -57,7 +57,7 @@ def lain(mesh: Mesh, roll: float, yaw: float) -> Mesh:
     return scenes.placed(mesh.transformed(side), 0.5, 0.0, yaw)
 
 
-@pytest.mark.parametrize(("seed", "roll", "yaw"), [(7002, 1.6, 0.4), (7005, 1.2, 2.2)])
+@pytest.mark.parametrize(("seed", "roll", "yaw"), [(7002, 1.6, 0.4), (7003, 1.2, 2.2)])
 def test_a_mug_on_its_side_is_a_round_body_with_an_open_handle(seed, roll, yaw):
     truth = lain(shapes.make("mug", seed).mesh, roll, yaw).painted((60, 90, 200))
     item, shape = seen(truth, ("left", "right"), poses=sensor.STATION)

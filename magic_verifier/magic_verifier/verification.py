@@ -674,7 +674,7 @@ def _verdict(task: Task, outcomes: list[Outcome], most: int, tried: int, simulat
     shown = _shown(outcomes, good, most, required, z)
     failures = reasons(task, judgements)
     code, message = judgements[shown].code, judgements[shown].message
-    before = f", for {tried} tried before" if tried else ""
+    before = f", for {tried} tried before," if tried else ""
     rate = f"{good} of {count} rollouts passed ({100 * level(tried):.3g} % interval{before} {100 * low:.0f} to {100 * high:.0f} %)"
     if success:
         code = Code.OK
