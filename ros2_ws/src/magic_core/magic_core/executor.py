@@ -8,8 +8,12 @@ import traceback
 
 from rclpy.context import Context
 from rclpy.executors import ConditionReachedException, Executor, ExternalShutdownException, ShutdownException, TimeoutException
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.logging import get_logger
 from rclpy.task import Task
+
+#: A wait that fails this many times in a row does not fail for what is just being destroyed.
+FAILED_WAITS = 100
 
 
 class ThreadedExecutor(Executor):
@@ -28,6 +32,7 @@ class ThreadedExecutor(Executor):
         self._handed: dict[concurrent.futures.Future[None], Task] = {}  # over to the threads, and not done yet
         self._taking = threading.Lock()  # held while callbacks are waited for: what is waited on must not be destroyed meanwhile
         self._closed = False
+        self._failed_waits = 0  # in a row
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for one callback, and until a thread has begun it; each at most ``timeout_sec``, s."""
@@ -38,7 +43,16 @@ class ThreadedExecutor(Executor):
             try:
                 callback, _, _ = self.wait_for_ready_callbacks(timeout_sec=timeout_sec, condition=self._is_closed)
             except (TimeoutException, ConditionReachedException, ShutdownException, ExternalShutdownException):
+                self._failed_waits = 0
                 return
+            except _rclpy.RCLError:
+                # An action server or client that another thread destroys between being listed and being waited for: rclpy leaves
+                # the dead handle in its list.  The next wait lists anew.
+                self._failed_waits += 1
+                if self._failed_waits == FAILED_WAITS:
+                    raise
+                return
+            self._failed_waits = 0
             future = self._pool.submit(self._work, callback, begun)
             self._handed[future] = callback
         future.add_done_callback(self._handed.pop)

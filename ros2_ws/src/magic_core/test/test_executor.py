@@ -6,10 +6,13 @@ import threading
 
 import pytest
 import rclpy
+from rclpy.action import ActionServer
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 from magic_core.executor import ThreadedExecutor
+from magic_interfaces.action import VerifyMotion
 
 DEADLINE = 10.0
 
@@ -33,7 +36,8 @@ class Bench:
     def close(self):
         self.release.set()
         self.executor.shutdown(DEADLINE)
-        self._thread.join(DEADLINE)
+        if self._thread.ident is not None:  # a test may spin by itself
+            self._thread.join(DEADLINE)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
@@ -106,6 +110,39 @@ def test_an_exception_out_of_a_callback_ends_nothing_else(bench, capfd):
     assert went_on.wait(DEADLINE)
     bench.close()  # now all is said
     assert "ValueError: a defect" in capfd.readouterr().err
+
+
+def test_an_action_server_destroyed_while_it_is_waited_for_ends_nothing(bench, monkeypatch):
+    server = ActionServer(bench.node, VerifyMotion, "verify_motion", lambda goal: VerifyMotion.Result(), callback_group=bench.group)
+    failed, went_on = threading.Event(), threading.Event()
+    add = server.add_to_wait_set
+
+    def destroyed(wait_set):
+        failed.set()
+        add(wait_set)
+
+    def tick():
+        if failed.is_set():
+            went_on.set()
+
+    timer(bench, tick)
+    bench.start()
+    monkeypatch.setattr(server, "add_to_wait_set", destroyed)
+    # As between the two steps of rclpy's ActionServer.destroy: the handle is gone, and the node still lists the server.
+    server._handle.destroy_when_not_in_use()
+    assert failed.wait(DEADLINE)
+    bench.node.remove_waitable(server)
+    assert went_on.wait(DEADLINE)
+
+
+def test_a_wait_that_never_succeeds_is_an_error(bench, monkeypatch):
+    def fail(**kwargs):
+        raise _rclpy.RCLError("never")
+
+    monkeypatch.setattr(bench.executor, "wait_for_ready_callbacks", fail)
+    with pytest.raises(_rclpy.RCLError, match="never"):
+        for _ in range(1000):
+            bench.executor.spin_once(0.0)
 
 
 def test_shutdown_waits_for_the_callbacks_at_work(bench):
