@@ -5,11 +5,14 @@ No ROS here.  The three stages come in as an object with the methods of
 server can hand on messages as they came.  Candidates are taken best first.  For
 each, the reflections of the strategy are tried where the match was mirrored, and
 with an arm several attempts (grasps).  The first motion that physics passes ends
-the run; every trial before it leaves a :class:`Report` with its reason.
+the run; every trial before it leaves a :class:`Report` with its reason.  While a motion
+is verified, the plan that comes next if it fails is begun; what is tried, in which
+order, and what is said of it are the same as one after the other.
 """
 
 from __future__ import annotations
 
+import copy
 import heapq
 import re
 import time
@@ -107,11 +110,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Planned:
-    """What the planner answered; ``plan`` counts only where the code is OK."""
+    """What the planner answered; ``plan`` counts only where the code is OK.  state_known: whether it begins where the arm was heard to be; else at home."""
 
     code: Code
     message: str = ""
     plan: Any = None
+    state_known: bool = True
 
 
 @dataclass(frozen=True)
@@ -142,7 +146,7 @@ class Outcome:
     """How a run ended.  ``verified`` says that physics agreed, by ``verdict``; only then may the plan be published.
 
     ``plan`` is also filled in for the best match of a strategy that simulation cannot judge; its code is OK only if the caller allowed that.
-    ``seconds`` holds the wall time of each stage and ``total``.
+    ``state_known`` is the plan's.  ``seconds`` holds the wall time for which the run waited for each stage, and ``total``.
     """
 
     code: Code
@@ -150,6 +154,7 @@ class Outcome:
     verified: bool = False
     verdict: Verdict | None = None
     plan: Any = None
+    state_known: bool = True
     tool_id: str = ""
     target_id: str = ""
     reports: tuple[Report, ...] = ()
@@ -200,6 +205,12 @@ class Stages(Protocol):
     def plan(self, request: Request, matches: Matches, trial: Trial, timeout: float) -> Planned:
         """Turn one contact into a motion."""
 
+    def expect(self, request: Request, matches: Matches, trial: Trial, timeout: float) -> None:
+        """Begin, beside what follows, the plan that will probably be asked for next; returns at once, and raises nothing."""
+
+    def forget(self) -> None:
+        """What was expected is not asked for any more; returns at once."""
+
     def verify(self, request: Request, matches: Matches, trial: Trial, plan: Any, timeout: float) -> Verdict:
         """Run a motion in physics."""
 
@@ -248,6 +259,14 @@ class Agenda:
             return
         again = Trial(trial.index, trial.candidate, trial.reflection, trial.attempt + 1)
         self._push(promise if code in GRASP_ONLY else promise / 2, again)
+
+    def foreseen(self, promise: float, trial: Trial) -> Trial | None:
+        """What will be next if a trial fails, as most that fail do: by the contact, not by the grasp alone."""
+        then = copy.copy(self)
+        then._heap = list(self._heap)
+        then.failed(promise, trial, Code.GOAL_NOT_REACHED)
+        entry = then.next()
+        return entry[1] if entry is not None else None
 
 
 def reflections_of(candidate: Any, reflections: Sequence[str]) -> tuple[str, ...]:
@@ -312,6 +331,8 @@ class Run:
         except Exception as error:  # nothing may leave the server's handler
             code, message = self._describe(error)
             return self._outcome(Code(code), message)
+        finally:
+            self._stages.forget()
 
     def _work(self) -> Outcome:
         self._tell("perceive", 0, "waiting for objects")
@@ -329,14 +350,14 @@ class Run:
             promise, trial = entry
             if self._left() < self._settings.reserve:
                 raise self._late()
-            outcome, code = self._try(matches, trial)
+            outcome, code = self._try(matches, trial, agenda.foreseen(promise, trial))
             if outcome is not None:
                 return outcome
             agenda.failed(promise, trial, code)
         summary = self._summary() or f"each of {len(matches.candidates)} candidates has been tried before"
         return self._outcome(Code.NO_CANDIDATE_SUCCEEDED, "; ".join([summary, *matches.doubts]))
 
-    def _try(self, matches: Matches, trial: Trial) -> tuple[Outcome | None, Code]:
+    def _try(self, matches: Matches, trial: Trial, following: Trial | None) -> tuple[Outcome | None, Code]:
         request = self._request
         what = f"candidate {trial.index + 1} of {len(matches.candidates)}, {trial.reflection}" + (
             f", grasp {trial.attempt + 1}" if trial.attempt else ""
@@ -351,8 +372,10 @@ class Run:
             if not request.allow_unverified:
                 message += " (allow_unverified = true accepts it)"
             self._reports.append(Report(trial, "plan", code, message, planned.plan))
-            return self._outcome(code, message, plan=planned.plan, trial=trial), code
+            return self._outcome(code, message, planned=planned, trial=trial), code
         self._tell("verify", trial.index, what)
+        if following is not None and self._left() >= self._settings.reserve:
+            self._stages.expect(request, matches, following, self._left())
         self._simulations += 1
         verdict = self._attempt("verify", trial, lambda left: self._stages.verify(request, matches, trial, planned.plan, left), Verdict)
         self._simulations += max(0, verdict.rollouts - 1)
@@ -361,7 +384,7 @@ class Run:
             return self._drop(report), verdict.code
         self._reports.append(report)
         self._tell("verify", trial.index, f"verified: {verdict.message}")
-        return self._outcome(Code.OK, verdict.message, verdict=verdict, plan=planned.plan, trial=trial), Code.OK
+        return self._outcome(Code.OK, verdict.message, verdict=verdict, planned=planned, trial=trial), Code.OK
 
     def _attempt(self, stage: str, trial: Trial, work: Callable[[float], Any], failure: Callable[[Code, str], Any]) -> Any:
         """Run a stage for one trial; an error that is the trial's own becomes its failure, others end the run."""
@@ -414,7 +437,9 @@ class Run:
         count = len(self._matches.candidates) if self._matches else 0
         self._notify(Progress(stage, index, count, message, tuple(self._reports)))
 
-    def _outcome(self, code: Code, message: str, verdict: Verdict | None = None, plan: Any = None, trial: Trial | None = None) -> Outcome:
+    def _outcome(
+        self, code: Code, message: str, verdict: Verdict | None = None, planned: Planned | None = None, trial: Trial | None = None
+    ) -> Outcome:
         matches = self._matches
         first = matches.candidates[0] if matches and matches.candidates else None
         chosen = trial.candidate if trial else first
@@ -423,7 +448,8 @@ class Run:
             message=message,
             verified=verdict is not None,
             verdict=verdict,
-            plan=plan,
+            plan=planned.plan if planned is not None else None,
+            state_known=planned is None or planned.state_known,
             tool_id=chosen.tool_id if chosen is not None else self._request.tool_id,
             target_id=matches.target_id if matches else self._request.target_id,
             reports=tuple(self._reports),

@@ -33,10 +33,14 @@ SEND_GOAL = "/_action/send_goal"
 
 
 class Token:
-    """Joins the reasons to stop waiting: something arrived, the run was canceled, the node closes."""
+    """Joins the reasons to stop waiting: something arrived, the run was canceled, the node closes.
 
-    def __init__(self) -> None:
-        self._condition = threading.Condition()
+    ``within``: a token by which this one is canceled and poked as well; that one minds nothing of this one.
+    """
+
+    def __init__(self, within: Token | None = None) -> None:
+        self._within = within
+        self._condition = threading.Condition() if within is None else within._condition
         self._canceled = self._ended = False
         self._closing = False
         self._minded: Callable[[], None] = lambda: None
@@ -64,16 +68,16 @@ class Token:
     @property
     def canceled(self) -> bool:
         """Whether :meth:`cancel` was called."""
-        return self._canceled
+        return self._canceled or (self._within is not None and self._within.canceled)
 
     @property
     def closing(self) -> bool:
         """Whether the node itself is going down."""
-        return self._closing
+        return self._closing or (self._within is not None and self._within.closing)
 
     def check(self) -> None:
         """Raise CANCELED where :meth:`cancel` was called: before something is begun that a wait would only regret."""
-        if self._canceled:
+        if self.canceled:
             raise MagicError(Code.CANCELED, "canceled")
 
     @contextmanager
@@ -97,7 +101,7 @@ class Token:
         """
         with self._condition:
             while not done():
-                if self._canceled and (heed_cancel or self._closing):
+                if self.canceled and (heed_cancel or self.closing):
                     raise MagicError(Code.CANCELED, "canceled")
                 left = deadline - time.monotonic()
                 if left <= 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any, Protocol
@@ -24,6 +24,7 @@ from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import ContactCandidate, MotionPlan, SceneObject, SceneObjectArray
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, scene_change
+from magic_server.ahead import Ahead
 from magic_server.joints import JointStates, check_range
 from magic_server.permission import Verdict, check_single
 from magic_server.remote import RemoteAction, RemoteService, Token
@@ -58,6 +59,7 @@ class Server(Protocol):
     verifier: RemoteAction
     scene: SceneObjectArray | None
     joints: JointStates
+    ahead: Ahead[pipeline.Planned]
     objects_topic: str
 
     def in_base(self, scene: SceneObjectArray) -> SceneObjectArray: ...
@@ -78,8 +80,7 @@ class Server(Protocol):
 class Stages:
     """The stages of :mod:`magic_server.pipeline`, done by the other nodes; messages pass through as they came.
 
-    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.  state_known: whether the last plan began where the arm was heard
-    to be; else it began at home.
+    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.
     """
 
     def __init__(self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool, since: float = -math.inf) -> None:
@@ -93,7 +94,6 @@ class Stages:
         self.strategy = ""
         self._seen: SceneObjectArray | None = None  # the same objects as they came
         self.scene: SceneObjectArray | None = None
-        self.state_known = False
         self.matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
         #: Motions that the verifier was asked for.
@@ -287,7 +287,43 @@ class Stages:
         return self._find(trial.candidate.tool_id)
 
     def plan(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> pipeline.Planned:
-        """Ask the planner for one trial."""
+        """Ask the planner for one trial, or take its answer where it was asked before."""
+        deadline = time.monotonic() + timeout
+        with self._minding(self._server.planner, *self._verifier()):
+            planned = self._expected(trial, deadline)
+            if planned is not None:
+                return planned
+            return self._ask_planner(request, matches, trial, max(0.0, deadline - time.monotonic()), self._token)
+
+    def expect(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> None:
+        """Ask the planner for a trial in another thread."""
+        token = Token(self._token)
+        self._server.ahead.begin(self._key(trial), lambda: self._ask_planner(request, matches, trial, timeout, token), token.cancel)
+
+    def forget(self) -> None:
+        """Cancel what the planner was asked for that nobody waits for."""
+        self._server.ahead.drop()
+
+    def _key(self, trial: pipeline.Trial) -> Hashable:
+        return self, trial.index, trial.reflection, trial.attempt
+
+    def _expected(self, trial: pipeline.Trial, deadline: float) -> pipeline.Planned | None:
+        """What the planner answered for a trial that was expected; ``None`` where it is to be asked now, which nothing stands in the way of then.
+
+        Only an answer for the trial itself counts: whatever else kept one from coming may be over.
+        """
+        future, mine = self._server.ahead.take(self._key(trial))
+        if future is None:
+            return None
+        future.add_done_callback(self._token.poke)
+        if not self._token.wait(future.done, deadline, alive=lambda: None) or not mine or future.exception() is not None:
+            return None
+        planned = future.result()
+        return None if planned.code in pipeline.FATAL else planned
+
+    def _ask_planner(
+        self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float, token: Token
+    ) -> pipeline.Planned:
         server = self._server
         timeout = min(timeout, server.settings.plan)
         goal = PlanMotion.Goal(
@@ -306,9 +342,7 @@ class Stages:
         )
         joints = server.joints.all()
         goal.start = JointState(name=list(joints), position=[j.position for j in joints.values()])
-        self.state_known = bool(joints)
-        with self._minding(server.planner, *self._verifier()):
-            result = server.planner.call(goal, timeout, self._token, server.settings.presence, server.settings.grace).result
+        result = server.planner.call(goal, timeout, token, server.settings.presence, server.settings.grace).result
         if result.code == Code.OK:
             self._check_plan(result.plan, request.variant)
         elif result.code == Code.JOINT_LIMIT:
@@ -317,7 +351,7 @@ class Stages:
                 check_range(server.robot.arm, joints)
             except MagicError as error:
                 raise pipeline.HopelessError(error.code, error.message) from error
-        return pipeline.Planned(code_of(result.code), result.message, result.plan)
+        return pipeline.Planned(code_of(result.code), result.message, result.plan, bool(joints))
 
     def _check_plan(self, plan: MotionPlan, variant: str) -> None:
         """A plan must be what was asked for, and in the robot's base frame."""

@@ -36,6 +36,7 @@ from magic_interfaces.msg import CandidateReport, MotionPlan, SceneObjectArray, 
 from magic_interfaces.srv import MatchContact
 from magic_server import interop, markers, pipeline
 from magic_server import settings as parameters
+from magic_server.ahead import Ahead
 from magic_server.arm import SLOW, Arm
 from magic_server.closed_loop import ClosedLoop, Job
 from magic_server.held import Held, HeldStages
@@ -121,6 +122,7 @@ class StrategyServer(LifecycleNode):
         self.scene: SceneObjectArray | None = None
         self.scene_came = -math.inf
         self.joints = JointStates()
+        self.ahead: Ahead[pipeline.Planned] = Ahead()
 
         self.matcher = RemoteService(self, MatchContact, "match_contact", "matcher", group)
         self.planner = RemoteAction(self, PlanMotion, "plan_motion", "planner", group)
@@ -400,6 +402,7 @@ class StrategyServer(LifecycleNode):
             result.verified = False
         finally:
             if mine:
+                self.ahead.clear()
                 self._token, self._run_id = None, ""
         if not token.end() and result.code == Code.OK:  # canceled when all was done
             result.code, result.message = int(Code.CANCELED), f"canceled: {result.message}"
@@ -546,7 +549,7 @@ class StrategyServer(LifecycleNode):
             waived=waived,
             joints=tuple(arm.joint_names) if arm is not None else (),
             start=tuple(arm.points[0].positions) if arm is not None and arm.points else (),
-            state_known=stages.state_known,
+            state_known=outcome.state_known,
             motion=Motion(plan, stages.strategy, outcome.tool_id, outcome.target_id, stages.scene.header.stamp),
             mark=mark_of(plan),
         )

@@ -16,6 +16,7 @@ from magic_core.scene import Scene, SceneObject
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.srv import MatchContact
 from magic_server import seen_goal
+from magic_server.stages import Stages
 from magic_server.testing import fakes
 from magic_server.testing.bench import Bench
 
@@ -66,7 +67,9 @@ def shared(folder):  # noqa: F811
 
 
 @pytest.fixture
-def bench(shared):
+def bench(shared, monkeypatch):
+    # Here the plans that are asked for are counted; that a plan ahead changes nothing else is tested with the stages.
+    monkeypatch.setattr(Stages, "expect", lambda *_: None)
     arm = shared.arm
     shared.fakes.clear()
     shared.feedback.clear()

@@ -20,6 +20,7 @@ class Script:
         self.candidates, self._plan, self._verify, self.cost = candidates, plan, verify, cost
         self.now = 0.0
         self.calls = []
+        self.expected = []
 
     def clock(self):
         return self.now
@@ -37,6 +38,13 @@ class Script:
         assert timeout > 0
         self.calls.append(("plan", trial.index, trial.reflection, trial.attempt))
         return Planned(self._plan(trial), "planned", plan=("plan", trial.index, trial.attempt))
+
+    def expect(self, request, matches, trial, timeout):
+        assert timeout > 0
+        self.expected.append((trial.index, trial.reflection, trial.attempt))
+
+    def forget(self):
+        self.expected.append(None)
 
     def verify(self, request, matches, trial, plan, timeout):
         self.now += self.cost
@@ -205,6 +213,46 @@ def test_what_promises_most_comes_next(scores, code, expected):
         order.append((entry[1].index, entry[1].attempt))
         agenda.failed(*entry, code)
     assert order == expected
+
+
+@pytest.mark.parametrize("variant", ["fg", "arm"])
+def test_what_comes_next_is_expected_while_a_motion_is_verified(variant):
+    script = Script([candidate(), candidate(0.6, flipped=True), candidate(0.5)], verify=lambda t: Code.DRIFT)
+    execute(script, variant)
+    *expected, end = script.expected
+    assert expected == tried(script)[1:]
+    assert end is None
+
+
+def test_a_slipped_grasp_is_not_what_is_expected():
+    script = Script([candidate(), candidate()], verify=lambda t: Code.GRASP_SLIPPED if t.attempt == 0 else Code.OK)
+    execute(script, "arm")
+    assert tried(script) == [(0, "keep", 0), (0, "keep", 1)]
+    assert script.expected == [(1, "keep", 0), (1, "keep", 0), None]
+
+
+def test_nothing_is_expected_where_nothing_follows():
+    script = Script([candidate()])
+    execute(script)
+    assert script.expected == [None]
+    script = Script([candidate(), candidate()])
+    execute(script, simulatable=False, allow=True)
+    assert script.expected == [None]
+    script = Script([candidate(), candidate()], cost=1.0)
+    execute(script, timeout=3.1)  # over before the motion is verified
+    assert script.expected == [None]
+
+
+def test_to_look_ahead_changes_nothing():
+    looked, plain = (Agenda([candidate(1.0), candidate(0.7), candidate(0.4)], ("keep",), 3) for _ in range(2))
+    while (entry := looked.next()) is not None:
+        assert entry == plain.next()
+        for _ in range(2):
+            following = looked.foreseen(*entry)
+        for agenda in (looked, plain):
+            agenda.failed(*entry, Code.NO_IK)
+        assert following == (looked._heap[0][-1] if looked._heap else None)
+    assert plain.next() is None
 
 
 def test_what_was_tried_before_is_left_out():

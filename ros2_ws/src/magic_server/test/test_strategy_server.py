@@ -1,10 +1,13 @@
 """The strategy server against stand-ins of the other nodes."""
 
+import collections
 import os
+import random
 import signal
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +25,10 @@ from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, remote
+from magic_server.joints import JointStates
 from magic_server.permission import ARM_UNKNOWN
 from magic_server.remote import Token
+from magic_server.stages import Stages
 from magic_server.strategy_server import complaint_code
 from magic_server.testing import fakes
 from magic_server.testing.bench import DEADLINE, Bench
@@ -498,8 +503,10 @@ def test_the_contacts_belong_to_the_objects_that_are_planned_with(bench):
 def test_goals_carry_what_the_servers_need(bench):
     bench.run(variant="arm", seed=7)
     names = [name for name, _ in bench.fakes.goals]
-    assert names == ["match", "plan_motion", "verify_motion"]
-    request, plan, verify = (goal for _, goal in bench.fakes.goals)
+    # The next candidate's plan is asked for while the first is verified.
+    assert names[:2] == ["match", "plan_motion"] and "verify_motion" in names[2:]
+    request, plan = (goal for _, goal in bench.fakes.goals[:2])
+    (verify,) = (goal for name, goal in bench.fakes.goals if name == "verify_motion")
     assert not request.want_heatmap  # pictures only on request
     assert (plan.tool.id, plan.target.id, plan.variant, plan.seed, plan.reflection) == ("object_1", "object_2", "arm", 7, "keep")
     assert verify.plan.arm_trajectory.points
@@ -614,7 +621,175 @@ def test_cancel_inside_a_stage_reaches_its_server(bench, stage):
     response = bench.result(handle.get_result_async())
     assert (response.result.code, response.status) == (Code.CANCELED, GoalStatus.STATUS_CANCELED)
     assert time.monotonic() - begin < 10.0
-    assert bench.fakes.canceled_goals == [stage]
+    assert bench.fakes.canceled_goals.count(stage) == 1
+
+
+class OneAtATime:
+    """A planner as the true one is: BUSY during another goal.  ``begun`` has an event for each trial (score, reflection, attempt), set by its goal; what is
+    ``held`` is planned until it is canceled."""
+
+    def __init__(self, held=()):
+        self.held = set(held)
+        self.begun = collections.defaultdict(threading.Event)
+        self.asked = []
+        self.refused = threading.Event()
+        self._busy = threading.Lock()
+
+    def __call__(self, goal, canceled):
+        trial = (goal.candidate.score, goal.reflection, goal.attempt)
+        if not self._busy.acquire(blocking=False):
+            self.refused.set()
+            return PlanMotion.Result(code=int(Code.BUSY), message="another motion is being planned")
+        try:
+            self.asked.append(trial)
+            self.begun[trial].set()
+            if trial in self.held:
+                result = fakes.FakeServers.until_canceled(PlanMotion.Result())(goal, canceled)
+                self.refused.wait(0.2)  # a search takes a while to end
+                return result
+            return fakes.FakeServers.plan(goal, canceled)
+        finally:
+            self._busy.release()
+
+
+def test_the_next_candidate_is_planned_while_the_last_one_is_verified(bench):
+    planner = bench.fakes.on_plan = OneAtATime()
+
+    def verify(goal, canceled):
+        if goal.tried == 0:
+            assert planner.begun[0.9, "keep", 0].wait(DEADLINE), "not planned before the first one is judged"
+            return VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+        assert planner.begun[0.9, "turn", 0].wait(DEADLINE)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    result, _ = bench.run()
+    assert (result.code, result.verified, result.simulations) == (0, True, 2), result.message
+    assert [(r.stage, r.code) for r in result.candidates] == [("verify", Code.DRIFT), ("verify", 0)]
+    assert planner.asked == [(1.0, "keep", 0), (0.9, "keep", 0), (0.9, "turn", 0)], "each is asked for once"
+
+
+def test_a_plan_that_was_begun_for_nothing_is_canceled(bench):
+    planner = bench.fakes.on_plan = OneAtATime(held={(0.9, "keep", 0)})
+
+    def verify(goal, canceled):
+        assert planner.begun[0.9, "keep", 0].wait(DEADLINE)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    bench.fakes.on_verify = verify
+    for count in (1, 2):  # the planner is free again for the next run
+        result, status = bench.run()
+        assert (result.code, result.verified, status) == (0, True, GoalStatus.STATUS_SUCCEEDED), result.message
+        assert bench.fakes.canceled_goals == ["plan_motion"] * count
+        planner.begun.clear()
+    bench.wait(lambda: len(bench.messages["tool"]) == 2)
+
+
+def test_another_trial_than_the_expected_one_is_planned_when_that_has_ended(bench):
+    planner = bench.fakes.on_plan = OneAtATime(held={(0.9, "keep", 0)})
+
+    def verify(goal, canceled):
+        if goal.tried:
+            return fakes.FakeServers.verify(goal, canceled)
+        assert planner.begun[0.9, "keep", 0].wait(DEADLINE)
+        return VerifyMotion.Result(code=int(Code.GRASP_SLIPPED), message="it slipped")
+
+    bench.fakes.on_verify = verify
+    result, _ = bench.run(variant="arm")
+    assert (result.code, result.verified) == (0, True), result.message
+    assert [r.code for r in result.candidates] == [Code.GRASP_SLIPPED, 0]
+    assert planner.asked[:3] == [(1.0, "keep", 0), (0.9, "keep", 0), (1.0, "keep", 1)]
+
+
+def test_a_plan_that_could_not_be_asked_for_ahead_is_asked_for_again(bench):
+    refused = threading.Event()
+
+    def plan(goal, canceled):
+        if goal.candidate.score == 0.9 and goal.reflection == "keep" and not refused.is_set():
+            refused.set()  # somebody else's motion is being planned
+            return PlanMotion.Result(code=int(Code.BUSY), message="another motion is being planned")
+        return fakes.FakeServers.plan(goal, canceled)
+
+    def verify(goal, canceled):
+        if goal.tried:
+            return fakes.FakeServers.verify(goal, canceled)
+        assert refused.wait(DEADLINE)
+        return VerifyMotion.Result(code=int(Code.DRIFT), message="it drifted")
+
+    bench.fakes.on_plan, bench.fakes.on_verify = plan, verify
+    result, _ = bench.run()
+    assert (result.code, result.verified) == (0, True), result.message
+    assert [r.code for r in result.candidates] == [Code.DRIFT, 0]
+
+
+@pytest.mark.parametrize("variant, seed", [("fg", 0), ("arm", 1), ("arm", 2), ("arm", 3)])
+def test_ahead_and_one_after_the_other_end_alike(bench, monkeypatch, variant, seed):
+    def answers(draw, *codes):
+        """An answer to each trial, the same whenever it is asked."""
+        known = {}
+        for score in (1.0, 0.9, 0.8):
+            for reflection in ("keep", "turn"):
+                for attempt in range(3):
+                    known[score, reflection, attempt] = draw.choice(codes)
+        return lambda goal: known[goal.candidate.score, goal.reflection, goal.attempt]
+
+    draw = random.Random(seed)
+    planned = answers(draw, Code.OK, Code.OK, Code.OK, Code.NO_IK, Code.NO_GRASP)
+    judged = answers(draw, Code.DRIFT, Code.GRASP_SLIPPED, Code.LOST_CONTACT, Code.OK if seed == 3 else Code.UNSTABLE)
+
+    def plan(goal, canceled):
+        result = fakes.FakeServers.plan(goal, canceled)
+        result.code, result.message = int(planned(goal)), f"{goal.candidate.score} {goal.reflection} {goal.attempt}"
+        # The motion says which trial it was made for.
+        result.plan.grasp_width = 0.01 + 0.01 * goal.attempt
+        result.plan.tool_from_tcp.position.x = 0.1 if goal.reflection == "turn" else 0.0
+        return result
+
+    def verify(goal, canceled):
+        attempt = round((goal.plan.grasp_width - 0.01) / 0.01)
+        reflection = "turn" if goal.plan.tool_from_tcp.position.x else "keep"
+        code = judged(SimpleNamespace(candidate=goal.candidate, reflection=reflection, attempt=attempt))
+        if code == Code.OK:
+            return fakes.FakeServers.verify(goal, canceled)
+        return VerifyMotion.Result(code=int(code), message=f"{goal.candidate.score} {reflection} {attempt}")
+
+    def told():
+        bench.fakes.goals.clear()
+        bench.fakes.on_plan, bench.fakes.on_verify = plan, verify
+        result, _ = bench.run(variant=variant)
+        simulated = [(g.candidate.score, g.tried, g.plan.grasp_width) for name, g in bench.fakes.goals if name == "verify_motion"]
+        reports = [(r.candidate.score, r.reflection, r.stage, r.code, r.message) for r in result.candidates]
+        return result.code, result.message, result.verified, result.simulations, reports, simulated
+
+    ahead = told()
+    monkeypatch.setattr(Stages, "expect", lambda *_: None)
+    assert ahead == told()
+
+
+def test_an_arm_that_is_heard_meanwhile_is_not_what_the_verified_motion_began_with(bench, monkeypatch):
+    planned, claims = threading.Event(), []
+    monkeypatch.setattr(bench.server, "joints", JointStates())
+
+    def plan(goal, canceled):
+        if goal.start.name:
+            planned.set()
+        return fakes.FakeServers.plan(goal, canceled)
+
+    def verify(goal, canceled):
+        assert planned.wait(DEADLINE)
+        return fakes.FakeServers.verify(goal, canceled)
+
+    expect, claim = Stages.expect, bench.server._claim
+
+    def heard_first(stages, *arguments):
+        bench.server.joints.take(fakes.JOINTS, [0.0] * 7, [0.0] * 7, time.time(), time.monotonic())
+        expect(stages, *arguments)
+
+    monkeypatch.setattr(Stages, "expect", heard_first)
+    monkeypatch.setattr(bench.server, "_claim", lambda *a: claims.append(claim(*a)) or claims[-1])
+    bench.fakes.on_plan, bench.fakes.on_verify = plan, verify
+    bench.run(variant="arm")
+    assert [c.state_known for c in claims] == [False]
 
 
 def test_cancel_while_matching(bench):
@@ -655,7 +830,7 @@ def test_a_server_that_never_finishes(folder):
         assert result.code == Code.SERVER_TIMEOUT
         assert "verifier" in result.message
         assert time.monotonic() - begin < 15.0
-        assert bench.fakes.canceled_goals == ["verify_motion"]
+        assert bench.fakes.canceled_goals.count("verify_motion") == 1
     finally:
         bench.close()
 
