@@ -20,7 +20,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
-from magic_perception import clusters, convexity, smear
+from magic_perception import attached, clusters, convexity, smear
 from magic_perception.parameters import Parameters
 from magic_perception.seams import Judge, learned
 from magic_perception.table import Plane, fit_plane, supports
@@ -639,80 +639,12 @@ def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.
     return result
 
 
-#: A part that belongs to a larger thing across a gap in depth: its largest share of the other's pixels; the widest gap and least height over the
-#: table, m; the largest difference in chromaticity (R, G, B over their sum); pixels in which both are neighbours.
-PART, GAP, LIFTED, COLOR, BESIDE = 0.2, 0.020, 0.012, 0.06, 7
-
-
 def _attached(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
-    """Small things that hang in the air beside a larger one of their colour are its parts: a handle behind a mug, across a shadow of depth.
-
-    What is carried by the other, or reaches the table, is a thing of its own.
-    """
-    from scipy.spatial import cKDTree
-
-    top = max((int(image.max()) for image in labels), default=0)
-    sizes = sum(np.bincount(image[image > 0], minlength=top + 1) for image in labels) if top else np.zeros(1, int)
-    clouds: dict[int, tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = {}
-
-    def cloud(label: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Points (N, 3), heights (N,) and the middle chromaticity (3,) of a label, which shading leaves as it is."""
-        if label not in clouds:
-            points, heights, colors = [], [], []
-            for look, image in zip(looks, labels, strict=True):
-                where = np.nonzero((image == label) & np.isfinite(look.heights))
-                step = max(1, len(where[0]) // 4000)
-                where = (where[0][::step], where[1][::step])
-                points.append(look.points(*where))
-                heights.append(look.heights[where])
-                colors.append(look.frame.color[where])
-            rgb = np.concatenate(colors).astype(np.float32)
-            clouds[label] = (
-                np.concatenate(points),
-                np.concatenate(heights),
-                np.median(rgb / np.maximum(rgb.sum(axis=1, keepdims=True), 1), axis=0),
-            )
-        return clouds[label]
-
-    owner = np.arange(top + 2)
-    for label in range(top, 0, -1):
-        if sizes[label] >= PART * sizes.max():
-            continue
-        beside: set[int] | None = None
-        for image in labels:
-            mine = image == label
-            x, y, w, h = cv2.boundingRect(mine.view(np.uint8))
-            if w == 0:
-                continue
-            cut = (slice(max(y - BESIDE, 0), y + h + BESIDE), slice(max(x - BESIDE, 0), x + w + BESIDE))
-            near = cv2.dilate(mine[cut].view(np.uint8), np.ones((BESIDE, BESIDE), np.uint8)) > 0
-            here = {int(i) for i in np.unique(image[cut][near]) if i > 0 and i != label}
-            beside = here if beside is None else beside & here
-        if not beside:
-            continue
-        points, heights, color = cloud(label)
-        if len(points) < 20 or np.percentile(heights, 10) < LIFTED:
-            continue
-        foot = points[heights <= np.percentile(heights, 25)]
-        bottom = float(np.percentile(heights, 10))
-        for other in sorted(beside, key=lambda i: -sizes[i]):
-            if sizes[label] >= PART * sizes[other]:
-                continue
-            theirs, high, shade = cloud(other)
-            if float(np.linalg.norm(color - shade)) > COLOR or float(cKDTree(theirs).query(points)[0].min()) > GAP:
-                continue
-            # Carried: the other ends at its foot.
-            below = cKDTree(theirs[:, :2]).query_ball_point(np.median(foot[:, :2], axis=0), 0.02)
-            if len(below) > 4 and bottom - 0.015 < float(np.percentile(high[below], 95)) < bottom + 0.010:
-                continue
-            owner[label] = other
-            break
-    if np.array_equal(owner, np.arange(top + 2)):
+    """Labels with the parts of one thing joined that depth or a seam has parted (:mod:`magic_perception.attached`)."""
+    owner = attached.owners(labels, looks)
+    if np.array_equal(owner, np.arange(len(owner))):
         return labels
-    for label in range(top + 1):
-        while owner[owner[label]] != owner[label]:
-            owner[label] = owner[owner[label]]
-    owner[-1] = -1
+    owner = np.append(owner, -1)
     return _sizeable([owner[image] for image in labels], looks, parameters)
 
 

@@ -67,6 +67,13 @@ def test_a_mug_on_its_side_is_a_round_body_with_an_open_handle(seed, roll, yaw):
     assert solid.bounds == pytest.approx(truth.to_trimesh().bounds, abs=0.012)
 
 
+def test_a_handle_beside_its_mug_on_the_table_is_no_thing_of_its_own():
+    truth = lain(shapes.make("mug", 7013).mesh, -1.6, 5.0).painted((60, 90, 200))
+    item, _ = seen(truth, ("left", "right"), poses=sensor.STATION)
+    solid = item.mesh.transformed(item.world_from_object).to_trimesh()
+    assert solid.bounds == pytest.approx(truth.to_trimesh().bounds, abs=0.012)
+
+
 def test_a_can_on_its_side():
     can = trimesh.creation.cylinder(0.033, 0.12)
     truth = lain(Mesh(can.vertices, can.faces), 0.0, 0.6).painted((180, 60, 50))
