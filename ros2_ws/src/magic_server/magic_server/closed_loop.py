@@ -51,6 +51,8 @@ SLOWEST = 20.0
 SILENT = 1.0
 #: Failures after which the next candidate is tried, from the state as it is then.
 RETRIED = frozenset({Code.GRASP_FAILED, Code.GOAL_MISSED})
+#: What is seen is of the tool where more than this share of it is on the tool's surface.
+MOSTLY = 0.9
 #: Two contacts of one tool that are nearer than this are the same, m.
 SAME_CONTACT = 0.015
 #: The phases of a motion in which the tool is meant to touch the target.
@@ -77,6 +79,20 @@ class Off(Exception):
     def __init__(self, held: Held, deviation: in_hand.Deviation) -> None:
         super().__init__(str(deviation))
         self.held, self.deviation = held, deviation
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A tool by its id, its shape, and where it is: world_from_tool (4, 4)."""
+
+    id: str
+    shape: in_hand.Shape
+    world_from_tool: NDArray[np.float64]
+
+    def explains(self, item: SceneObject) -> bool:
+        """Whether an object that is seen is this tool, or a part of it, whatever its id."""
+        points = conversions.cloud_from_msg(item.cloud)[0]
+        return len(points) > 0 and float(np.mean(self.shape.distances(self.world_from_tool, points) < in_hand.CLOSE)) > MOSTLY
 
 
 @dataclass(frozen=True)
@@ -290,9 +306,9 @@ class ClosedLoop:
         hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
         expected = held.pose(hand)
         job = self.jobs[-1]
-        axis = "xy".index(self._server.robot.config.closing_axis)
-        prior = in_hand.AGAIN if held.looked else in_hand.PRIOR
-        found = in_hand.locate(held.mesh, expected, self._points(scene, job), hand[:3, axis], prior)
+        points = in_hand.clear_of(hand, self._points(scene, job))
+        spread = in_hand.LOOKED if held.looked else in_hand.GRASPED
+        found = in_hand.locate(held.shape, expected, points, hand, self._closing, spread)
         if found is None:
             lying = next((o for o in scene.objects if self._lies(o, job)), None)
             if lying is not None:
@@ -310,6 +326,11 @@ class ClosedLoop:
         self._held = Held(held.tool, transforms.inverse(found.world_from_tool) @ hand, True)
         self._carried = Carried(self._held)
         raise Off(self._held, off)
+
+    @property
+    def _closing(self) -> int:
+        """The axis of the hand along which the fingers close."""
+        return "xy".index(self._server.robot.config.closing_axis)
 
     def _unseen(self, why: str) -> None:
         self._say(f"the tool in the hand was not seen ({why}): it is carried on as it was grasped")
@@ -482,20 +503,22 @@ class ClosedLoop:
         return seen.message
 
     def _sight(self, scene: SceneObjectArray, after: bool) -> seen_goal.Sight:
-        """Things where they were seen; after the motion a tool in the hand is where the hand has it."""
+        """Things where they were seen.  After the motion the tool is where the hand has it, or where its shape is seen once that has let it go, and ids may
+        have been handed on: tool and target were near each other."""
         stamp, known = conversions.time_from_msg(scene.header.stamp), self.jobs[-1].claim.scene.objects
-        held = self._held if after else None
-        hand = None if held is None else self._server.hand(stamp)
-        things = {}
-        for item in scene.objects:
-            if after and UNSEEN in item.cut_off:
-                continue  # remembered from before the motion: what came of it is not known
-            if held is None or not held.sees(item, hand, known):
-                things[item.id] = seen_goal.Thing.of(conversions.mesh_from_msg(item.mesh), conversions.pose_from_msg(item.pose))
+        # What is remembered from before the motion does not tell what came of it.
+        items = [item for item in scene.objects if not (after and UNSEEN in item.cut_off)]
+        held, tool = (self._held, self._placed(scene)) if after else (None, None)
+        if tool is not None:
+            items = [item for item in items if not tool.explains(item)]
         if held is not None:
-            things[held.tool.id] = seen_goal.Thing.of(held.mesh, held.pose(hand))
-        elif after and self._carried is not None and (tool := self._carried.held.tool.id) not in things:
-            # What the hand let go of is what is seen there, whatever its id; most of it, where it is seen in parts.
+            hand = self._server.hand(stamp)
+            items = [item for item in items if not held.sees(item, hand, known)]
+        things = {i.id: seen_goal.Thing.of(conversions.mesh_from_msg(i.mesh), conversions.pose_from_msg(i.pose)) for i in items}
+        if tool is not None:
+            things[tool.id] = seen_goal.Thing.of(tool.shape.mesh, tool.world_from_tool)
+        elif after and self._carried is not None and self._carried.held.tool.id not in things:
+            # Most of what is seen where the hand let it go, whatever its id.
             place = self._tool_at(stamp)
             near = [
                 i
@@ -503,8 +526,31 @@ class ClosedLoop:
                 if scene_change.contained(scene_change.hull(things[i].points), place, scene_change.ABOUT)
             ]
             if near:
-                things[tool] = things.pop(max(near, key=lambda i: float(np.prod(things[i].extents))))
-        return seen_goal.Sight(things, conversions.time_from_msg(scene.header.stamp))
+                things[self._carried.held.tool.id] = things.pop(max(near, key=lambda i: float(np.prod(things[i].extents))))
+        target = self.jobs[-1].outcome.target_id
+        if after and target not in things and target in known:
+            there = self._sight(self.jobs[-1].stages.scene, False).things[target]
+            alike = [i for i in things.keys() - known.keys() if there.like(things[i], 2 * self._settings.accuracy)]
+            if len(alike) == 1:
+                things[target] = things.pop(alike[0])
+        return seen_goal.Sight(things, stamp)
+
+    def _placed(self, scene: SceneObjectArray) -> Placed | None:
+        """The tool in the hand, or where the hand has let it go its shape as it was seen before, laid on what is seen there; ``None``: it was never
+        taken up, or it cannot be told how it lies.
+
+        What is seen of a tool that hangs stops where it is near what holds it, what is seen there counts as that, and it has no more of its
+        hollows than shows now.
+        """
+        carried = self._carried
+        if self._held is not None:
+            hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
+            return Placed(self._held.tool.id, self._held.shape, self._held.pose(hand))
+        if carried is None or carried.let_go_at is None:
+            return None
+        expected, points = carried.held.pose(carried.let_go_at), self._points(scene, self.jobs[-1])
+        found = in_hand.locate(carried.held.shape, expected, points, carried.let_go_at, self._closing, in_hand.LET_GO)
+        return None if found is None else Placed(carried.held.tool.id, carried.held.shape, found.world_from_tool)
 
 
 def contact_time(plan: MotionPlan) -> float:

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from magic_core.mesh import Mesh
 from magic_interfaces.msg import SceneObject, SceneObjectArray
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, scene_change
+from magic_server.in_hand import Shape
 from magic_server.remote import Token
 from magic_server.stages import Server, Stages, code_of, hull_of
 
@@ -34,6 +36,12 @@ class Held:
     def mesh(self) -> Mesh:
         """Its shape, in its own frame."""
         return conversions.mesh_from_msg(self.tool.mesh)
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Its shape with what was seen of it before it was grasped."""
+        seen = transforms.inverse(conversions.pose_from_msg(self.tool.pose))
+        return Shape.of(self.mesh, transforms.apply(seen, conversions.cloud_from_msg(self.tool.cloud)[0]))
 
     def pose(self, world_from_tcp: NDArray[np.float64]) -> NDArray[np.float64]:
         """world_from_tool (4, 4) with the hand at a pose."""

@@ -27,6 +27,7 @@ from magic_core import transforms
 from magic_core.goal import PREDICATES, Node, direction_of, leaf_words, moment_words, node_words
 from magic_core.mesh import Mesh
 from magic_core.strategy import Strategy
+from magic_server import scene_change
 
 Array = NDArray[np.float64]
 
@@ -62,6 +63,11 @@ class Thing:
     def extents(self) -> Array:
         """(3,): of its box along the world's axes, m."""
         return np.asarray(np.ptp(self.points, axis=0))
+
+    def like(self, other: Thing, exact: float) -> bool:
+        """Whether another thing is of this form, and turned as this one is, to ``exact`` m, wherever it is."""
+        here, there = (scene_change.hull(thing.points - thing.middle) for thing in (self, other))
+        return scene_change.distance(here, there) <= exact
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from test_execution import ACTIONS, folder  # noqa: F401  a fixture
 
 from magic_core import conversions, shapes, transforms
 from magic_core.errors import Code
+from magic_core.mesh import from_trimesh
 from magic_core.robot import Description
 from magic_core.scene import Scene, SceneObject
 from magic_interfaces.action import PlanMotion, VerifyMotion
@@ -329,18 +330,69 @@ def test_a_goal_that_cannot_be_told_is_not_said_to_be_met(bench):
     assert len(asked(bench, "plan_motion")) == 1
 
 
-def test_a_goal_is_asked_with_the_motions_phases_and_the_hand_as_it_is(bench, monkeypatch):
+def test_tool_and_target_are_told_apart_by_their_forms_where_ids_have_been_handed_on(bench):
+    pulls(bench, 0.25)
+    scene = bench.table.scene
+
+    def seen():
+        first, box = scene().objects
+        swapped = replace(first, id="object_2"), replace(box, id="object_7")
+        return replace(scene(), objects=swapped) if bench.table.target < 0.4 else scene()
+
+    bench.fakes.see(seen)
+    assert "seen to be met: the target moved 250 mm of 200" in run(bench).message
+
+
+def letting_go(goal, _canceled):
     """The arm turns by 0.1 rad at every joint after it has let the tool go."""
+    plan = fakes.plan("arm", release=True)
+    plan.arm_motion.positions[-1] += 0.1
+    return PlanMotion.Result(message="planned", plan=conversions.plan_to_msg(plan, goal.tool.id))
+
+
+def test_what_was_let_go_has_its_whole_form_where_it_is_seen_in_part(bench, monkeypatch):
+    looked, let_go = [], ROBOT.forward(np.full(7, 0.2))[0]
+    swung = let_go @ transforms.from_rpy(0.05, 0.0, 0.05, [0.004, 0.0, 0.006])
+    shown = POINTS[POINTS[:, 0] > np.quantile(POINTS[:, 0], 0.3)]
+    part = from_trimesh(trimesh.convex.convex_hull(shown))
+    scene = bench.table.scene
+
+    def seen():
+        before, box = scene().objects
+        if before.id == "object_1" and any(isinstance(entry, tuple) for entry in bench.arm.log[2:]):
+            colors = np.zeros((len(shown), 3), np.uint8)
+            before = replace(
+                before,
+                id="object_7",
+                mesh=part,
+                pieces=(part,),
+                world_from_object=swung,
+                points=transforms.apply(swung, shown),
+                colors=colors,
+            )
+        return replace(scene(), objects=(before, box))
+
+    def judge(_strategy, _names, _phases, looks, *_):
+        looked.append(looks[2].things)
+        return seen_goal.SeenGoal(True, "as it should be")
+
+    monkeypatch.setattr(seen_goal, "judge", judge)
+    bench.fakes.on_plan = letting_go
+    bench.fakes.see(seen)
+    bench.server._loop = replace(bench.usual, judge=True, watch=False, look=False)
+    run(bench)
+    (things,) = looked
+    assert set(things) == {"object_1", "object_2"}
+    whole = transforms.apply(swung, MESH.vertices)
+    assert things["object_1"].middle == pytest.approx((whole.min(axis=0) + whole.max(axis=0)) / 2, abs=0.003)
+
+
+def test_a_goal_is_asked_with_the_motions_phases_and_the_hand_as_it_is(bench, monkeypatch):
     heard = []
 
     def judge(_strategy, names, phases, looks, _table, hand, accuracy):
         heard.append((names, phases, looks, hand, accuracy))
         return seen_goal.SeenGoal(True, "as it should be")
-
-    def letting_go(goal, _canceled):
-        plan = fakes.plan("arm", release=True)
-        plan.arm_motion.positions[-1] += 0.1
-        return PlanMotion.Result(message="planned", plan=conversions.plan_to_msg(plan, goal.tool.id))
 
     monkeypatch.setattr(seen_goal, "judge", judge)
     bench.fakes.on_plan = letting_go
