@@ -65,7 +65,8 @@ class ArmRun:
     gripper closes; ``world.time`` goes on.  With ``held`` the run begins at that moment
     of the trajectory, arm and tool as fast as they are then, the tool in the hand.
     Where the gripper of a plan closes at its very start the tool is in the hand already:
-    the fingers are about it, and it does not fall before they have closed.
+    the fingers are about it, and it does not fall before they have closed.  It is then held where
+    the plan has it: real pads have turned it as they do, which those about its reconstruction would do once more.
     ``lag``: seconds by which the arm follows its command late.
     """
 
@@ -87,7 +88,7 @@ class ArmRun:
             raise MagicError(Code.BAD_MOTION, "plan", "without an arm motion", "an arm motion")
         positions = np.asarray(motion.positions, dtype=float)
         times = np.asarray(motion.times, dtype=float)
-        in_hand = held is None and motion.grasp_time <= 0
+        self._in_hand = in_hand = held is None and motion.grasp_time <= 0
         if held is None and not in_hand:
             setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
         self.setup = setup
@@ -239,13 +240,15 @@ class ArmRun:
         return patch_of(touches, self._arm.tcp(), "xy".index(self.robot.config.closing_axis), self._friction)
 
     def _take(self, patch: Patch) -> None:
-        """The tool is held, as it is between the pads."""
+        """The tool is held, as it is between the pads, or as it was before they closed on what was in them already."""
         self._patch = patch
+        planned = np.asarray(self._motion.tool_from_tcp, dtype=float)
+        if self._in_hand:
+            self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(planned))
         self.world.component(TOOL).disable_gravity = False
         self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
         self._from_reference = self._arm.tcp_pose.inv() * self.world.component(TOOL).entity_pose
         self._metrics["grip_width"] = self._arm.width()
-        planned = np.asarray(self._motion.tool_from_tcp, dtype=float)
         self._metrics["grasp_shift"] = float(np.linalg.norm((transforms.inverse(planned) @ self._tool_from_tcp())[:3, 3]))
 
     def _set_off(self) -> None:

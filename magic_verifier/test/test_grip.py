@@ -5,8 +5,14 @@ import pytest
 import scenes
 
 from magic_core import transforms
+from magic_core.motion import ArmMotion, MotionPlan, ToolMotion
+from magic_core.robot import Description
+from magic_core.strategy import Physics
+from magic_verifier.arm_simulation import ArmRun
+from magic_verifier.floating import make_setup
 from magic_verifier.grip import LEAST, Grip, Patch, patch_of
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, usable_pieces
+from magic_verifier.verification import Limits
 
 FORCE, FRICTION = 40.0, 0.8
 PATCH = Patch(np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]]), 0.006, (0.008, 0.006))
@@ -87,3 +93,22 @@ def test_no_patch_where_one_pad_touches_nothing_or_only_pushes():
     assert patch_of([*one, steep], np.eye(4), 1, FRICTION) is None
     aside = [touch(0, -0.01, 0.04, -1)]
     assert patch_of([*one, *aside], np.eye(4), 1, FRICTION) is None
+
+
+def test_what_is_in_the_hand_already_is_held_as_it_is():
+    """A bar lies askew between the pads, as it was seen there: that they would turn it true has been settled in the real hand."""
+    robot = Description()
+    home = np.asarray(robot.config.home, dtype=float)
+    tcp = robot.forward(home)[0]
+    askew = tcp @ transforms.from_rpy(0.0, 0.0, 0.12)
+    tool = scenes.item("tool", [scenes.block((-0.08, 0.08), (-0.006, 0.006), (-0.008, 0.008))], askew)
+    target = scenes.item("target", [scenes.block((-0.03, 0.03), (-0.03, 0.03), (0, 0.06))], transforms.make(translation=[0.5, 0.4, 0]))
+    setup = make_setup(tool, target, (), scenes.TABLE, Physics(0.5, 600.0, 600.0), Settings(frequency=300.0))
+    times, still = np.array([0.0, 0.3]), np.zeros((2, len(home)))
+    held = transforms.inverse(askew) @ tcp
+    arm = ArmMotion(times, robot.names, np.stack([home, home]), still, still, held, 0.012, 0.0)
+    run = ArmRun(setup, MotionPlan("arm", ToolMotion(times, np.stack([askew, askew])), arm), None, Limits(), robot)
+    while run.time < 0.3:
+        run.advance()
+    off = transforms.inverse(held) @ run.held().tool_from_tcp
+    assert np.linalg.norm(off[:3, 3]) < 0.0005 and transforms.rotation_angle(off, np.eye(4)) < 0.005
