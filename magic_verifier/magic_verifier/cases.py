@@ -155,6 +155,13 @@ def _cases(options: Options) -> list[Case]:
 
 def control_cases(options: Options) -> list[Case]:
     """Things that cannot do the task with the targets that they are given: near misses, and plain things drawn by the seed."""
+    asked = {name: getattr(options, name) for name in ("task", "targets", "seed", "strategies", "demonstration")}
+    return list(_control_cases(Options(**asked)))
+
+
+@lru_cache(maxsize=8)
+def _control_cases(options: Options) -> tuple[Case, ...]:
+    """The same for all methods and variants: geometry alone is asked, which takes a second or more."""
     strategy = strategy_for(options)
     targets = target_names(options)
     first = CONTROL_SEEDS + 1000 * options.seed
@@ -167,7 +174,7 @@ def control_cases(options: Options) -> list[Case]:
             cases.append(case)
         if len(cases) == CONTROL_COUNT:
             break
-    return cases
+    return tuple(cases)
 
 
 def shown_by(strategy: Strategy, name: str) -> Strategy:

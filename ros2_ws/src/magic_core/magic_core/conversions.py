@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from operator import attrgetter
 
 import cv2
@@ -88,10 +88,29 @@ def transform_to_msg(transform: NDArray[np.float64]) -> Transform:
     return Transform(translation=Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z), rotation=pose.orientation)
 
 
+def transforms_to_msgs(stack: NDArray[np.float64]) -> list[Transform]:
+    """Transforms (N, 4, 4) to messages, as :func:`transform_to_msg` makes each."""
+    if not len(stack):
+        return []
+    return [
+        Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(stack[:, :3, 3].tolist(), transforms.quaternion_xyzw(stack).tolist(), strict=True)
+    ]
+
+
 def transform_from_msg(msg: Transform) -> NDArray[np.float64]:
-    """Transform to 4x4 transform."""
+    """Transform to 4x4 transform; raises BAD_REQUEST for a quaternion that is not one."""
     t, q = msg.translation, msg.rotation
     return _transform([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+
+
+def transforms_from_msgs(msgs: Sequence[Transform]) -> NDArray[np.float64]:
+    """Transforms to (N, 4, 4); raises BAD_REQUEST for the first whose quaternion is not one."""
+    rows = [(*_XYZ(msg.translation), *_XYZW(msg.rotation)) for msg in msgs]
+    try:
+        return transforms.from_rows(np.array(rows, dtype=float).reshape(-1, 7))
+    except ValueError:
+        return np.stack([_transform(list(row[:3]), list(row[3:])) for row in rows])
 
 
 def remember_transform(buffer: TransformBuffer, msg: TransformStamped, static: bool) -> None:
@@ -266,7 +285,7 @@ MOST_TRIANGLES = 1_000_000
 
 
 #: Thousands of points and triangles are read at a time: this is twice as quick as naming the fields in a loop of Python's.
-_XYZ, _CORNERS = attrgetter("x", "y", "z"), attrgetter("vertex_indices")
+_XYZ, _XYZW, _CORNERS = attrgetter("x", "y", "z"), attrgetter("x", "y", "z", "w"), attrgetter("vertex_indices")
 
 
 def mesh_to_msg(mesh: Mesh) -> MeshMsg:
@@ -607,8 +626,8 @@ def tool_motion_to_msg(motion: ToolMotion, tool_id: str, frame_id: str = "panda_
         header=header(frame_id),
         joint_names=[tool_id],
         points=[
-            MultiDOFJointTrajectoryPoint(transforms=[transform_to_msg(pose)], time_from_start=duration_to_msg(float(t)))
-            for t, pose in zip(motion.times, motion.world_from_tool, strict=True)
+            MultiDOFJointTrajectoryPoint(transforms=[transform], time_from_start=duration_to_msg(float(t)))
+            for t, transform in zip(motion.times, transforms_to_msgs(motion.world_from_tool), strict=True)
         ],
     )
 
@@ -655,7 +674,7 @@ def plan_from_msg(msg: mi.MotionPlan) -> MotionPlan:
     phases = tuple(Phase(p.name, p.start, p.end) for p in msg.phases)
     motion = ToolMotion(
         np.array([seconds(p.time_from_start) for p in points]),
-        np.stack([transform_from_msg(p.transforms[0]) for p in points]) if points else np.zeros((0, 4, 4)),
+        transforms_from_msgs([p.transforms[0] for p in points]),
         phases,
     )
     arm = None

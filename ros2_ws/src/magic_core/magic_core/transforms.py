@@ -77,12 +77,23 @@ def from_numbers(numbers: ArrayLike) -> Matrix:
     Raises ``ValueError``, whose text says what is allowed.
     """
     values = np.asarray(numbers, dtype=float)
-    length = float(np.linalg.norm(values[3:])) if values.shape == (7,) else 0.0
-    if not np.all(np.isfinite(values)) or not 1 - UNIT < length < 1 + UNIT:
+    return from_rows(values[None] if values.shape == (7,) else np.zeros((1, 7)))[0]
+
+
+def from_rows(rows: NDArray[np.float64]) -> Matrix:
+    """Transforms (N, 4, 4) of rows (N, 7), as :func:`from_numbers` makes each; raises its ``ValueError`` for the first that is none."""
+    lengths = np.linalg.norm(rows[:, 3:], axis=1)
+    fine = np.isfinite(rows).all(axis=1) & (lengths > 1 - UNIT) & (lengths < 1 + UNIT)
+    if not fine.all():
         raise ValueError(
-            f"seven finite numbers, the last four a quaternion (x, y, z, w) whose length, here {length:.4g}, differs from 1 by less than {UNIT:g}"
+            f"seven finite numbers, the last four a quaternion (x, y, z, w) whose length, here {lengths[np.argmin(fine)]:.4g}, differs from 1 "
+            f"by less than {UNIT:g}"
         )
-    return from_quaternion(values[:3], values[3:])
+    result = np.tile(np.eye(4), (len(rows), 1, 1))
+    if len(rows):
+        result[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
+        result[:, :3, 3] = rows[:, :3]
+    return result
 
 
 def quaternion_xyzw(transform: Matrix) -> NDArray[np.float64]:

@@ -414,6 +414,22 @@ def test_plans(variant):
         assert after.arm_motion.joint_names == before.arm_motion.joint_names
 
 
+def test_many_transforms_are_what_each_of_them_is():
+    rng = np.random.default_rng(3)
+    turns = rng.normal(size=(300, 3)) * np.repeat([1e-9, 0.1, 3.0], 100)[:, None]
+    poses = np.stack([tf.from_rotvec(turn, rng.normal(size=3)) for turn in turns])
+    msgs = cv.transforms_to_msgs(poses)
+    assert msgs == [cv.transform_to_msg(pose) for pose in poses]
+    assert np.array_equal(cv.transforms_from_msgs(msgs), np.stack([cv.transform_from_msg(msg) for msg in msgs]))
+    assert cv.transforms_to_msgs(poses[:0]) == [] and cv.transforms_from_msgs([]).shape == (0, 4, 4)
+    msgs[7].rotation.w += 1.0
+    with pytest.raises(MagicError) as one:
+        cv.transform_from_msg(msgs[7])
+    with pytest.raises(MagicError) as many:
+        cv.transforms_from_msgs(msgs)
+    assert (many.value.code, many.value.message) == (one.value.code, one.value.message)
+
+
 def test_plans_that_are_none():
     def code(change):
         msg = cv.plan_to_msg(plan("arm"), "object_1")

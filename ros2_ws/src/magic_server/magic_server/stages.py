@@ -451,23 +451,22 @@ def hull_of(item: SceneObject) -> NDArray[np.float64]:
 
 def mark_of(plan: MotionPlan) -> bytes:
     """What tells a motion from every other one: a digest of its numbers (serialised messages have padding in them)."""
-    found = hashlib.sha256(" ".join([plan.variant, *plan.arm_trajectory.joint_names]).encode())
-
-    def take(*numbers: float) -> None:
-        found.update(np.array(numbers, dtype=float).tobytes())
+    numbers: list[float] = []
 
     def pose(at: Vector3 | Point, turned: Quaternion) -> None:
-        take(at.x, at.y, at.z, turned.x, turned.y, turned.z, turned.w)
+        numbers.extend((at.x, at.y, at.z, turned.x, turned.y, turned.z, turned.w))
 
-    take(plan.grasp_width, plan.grasp_time, plan.release_time)
+    numbers.extend((plan.grasp_width, plan.grasp_time, plan.release_time))
     pose(plan.tool_from_tcp.position, plan.tool_from_tcp.orientation)
     for point in plan.arm_trajectory.points:
-        take(point.time_from_start.sec, point.time_from_start.nanosec, *point.positions, *point.velocities, *point.accelerations)
+        since = point.time_from_start
+        numbers.extend((since.sec, since.nanosec, *point.positions, *point.velocities, *point.accelerations))
     for point in plan.tool_trajectory.points:
-        take(point.time_from_start.sec, point.time_from_start.nanosec)
+        numbers.extend((point.time_from_start.sec, point.time_from_start.nanosec))
         for transform in point.transforms:
             pose(transform.translation, transform.rotation)
-    return found.digest()
+    names = " ".join([plan.variant, *plan.arm_trajectory.joint_names])
+    return hashlib.sha256(names.encode() + np.array(numbers, dtype=float).tobytes()).digest()
 
 
 def code_of(number: int) -> Code:
