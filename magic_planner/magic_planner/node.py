@@ -130,7 +130,7 @@ class PlannerNode(Node):
             handle.publish_feedback(PlanMotion.Feedback(stage=stage, message=message))
 
         feedback("motion", f"moving {goal.tool.id} by strategy {goal.strategy}")
-        strategy = strategies.find(goal.strategy, self._strategies or None)
+        strategy = strategies.known(goal.strategy, self._strategies or None)
         convert.check_frames(self._base, (goal.tool, goal.target, *goal.obstacles))
         tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))
         for item, what in ((tool, "tool"), (target, "target")):

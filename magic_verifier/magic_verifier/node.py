@@ -14,7 +14,7 @@ from sensor_msgs.msg import Image
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import check_solid
+from magic_core.mesh import Mesh, check_solid
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
 from magic_core.threads import one_thread
@@ -27,6 +27,7 @@ from magic_verifier.workers import Workers
 
 #: More repetitions than this in one goal are refused.
 MAX_REPETITIONS = 1000
+NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
 #: Goals that end so were not judged.
 UNJUDGED = (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY)
 
@@ -122,8 +123,6 @@ class VerifierNode(Node):
 
     def _warm_up(self) -> None:
         """Load SAPIEN and the arm and step small worlds, so that the first goal does not pay for it; raises BAD_REQUEST."""
-        from magic_core.mesh import Mesh
-
         cube = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
         world = World(self._settings["fg"])
         world.add_table(np.array([0, 0, 1.0, 0]), 0.5)
@@ -154,7 +153,7 @@ class VerifierNode(Node):
             raise MagicError(Code.BAD_REQUEST, "repetitions", goal.repetitions, f"0 to {MAX_REPETITIONS}")
         if not (np.isfinite(goal.timeout) and goal.timeout >= 0):
             raise MagicError(Code.BAD_REQUEST, "timeout", goal.timeout, "0 or a number of seconds above it")
-        strategy = strategies.find(goal.strategy, self._strategies or None)
+        strategy = strategies.known(goal.strategy, self._strategies or None)
         trajectories = goal.plan.tool_trajectory, goal.plan.arm_trajectory
         convert.check_frames(self._robot.base_frame, (goal.tool, goal.target, *goal.obstacles), *trajectories)
         tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))
@@ -172,7 +171,9 @@ class VerifierNode(Node):
         def feedback(phase: str, simulated: float) -> None:
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
-        asked = digest((goal.strategy, tool, target, obstacles, table, candidate, plan, goal.repetitions, goal.seed, goal.tried))
+        # What obstacles look like is in the film alone.
+        simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in obstacles)
+        asked = digest((goal.strategy, tool, target, simulated, table, candidate, plan, goal.repetitions, goal.seed, goal.tried))
         if goal.want_film and self._last is not None and asked == self._last[0]:
             return self._with_film(self._last[1], tool, target, obstacles, table)
         verdict = verify(

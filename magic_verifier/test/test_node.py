@@ -1,5 +1,6 @@
 """The node answers every goal with a code, runs one simulation at a time and stops when told to."""
 
+import copy
 import os
 import threading
 import time
@@ -67,6 +68,25 @@ def test_the_film_of_the_last_goal_needs_no_second_simulation(graph):
     assert (again.code, again.message, again.metric_values) == (first.code, first.message, first.metric_values)
     ask(graph, goal_message(seed=6, repetitions=2, want_film=True))
     assert len(SIMULATED) == before + 1
+
+
+def test_what_obstacles_look_like_is_in_the_film_alone(graph):
+    def beside(surface, x=0.0):
+        goal = goal_message(seed=7, repetitions=2, want_film=surface)
+        obstacle = copy.deepcopy(goal.target)
+        obstacle.id = "obstacle"
+        obstacle.pose.position.x += x
+        obstacle.pose.position.y += 0.4
+        goal.obstacles = [convert.without_pictures(obstacle, cloud=False, surface=surface)]
+        return goal
+
+    before = len(SIMULATED)
+    first = ask(graph, beside(False))
+    again = ask(graph, beside(True))
+    assert len(again.film.data) and (again.code, again.message) == (first.code, first.message)
+    assert len(SIMULATED) == before + 1
+    ask(graph, beside(True, x=0.01))
+    assert len(SIMULATED) == before + 2
 
 
 def test_a_bad_motion_fails_with_its_reason(graph):

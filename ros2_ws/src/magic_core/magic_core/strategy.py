@@ -24,7 +24,8 @@ A waypoint with ``contact: back`` is a pose of that contact of the tool in the f
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+import hashlib
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -292,8 +293,58 @@ def find(name: str, root: str | Path | None = None) -> Strategy:
 
     Raises ``UNKNOWN_STRATEGY`` naming the strategies there are.
     """
+    return load(_folder(name, root))
+
+
+#: What a strategy is read from.
+FILES = ("strategy.yaml", "trajectory.csv", *(f"{body}{what}" for body in ("tool", "target") for what in (".png", "_mask.png", ".ply")))
+#: Strategies by the content of their files; the newest of them.
+_KNOWN: dict[bytes, Strategy] = {}
+MOST_KNOWN = 16
+
+
+def known(name: str, root: str | Path | None = None) -> Strategy:
+    """As :func:`find`, for who asks again and again: read once for files of the same content.  Its arrays are not to be written to, and refuse it."""
+    folder = _folder(name, root)
+    content = _content(folder)
+    kept = _KNOWN.get(content)
+    if kept is not None:
+        return kept
+    strategy = load(folder)
+    if content == _content(folder):  # else it was written while it was read
+        _make_read_only(strategy)
+        while len(_KNOWN) >= MOST_KNOWN:
+            _KNOWN.pop(next(iter(_KNOWN)), None)
+        _KNOWN[content] = strategy
+    return strategy
+
+
+def _content(folder: Path) -> bytes:
+    """A digest of a strategy's files; of what cannot be read one as well, which no strategy has."""
+    found = hashlib.sha256()
+    for name in FILES:
+        try:
+            data = (folder / name).read_bytes()
+        except (OSError, ValueError):  # ValueError: a NUL in the name
+            data = b""
+        found.update(f"{name} {len(data)} ".encode() + data)
+    return found.digest()
+
+
+def _make_read_only(value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        value.setflags(write=False)
+    elif is_dataclass(value):
+        for part in fields(value):
+            _make_read_only(getattr(value, part.name))
+    elif isinstance(value, (tuple, list)):
+        for part in value:
+            _make_read_only(part)
+
+
+def _folder(name: str, root: str | Path | None) -> Path:
     if name and "/" in name:
-        return load(name)
+        return Path(name)
     try:
         root = Path(root) if root else installed_folder()
     except LookupError:
@@ -303,7 +354,7 @@ def find(name: str, root: str | Path | None = None) -> Strategy:
     names = sorted(p.parent.name for p in root.glob("*/strategy.yaml"))
     if name not in names:
         raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, [*names, "or the path of a strategy folder"])
-    return load(root / name)
+    return root / name
 
 
 def _floats(values: Any) -> list[float]:

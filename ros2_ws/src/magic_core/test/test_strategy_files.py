@@ -1,5 +1,7 @@
 """Strategies as folders: what is saved comes back, and what is wrong is named."""
 
+import contextlib
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -243,3 +245,42 @@ def test_names_that_no_file_can_have_are_unknown_strategies(tmp_path, name):
         strategies.find(name, tmp_path)
     assert caught.value.code is Code.UNKNOWN_STRATEGY
     assert strategies.stamp(tmp_path / name) == 0
+
+
+def test_what_is_asked_for_again_is_read_once_until_a_file_changes(tmp_path):
+    folder = tmp_path / "pull"
+    strategies.save(make(), folder)
+    first = strategies.known("pull", tmp_path)
+    assert strategies.known("pull", tmp_path) is first is strategies.known(str(folder))
+    for name in strategies.FILES:
+        # Neither size nor time of the file tell that it is another one.
+        path, stat = folder / name, (folder / name).stat()
+        before = path.read_bytes()
+        path.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        with contextlib.suppress(MagicError):  # most are none any more
+            assert strategies.known("pull", tmp_path) is not first, name
+        path.write_bytes(before)
+    assert strategies.known("pull", tmp_path) is first
+    for name in ("push", str(folder / "nothing"), "a\0b/c"):
+        with pytest.raises(MagicError) as error:
+            strategies.known(name, tmp_path)
+        with pytest.raises(MagicError) as same:
+            strategies.find(name, tmp_path)
+        assert (error.value.code, error.value.message) == (same.value.code, same.value.message)
+
+
+def test_a_strategy_that_is_kept_cannot_be_written_to(tmp_path):
+    strategies.save(make(), tmp_path / "pull")
+    kept = strategies.known("pull", tmp_path)
+    for array in (kept.times, kept.target_from_tool, kept.tool_view.image, kept.tool_mesh.vertices, kept.waypoints[0].offset):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+    strategies.load(tmp_path / "pull").times[...] = 0
+
+
+def test_no_more_strategies_are_kept_than_a_few(tmp_path):
+    for number in range(strategies.MOST_KNOWN + 3):
+        strategies.save(replace(make(), description=str(number)), tmp_path / "pull")
+        assert strategies.known("pull", tmp_path).description == str(number)
+    assert len(strategies._KNOWN) == strategies.MOST_KNOWN

@@ -374,7 +374,8 @@ class Stages:
             strategy=request.strategy,
             tool=light(self._tool_of(trial), cloud=False, surface=True),
             target=light(self._find(matches.target_id), cloud=False, surface=True),
-            obstacles=[light(o, cloud=False, surface=True) for o in self._obstacles(trial, matches)],
+            # Obstacles are simulated by their pieces; their surface is for the film alone.
+            obstacles=[light(o, cloud=False, surface=False) for o in self._obstacles(trial, matches)],
             table=self.scene.table,
             candidate=trial.candidate,
             plan=plan,
@@ -414,6 +415,8 @@ class Stages:
         if goal is None or outcome_code in pipeline.FATAL:
             return None
         goal.want_film = True
+        around = {o.id for o in goal.obstacles}
+        goal.obstacles = [light(o, cloud=False, surface=True) for o in self.scene.objects if o.id in around]
         try:
             result = server.verifier.call(goal, server.settings.verify, self._token, server.settings.presence, server.settings.grace).result
         except MagicError as error:

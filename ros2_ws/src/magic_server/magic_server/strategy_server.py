@@ -439,7 +439,7 @@ class StrategyServer(LifecycleNode):
     def _run(self, handle: Any, token: Token, result: RunStrategy.Result) -> None:
         goal = handle.request
         self.publication.take_back("a new run has begun")
-        strategy = strategies.find(goal.strategy, self.settings.strategies or None)
+        strategy = strategies.known(goal.strategy, self.settings.strategies or None)
         request = self._request(goal)
         stages = Stages(self, token, self._run_id, needs_verifier=strategy.simulatable, heatmap=goal.want_pictures)
         notify = self._notifier(handle)

@@ -838,7 +838,7 @@ def test_a_server_that_never_finishes(folder):
 def test_the_film_is_made_after_the_trajectory_is_out(folder):
     bench = Bench(folder)
     try:
-        bench.fakes.publish(fakes.scene())
+        bench.fakes.publish(fakes.scene(("object_1", "object_2", "object_3")))
         published = []
 
         def verify(goal, canceled):
@@ -853,6 +853,10 @@ def test_the_film_is_made_after_the_trajectory_is_out(folder):
         result, _ = bench.run(want_pictures=True)
         assert (result.code, result.simulations, result.film.width) == (0, 1, 8)
         assert published == [True]
+        # What is simulated carries no surface of an obstacle, only its pieces; what is drawn does.
+        simulated, drawn = (goal.obstacles[0] for name, goal in bench.fakes.goals if name == "verify_motion")
+        assert simulated.id == drawn.id == "object_3"
+        assert simulated.pieces == drawn.pieces and simulated.pieces and drawn.mesh.triangles and not simulated.mesh.triangles
     finally:
         bench.close()
 
