@@ -29,9 +29,24 @@ class FreeMotion:
         self.space, self.robot, self.settings = space, space.robot, settings
 
     def come(self, request: Request, goal: Array) -> Array:
-        """Joint path (n, J) of the empty hand from where the arm is to ``goal`` (J,) before the tool; raises StageError."""
-        self.space.lay(request, request.tool.world_from_object)
-        self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
+        """Joint path (n, J) of the empty hand from where the arm is to ``goal`` (J,) before the tool; raises StageError.
+
+        What was seen may stand some millimetres elsewhere: a finger that just clears a rim in the scene as given pushes the tool off in
+        the true one, and no grasp is where it was planned any more.
+        """
+        robot, left = self.robot, request.searches
+        try:
+            for room in (self.settings.room, self.settings.room / 3):
+                self.space.come(request, room)
+                if robot.collides(request.start) or robot.collides(goal):
+                    continue
+                try:
+                    return self._free(request, request.start, goal, "approach")
+                except StageError:
+                    # What is left to search with was meant for ways that may be as narrow as they are.
+                    request.searches = min(left, 1)
+        finally:
+            self.space.come(request, 0.0)
         return self._free(request, request.start, goal, "approach")
 
     def carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
@@ -49,7 +64,7 @@ class FreeMotion:
                 )
         # A tool shifts a little in the hand when it is gripped: it is carried with room about it, where its ends leave that.
         for room in (self.settings.room, self.settings.room / 3):
-            self.space.hold(request, branch.grasp, request.roomy(room))
+            self.space.hold(request, branch.grasp, request.roomy(request.tool, room))
             robot.allow(request.tool.id, "table")
             if robot.collides(start) or robot.collides(goal):
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from magic_planner.request import ArmSettings, Branch, Request, StageError
 from magic_planner.workspace import Workspace
 
 Array = NDArray[np.float64]
+#: Ways to a grasp from which the lift is tried.
+WAYS = 3
 
 
 class HandMoves:
@@ -44,17 +46,12 @@ class HandMoves:
         # The posture nearest to both neighbours costs the least motion.
         far = np.abs(solutions - branch.path[0]).max(axis=1) + np.abs(solutions - request.start).max(axis=1)
         problem: StageError | None = None
-        ways: list[tuple[Array, Array]] = []
+        found: list[tuple[Array, Array]] = []
         self.space.lay(request, request.tool.world_from_object)
         solutions = solutions[np.argsort(far, kind="stable")][:8]
-
-        @cache
-        def backs(share: float) -> list[Array | None]:
-            return self.straight(tip, -share * settings.standoff * tip[:3, 2], solutions)
-
-        for n, q in enumerate(solutions):
-            request.budget.check("approach")
-            for back in (backs(share)[n] for share in (1.0, 0.5)):
+        for share in (1.0, 0.5):
+            for back, q in zip(self.straight(tip, -share * settings.standoff * tip[:3, 2], solutions), solutions, strict=True):
+                request.budget.check("approach")
                 if back is None:
                     problem = problem or StageError(
                         "approach",
@@ -68,21 +65,31 @@ class HandMoves:
                     continue
                 hit = robot.first_collision(back[::-1], budget=request.budget, stage="approach")
                 if hit is None:
-                    ways.append((back[::-1], q))
-                    break
+                    found.append((back[::-1], q))
+                    continue
                 problem = StageError(
                     "approach",
                     MagicError(Code.PATH_IN_COLLISION, f"coming to the grasp: {hit[1]}", "in collision", "a clear way to the tool"),
                 )
-            if len(ways) >= 3:
-                break
-        for back, q in ways:
+        for back, q in self._roomiest(request, found)[:WAYS]:
             try:
                 return back, q, self._lift(request, branch, tip, q)
             except StageError as error:
                 problem = error
         assert problem is not None
         raise problem
+
+    def _roomiest(self, request: Request, ways: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+        """The ways to the grasp in their order, but first those that begin with room about the tool and all that is beside it."""
+        left, ordered = ways, []
+        for room in (self.settings.room, self.settings.room / 3):
+            self.space.come(request, room)
+            kept = [not self.robot.collides(back[0]) for back, _ in left]
+            ordered += [way for way, keeps in zip(left, kept, strict=True) if keeps]
+            left = [way for way, keeps in zip(left, kept, strict=True) if not keeps]
+        self.space.surround(request, 0.0)
+        self.space.lay(request, request.tool.world_from_object)
+        return ordered + left
 
     def raised(self, request: Request, branch: Branch) -> Array:
         """Joint path (n, J) by which a tool that is in the hand leaves what is beneath it; where it is clear, only the start (1, J)."""
@@ -117,18 +124,23 @@ class HandMoves:
         raise problem
 
     def retreat(self, request: Request, branch: Branch, task: Array) -> Array:
-        """Joint path (n, J) of the open hand away from the released tool: back along its own axis, or as near to it as is clear."""
+        """Joint path (n, J) of the open hand away from the released tool: back along its own axis, or as near to it as is clear.
+
+        A tool that is let go swings to where it hangs, often after the hand, and would lean on a finger that stays within its reach:
+        the hand goes the whole way where it can, else three quarters or half of it.
+        """
         robot, settings = self.robot, self.settings
         request.feedback("retreat", "taking the open hand away")
         self.space.lay(request, request.poses[-1])
         tip = request.poses[-1] @ branch.grasp.tool_from_tcp
         problem: StageError | None = None
-        back = -tip[:3, 2]
-        for direction in (back, transforms.unit(back + 0.5 * request.plane[:3]), transforms.unit(back - 0.5 * request.plane[:3])):
-            path = self.straight(tip, settings.retreat * direction, task[-1:])[0]
+        back, up = -tip[:3, 2], 0.5 * request.plane[:3]
+        directions = (back, transforms.unit(back + up), transforms.unit(back - up))
+        for way, direction in itertools.product(settings.retreat * np.array([1.0, 0.75, 0.5]), directions):
+            path = self.straight(tip, way * direction, task[-1:])[0]
             if path is None:
                 problem = problem or StageError(
-                    "retreat", MagicError(Code.NO_IK, "taking the open hand away", "out of reach", f"{settings.retreat} m of straight way")
+                    "retreat", MagicError(Code.NO_IK, "taking the open hand away", "out of reach", f"{way:.2f} m of straight way")
                 )
                 continue
             hit = robot.first_collision(path, budget=request.budget, stage="retreat")

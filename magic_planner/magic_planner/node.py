@@ -85,8 +85,12 @@ class PlannerNode(Node):
         settings = ArmSettings(
             standoff=parameter(self, "standoff", 0.08, "Metres of straight way to the grasp.", low=0.01, high=0.5),
             lift=parameter(self, "lift", 0.06, "Metres straight up after the grasp.", low=0.005, high=0.5),
-            retreat=parameter(self, "retreat", 0.08, "Metres straight away after a release.", low=0.01, high=0.5),
-            room=parameter(self, "room", 0.015, "Metres of room about a tool that is carried.", low=0.0, high=0.1),
+            retreat=parameter(
+                self, "retreat", 0.16, "Metres straight away after a release, less where that is out of reach.", low=0.01, high=0.5
+            ),
+            room=parameter(
+                self, "room", 0.015, "Metres of room about a tool that is carried, and about what the empty hand passes.", low=0.0, high=0.1
+            ),
             dwell=parameter(self, "dwell", 0.5, "Seconds for the fingers to close or open.", low=0.0, high=10.0),
             time_step=parameter(self, "time_step", 0.02, "Seconds between the points of the trajectory.", low=0.002, high=0.2),
         )

@@ -15,7 +15,7 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_planner.budget import Budget
 from magic_planner.cloud import cloud_name
-from magic_planner.collision import roomy_shell, solid_pieces
+from magic_planner.collision import roomy_shell, shell, solid_pieces
 from magic_planner.grasps import Grasp
 
 Array = NDArray[np.float64]
@@ -27,7 +27,8 @@ STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", 
 class ArmSettings:
     """key_length, key_angle: spacing of the poses at which grasps are compared.  lots: how many are compared at once, the best ones
     first.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
-    lift, retreat: metres.  room: metres about a tool that is carried.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
+    lift, retreat: metres.  room: metres about a tool that is
+    carried, and about all that the empty hand passes.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
     neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path (it
     takes some 30 ms; the limit is wide so that a loaded machine finds the same path).  searches: how many of a request may fail."""
 
@@ -37,7 +38,7 @@ class ArmSettings:
     tries: int = 10
     standoff: float = 0.08
     lift: float = 0.06
-    retreat: float = 0.08
+    retreat: float = 0.16
     room: float = 0.015
     dwell: float = 0.5
     jump: float = 0.5
@@ -78,9 +79,10 @@ class Request:
     cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
     searches: int  # that may still fail
 
-    def roomy(self, margin: float) -> list[Any]:
-        """The tool's surface grown by ``margin`` metres."""
-        return roomy_shell(solid_pieces(self.tool), margin) if margin > 0 else self.shapes
+    @staticmethod
+    def roomy(item: SceneObject, margin: float) -> list[Any]:
+        """The surface of tool, target or an obstacle, grown by ``margin`` metres."""
+        return roomy_shell(solid_pieces(item), margin) if margin > 0 else shell(solid_pieces(item))
 
     def surroundings(self, target: bool = True) -> list[str]:
         """Names of all that is in the collision world besides table and tool; without the target on request."""

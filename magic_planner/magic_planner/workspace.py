@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_planner.cloud import CloudSettings, cloud_name
-from magic_planner.collision import shell, solid_pieces
 from magic_planner.grasps import Grasp
 from magic_planner.request import Request
 from magic_planner.robot import Robot
@@ -29,11 +28,16 @@ class Workspace:
         robot = self.robot
         robot.clear()
         robot.add_table(request.plane)
+        self.surround(request, 0.0)
         for item in (request.target, *request.obstacles):
-            robot.add(item.id, shell(solid_pieces(item)), item.world_from_object)
             if item.id in request.cloud:
                 robot.add_cloud(cloud_name(item), request.cloud[item.id], self.cloud.resolution)
         robot.add(request.tool.id, request.shapes, request.tool.world_from_object)
+
+    def surround(self, request: Request, room: float) -> None:
+        """Target and obstacles where they are, with so much room (m) about them."""
+        for item in (request.target, *request.obstacles):
+            self.robot.add(item.id, request.roomy(item, room), item.world_from_object)
 
     def empty(self, request: Request) -> None:
         """The world without the tool, the hand open."""
@@ -59,15 +63,22 @@ class Workspace:
         self.hold(request, grasp)
         self.robot.allow(request.tool.id, "table", *request.surroundings())
 
-    def lay(self, request: Request, pose: Array) -> None:
-        """The world with the tool lying at a pose and the hand open about it; only the fingers may touch it."""
+    def lay(self, request: Request, pose: Array, shapes: list[Any] | None = None) -> None:
+        """The world with the tool (or other shapes in its frame) lying at a pose and the hand open about it; only the fingers may touch it."""
         robot, name = self.robot, request.tool.id
         robot.detach()
         robot.open_to(robot.config.opening)
-        robot.add(name, request.shapes, pose)
+        robot.add(name, shapes or request.shapes, pose)
         robot.allow(name, *robot.finger_links)
         robot.allow(name, "table", *request.surroundings())
         self.ignore_target(request, False)
+
+    def come(self, request: Request, room: float) -> None:
+        """The world of the empty hand on its way to the tool, everything but the table with so much room (m) about it; nothing may be
+        touched.  What is set up after it needs ``come(request, 0.0)`` first."""
+        self.surround(request, room)
+        self.lay(request, request.tool.world_from_object, request.roomy(request.tool, room))
+        self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
 
     def ignore_target(self, request: Request, ignored: bool) -> None:
         """Let the arm touch the target (once it moves with the tool, where it is is not known any more), or forbid it again."""

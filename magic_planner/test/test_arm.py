@@ -14,7 +14,7 @@ from magic_core.joint_limits import PUBLISHED
 from magic_core.strategy import Waypoint
 from magic_planner import timing
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, grown
+from magic_planner.collision import Body, grown, roomy_shell, shell
 from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
 from magic_planner.request import StageError
 
@@ -140,7 +140,7 @@ def test_a_releasing_strategy_lets_go_and_backs_off(arm):
         plan.tool_motion.world_from_tool[after], np.repeat(plan.tool_motion.world_from_tool[-1:], after.sum(), axis=0)
     )
     tips = arm.robot.chain.forward(motion.positions[[np.searchsorted(motion.times, motion.release_time), -1]])
-    assert np.linalg.norm(tips[1, :3, 3] - tips[0, :3, 3]) == pytest.approx(0.08, abs=2e-3)
+    assert np.linalg.norm(tips[1, :3, 3] - tips[0, :3, 3]) == pytest.approx(arm.settings.retreat, abs=2e-3)
 
 
 def test_out_of_reach_names_the_waypoint(arm):
@@ -240,6 +240,44 @@ def test_a_free_motion_is_clear_as_it_is_timed_and_not_only_as_it_was_found(arm)
         held.move(pose)
         gaps.append(held.touches(fixed))
     assert not any(gaps)
+
+
+def test_the_empty_hand_keeps_room_about_what_it_passes(arm, monkeypatch):
+    asked = []
+    come = arm.free.come
+    monkeypatch.setattr(arm.free, "come", lambda request, goal: asked.append((request, goal, come(request, goal))) or asked[-1][2])
+    arm.plan(*problem())
+    request, goal, path = asked[-1]
+    robot = arm.robot
+    middle = robot.chain.forward(path[None, 0] + 0.5 * (path[None, -1] - path[None, 0]))[0, :3, 3]
+    plate = scenes.box([0.04, 0.04, 0.01])
+
+    def clear(path, height, room):
+        robot.clear()
+        robot.add("plate", shell(grown([plate], room) if room else [plate]), transforms.make(translation=[*middle[:2], height]))
+        robot.open_to(robot.config.opening)
+        return not any(robot.collides(q) for q in timing.swept(path, 0.01))
+
+    # Some 2 mm below the hand.
+    height = next(z for z in np.arange(middle[2], 0.0, -0.001) if clear(path, z, 0.0)) - 0.002
+    assert not clear(path, height, 0.005)
+    request = dataclasses.replace(
+        request, obstacles=(scenes.item("plate", [plate], transforms.make(translation=[*middle[:2], height])),), searches=2
+    )
+    arm.space.build(request)
+    assert clear(come(request, goal), height, 0.005)
+
+
+def test_the_straight_way_to_a_grasp_begins_with_room_about_the_tool_where_it_can(arm, solved):
+    (_, tool, *_), plan = solved
+    robot = arm.robot
+    tips = robot.chain.forward(plan.arm_motion.positions)[:, :3, 3]
+    grasped = int(np.searchsorted(plan.arm_motion.times, plan.arm_motion.grasp_time))
+    robot.clear()
+    robot.add("tool", roomy_shell(tool.pieces, arm.settings.room), tool.world_from_object)
+    robot.open_to(robot.config.opening)
+    away = np.linalg.norm(tips[:grasped] - tips[grasped], axis=1) >= arm.settings.standoff - 1e-3
+    assert away.any() and not any(robot.collides(q) for q in plan.arm_motion.positions[:grasped][away])
 
 
 def test_a_carried_tool_keeps_room_about_it():
