@@ -8,7 +8,12 @@ import signal
 import sys
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+# No test may fail because the machine has other work.
+hypothesis.settings.register_profile("magic", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.load_profile("magic")
 
 # A shell that starts the tests in the background has them ignore SIGINT, and what the tests start would inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
