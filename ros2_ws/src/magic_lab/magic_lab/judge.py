@@ -57,9 +57,15 @@ class Track:
         places = self.poses[name][:, :3, 3]
         return np.linalg.norm(places - places[0], axis=1)
 
-    def begun(self, by: float) -> bool:
-        """Whether the hand has been more than ``by`` metres from where it was."""
-        return bool((np.linalg.norm((self.tcp - self.tcp[0])[:, :3, 3], axis=1) > by).any())
+    def begun(self, by: float, lead: float = 1.0) -> Track | None:
+        """The track from ``lead`` seconds before the hand was first more than ``by`` metres from where it was; ``None``: it never was.  While planner and
+        verifier are at work nothing moves, and that may be minutes."""
+        away = np.flatnonzero(np.linalg.norm((self.tcp - self.tcp[0])[:, :3, 3], axis=1) > by)
+        if not len(away):
+            return None
+        first = int(np.searchsorted(self.times, self.times[away[0]] - lead))
+        poses = {name: stack[first:] for name, stack in self.poses.items()}
+        return replace(self, times=self.times[first:], poses=poses, tcp=self.tcp[first:])
 
     def let_go(self, tool: str) -> int | None:
         """The sample at which the tool, once taken up, has left the hand; ``None``: it was never taken, or is held."""

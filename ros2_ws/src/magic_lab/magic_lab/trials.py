@@ -261,6 +261,7 @@ class Session:
                 executed=result.executed,
             )
             record["attempts"] = len(result.candidates)
+            record["refused"] = [int(candidate.code) for candidate in result.candidates if candidate.code != Code.OK]
             seconds = {"perceive": looked - begun, "match": times.match, "plan": times.plan, "verify": times.verify}
             seconds["execute"] = max(0.0, time.monotonic() - looked - times.perceive - times.match - times.plan - times.verify)
             record["seconds"] = {k: round(v, 2) for k, v in seconds.items()}
@@ -273,12 +274,14 @@ class Session:
             record.update(code=int(error.code), reason=error.message)
         seen = self.seen
         if len(seen.truth) > 1 and found:
-            track = Track.of(list(seen.truth), self._hand)
-            record["begun"] = track.begun(BEGUN)
-            judgement = judge(scene, record.get("tool", scene.tools[0]), track)
-            record.update(truth=int(judgement.code), judgement=judgement.message, success=judgement.code == Code.OK and record["executed"])
+            track = Track.of(list(seen.truth), self._hand).begun(BEGUN)
+            record["begun"] = track is not None
+            if track is not None:
+                judgement = judge(scene, record.get("tool", scene.tools[0]), track)
+                success = judgement.code == Code.OK and record["executed"]
+                record.update(truth=int(judgement.code), judgement=judgement.message, success=success)
         record.setdefault("code", int(Code.INTERNAL))
-        record["stage"] = _stage(record)
+        record["stage"] = stage_of(record)
         record["wall_seconds"] = round(time.monotonic() - begun, 1)
         path = _path(out, case, seed)
         out.mkdir(parents=True, exist_ok=True)
@@ -288,7 +291,7 @@ class Session:
         return record
 
 
-def _stage(record: dict[str, Any]) -> str:
+def stage_of(record: dict[str, Any]) -> str:
     """Where a trial that failed did; empty: it did not."""
     if record["success"]:
         return ""
@@ -296,7 +299,9 @@ def _stage(record: dict[str, Any]) -> str:
         return "truth"
     if record["begun"]:
         return "execute"
-    return STAGES.get(record["code"] // 100, "execute")
+    # Where no candidate succeeded: how far the one got that came furthest.
+    code = max(record.get("refused", []), default=0) if record["code"] == Code.NO_CANDIDATE_SUCCEEDED else record["code"]
+    return STAGES.get(code // 100, "execute")
 
 
 def film(seen: Seen, out: Path, name: str) -> dict[str, Any]:

@@ -104,6 +104,16 @@ def test_a_cup_hung_by_its_handle_passes():
     assert found.code == Code.OK, found.message
 
 
+def test_the_truth_begins_with_the_arm():
+    s = scene("hooking")
+    away = transforms.make(translation=[0.3, 0, 0.3])
+    moved = track(s, [(0, {}), (8, {})], lambda time, _p: shifted(away, 0.1 * max(0.0, time - 6.0)))
+    begun = moved.begun(0.01)
+    assert (begun.times[0], begun.times[-1]) == pytest.approx((5.15, 8.0), abs=0.051)
+    assert len(begun.times) == len(begun.tcp) == len(begun.poses["target"])
+    assert track(s, [(0, {}), (2, {})], lambda _t, _p: away).begun(0.01) is None
+
+
 def test_the_hand_and_what_it_holds():
     s = scene("hooking")
     tool = s.thing("tool_1").item.world_from_object

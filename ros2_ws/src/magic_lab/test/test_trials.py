@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from magic_core.errors import Code
-from magic_lab.trials import Seen, film, main, summary, told
+from magic_lab.trials import Seen, film, main, stage_of, summary, told
 
 
 def record(name, seed, success=True, **more):
@@ -42,6 +42,13 @@ def test_sums_are_by_object_and_name_each_failure():
     text = told(total)
     assert "caliper: 1 of 2 succeeded" in text and "match [NO_MATCH]: nothing like it" in text
     assert told(summary([])).startswith(":")
+
+
+def test_where_no_candidate_succeeded_the_stage_is_how_far_the_best_got():
+    code, refused = int(Code.NO_CANDIDATE_SUCCEEDED), [int(Code.NO_PATH), int(Code.GRASP_SLIPPED), int(Code.NO_IK)]
+    assert stage_of(record("mug", 0, False, begun=False, code=code, refused=refused)) == "verify"
+    assert stage_of(record("mug", 0, False, begun=False, code=code, refused=refused[:1])) == "plan"
+    assert stage_of(record("mug", 0, False, begun=True, code=int(Code.GOAL_UNSEEN))) == "execute"
 
 
 def test_the_video_opens_and_shows_every_moment(tmp_path):
