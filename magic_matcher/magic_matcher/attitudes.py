@@ -70,7 +70,7 @@ def rotations(count: int, seed: int = 0) -> NDArray[np.float64]:
 
 def follow(matcher: matching.Matcher, strategy: Strategy, mesh: Mesh, turns: NDArray[np.float64]) -> Followed:
     """Match a mesh (m, as it stands) in attitudes (N, 3, 3)."""
-    reference, radius = global_stage.from_strategy(strategy), strategy.target_contact.radius
+    reference, radius = global_stage.from_strategy(strategy), strategy.target_contact.disc_radius
     target = matching.Target("", strategy.target_view, strategy.target_contact)
     points, normals = np.full((len(turns), 3), np.nan), np.full((len(turns), 3), np.nan)
     for k, turn in enumerate(turns):

@@ -150,14 +150,14 @@ def by_curvature(
     rng = np.random.default_rng(seed)
     deadline = clock() + seconds
     reference = global_stage.from_strategy(strategy)
-    flat = not np.isfinite(strategy.target_contact.radius) or not np.isfinite(target.contact.radius) or target.contact.concave
-    of_reference = reference.contour.size * reference.view.metres_per_pixel if flat else strategy.target_contact.radius
+    shown, disc = strategy.target_contact.disc_radius, target.contact.disc_radius
+    of_reference = reference.contour.size * reference.view.metres_per_pixel if shown is None or disc is None else shown
     ratio = reference.radius * reference.view.metres_per_pixel / of_reference
     found: list[ContactCandidate] = []
     for number, tool in enumerate(tools):
         view = as_it_stands(tool, strategy.view)
         contour = contours.extract(view.mask)
-        scale = contour.size * view.metres_per_pixel if flat else target.contact.radius
+        scale = contour.size * view.metres_per_pixel if shown is None or disc is None else disc
         order = rng.permutation(len(contour.points))
         # Each tool gets its share of the time that is left.
         until = clock() + (deadline - clock()) / (len(tools) - number)

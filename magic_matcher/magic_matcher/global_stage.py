@@ -161,6 +161,6 @@ def make_reference(
 
 def from_strategy(strategy: Strategy) -> Reference:
     """The reference of a strategy: its tool's view and contact, and the target's radius at p_O where it is round there."""
-    target = strategy.target_contact
-    radius = target.radius / strategy.tool_view.metres_per_pixel if np.isfinite(target.radius) and not target.concave else None
+    disc = strategy.target_contact.disc_radius
+    radius = None if disc is None else disc / strategy.tool_view.metres_per_pixel
     return make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)

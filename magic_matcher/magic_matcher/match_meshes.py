@@ -81,7 +81,7 @@ def reference_of(given: argparse.Namespace) -> tuple[Reference, Contact, float, 
     """The reference, its contact, the radius (m) of its target, and the kind of view."""
     if given.strategy:
         found = strategies.find(given.strategy)
-        return global_stage.from_strategy(found), found.tool_contact, found.target_contact.radius, found.view
+        return global_stage.from_strategy(found), found.tool_contact, found.target_contact.disc_radius, found.view
     tool = draw(given.reference, given.kind, given.as_is)
     radius = given.reference_radius or given.radius
     reference = make_reference(tool.view, np.array(given.reference_point, dtype=float), None, radius / tool.view.metres_per_pixel)

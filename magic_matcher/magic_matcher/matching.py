@@ -30,7 +30,7 @@ from magic_core.strategy import Strategy
 from magic_core.surface import Surface
 from magic_core.views import as_it_stands, mirrored, own_views, same_direction, square_view
 from magic_matcher import contour as contours
-from magic_matcher import curvature, enclosing, global_stage, score
+from magic_matcher import curvature, enclosing, facing, global_stage, score
 from magic_matcher.contour import Contour
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
@@ -45,8 +45,8 @@ SAME_PLACE = 0.06
 COMPANIONS = 8
 #: Places of a target that are looked at where it is met at a feature.
 FEATURES = 8
-#: What faces a direction does so within this angle (rad); narrower ways across (share of the object's size) are the raster's.
-FACING, LEAST_ACROSS = np.deg2rad(30.0), 0.03
+#: Narrower ways across (share of the object's size) are the raster's.
+LEAST_ACROSS = 0.03
 #: By so much a match in another view must be better for the tool to be turned for it.
 WORTH_TURNING = 0.05
 
@@ -175,13 +175,13 @@ def inner_point(contour: Contour, direction: NDArray[np.float64], tolerance: flo
     with the widest way across is taken, in it the point that lies farthest against ``direction``, in the middle of a flat side.
     Raises ``NO_MATCH`` where the outline has no such place.
     """
-    facing = np.nonzero(contour.normals @ direction > np.cos(FACING))[0]
+    towards = np.nonzero(contour.normals @ direction > np.cos(facing.FACING))[0]
     way = np.arange(2.0, contour.size + 2.0)
-    ahead = (contour.points[facing, None] + way[:, None] * direction).astype(np.float32)
+    ahead = (contour.points[towards, None] + way[:, None] * direction).astype(np.float32)
     solid = contour.sample(ahead[..., 0], ahead[..., 1]) > 0.5
     across = np.where(solid.any(axis=1), way[np.argmax(solid, axis=1)], 0.0)
-    facing, across = facing[across > LEAST_ACROSS * contour.size], across[across > LEAST_ACROSS * contour.size]
-    if not len(facing):
+    towards, across = towards[across > LEAST_ACROSS * contour.size], across[across > LEAST_ACROSS * contour.size]
+    if not len(towards):
         raise MagicError(
             Code.NO_MATCH,
             "places inside the target's outline that face the tool",
@@ -189,9 +189,9 @@ def inner_point(contour: Contour, direction: NDArray[np.float64], tolerance: flo
             "a hole or a notch that is open towards the strategy's target normal",
         )
     # Stretches: neighbours on one loop.  A loop that begins within a stretch cuts it in two, which changes nothing that counts.
-    stretch = np.concatenate([[0], np.cumsum((np.diff(facing) > 3) | (np.diff(contour.loop[facing]) != 0))])
+    stretch = np.concatenate([[0], np.cumsum((np.diff(towards) > 3) | (np.diff(contour.loop[towards]) != 0))])
     widest = stretch[int(np.argmax(across))]
-    return _middle_of_highest(contour, facing[stretch == widest], -direction, tolerance)
+    return _middle_of_highest(contour, towards[stretch == widest], -direction, tolerance)
 
 
 def _middle_of_highest(contour: Contour, among: NDArray[np.int64], direction: NDArray[np.float64], tolerance: float) -> int:
@@ -208,14 +208,15 @@ def further_of(strategy: Strategy) -> tuple[Further, ...]:
     found = []
     for pair in strategy.contacts:
         alone = replace(strategy, tool_contact=pair.tool, target_contact=pair.target)
-        found.append(Further(pair.name, global_stage.from_strategy(alone), pair.tool, pair.target.radius))
+        found.append(Further(pair.name, global_stage.from_strategy(alone), pair.tool, pair.target.disc_radius))
     return tuple(found)
 
 
 def target_contact(
     strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64], matcher: Matcher | None = None
 ) -> Contact:
-    """p_O': where the target's silhouette reaches farthest along the strategy's target normal, with the curvature there.
+    """p_O': what of the target's silhouette a tool meets that is led against the strategy's target normal (:mod:`magic_matcher.facing`), with its
+    curvature; where that is neither flat, round nor a corner, the place that reaches farthest.
 
     For a strategy that meets its target inside, the place inside that faces that normal (:func:`inner_point`); for one that meets
     it at a feature, what :meth:`Matcher.feature_of` finds, by default with the features that ship.
@@ -230,14 +231,22 @@ def target_contact(
     if strategy.target_outline == "feature":
         return (matcher or Matcher(EmbeddedFeatures())).feature_of(strategy, view, direction)
     contour = contours.extract(view.mask)
-    place = support_point if strategy.target_outline == "outer" else inner_point
-    found = curvature.estimate(contour, place(contour, direction))
-    contact = to_contact(view, found)
+    met = facing.side(contour, direction) if strategy.target_outline == "outer" else None
+    if met is not None:
+        contact = Contact(
+            met.point,
+            direction,
+            met.radius * view.metres_per_pixel,
+            False,
+            met.scale * view.metres_per_pixel,
+            contact_frame(view, met.point, direction),
+        )
+    else:
+        place = support_point if strategy.target_outline == "outer" else inner_point
+        contact = to_contact(view, curvature.estimate(contour, place(contour, direction)))
     # The normal asked for is the one acted along; the picture's own differs from it by raster noise only.
     if float(contact.normal @ direction) > np.cos(np.deg2rad(20)):
-        contact = Contact(
-            contact.pixel, direction, contact.radius, contact.concave, contact.scale, contact_frame(view, contact.pixel, direction)
-        )
+        contact = replace(contact, normal=direction, object_from_contact=contact_frame(view, contact.pixel, direction))
     return contact
 
 
@@ -346,7 +355,7 @@ class Matcher:
         reference = global_stage.from_strategy(strategy)
         further = further_of(strategy)
         found = self.match_views(
-            reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.radius, start, further
+            reference, strategy.tool_contact, drawn, met, top_k, heatmap, strategy.target_contact.disc_radius, start, further
         )
         return replace(found, refused=(*found.refused, *(error.message for error in unseen)))
 
@@ -414,13 +423,13 @@ class Matcher:
         self, reference: Reference, contact: Contact, target: Target | None, radius: float | None, top_k: int, heatmap: bool = False
     ) -> _Task:
         prepared = self.prepare(reference)
-        # The radius of the disc that the tool is to hold; what is flat or is met inside is no disc.
-        round_target = target is not None and np.isfinite(target.contact.radius) and not target.contact.concave
-        use_target = round_target and radius is not None and np.isfinite(radius)
+        # The radius of the disc that the tool is to hold; what is flat, sharp or met inside is no disc.
+        disc = None if target is None else target.contact.disc_radius
+        use_target = disc is not None and radius is not None
         scale = radius if use_target else reference.contour.size * reference.view.metres_per_pixel
         ratio = reference.radius * reference.view.metres_per_pixel / scale
         asked = demands(reference, self.backend.floor)
-        return _Task(reference, contact, prepared, asked, ratio, target, bool(round_target), bool(use_target), top_k, heatmap)
+        return _Task(reference, contact, prepared, asked, ratio, target, disc, use_target, top_k, heatmap)
 
     def feature_of(self, strategy: Strategy, view: CanonicalView, direction: NDArray[np.float64]) -> Contact:
         """p_O' by analogy: the place on a target that looks most as the demonstrated one does at p_O, of those that face a picture direction (2,).
@@ -431,16 +440,16 @@ class Matcher:
         reference = global_stage.make_reference(strategy.target_view, shown.pixel, shown.normal)
         task = self._task(reference, shown, None, None, FEATURES)
         seen = self._in_view(task, "the target", view)
-        facing = [c for c in seen.candidates if float(c.tool.normal @ direction) > np.cos(FACING)]
-        if not facing:
+        looking = [c for c in seen.candidates if float(c.tool.normal @ direction) > np.cos(facing.FACING)]
+        if not looking:
             if not seen.candidates:
                 raise _no_match("the target", seen.refusal)
             off = min(np.degrees(np.arccos(np.clip(float(c.tool.normal @ direction), -1, 1))) for c in seen.candidates)
-            allowed = f"at most {np.degrees(FACING):.0f} degrees"
+            allowed = f"at most {np.degrees(facing.FACING):.0f} degrees"
             raise MagicError(
                 Code.NO_MATCH, "angle of the target's likest places to the strategy's target normal", f"{off:.0f} degrees", allowed
             )
-        return max(facing, key=lambda c: c.score).tool
+        return max(looking, key=lambda c: c.score).tool
 
     def target_of(self, item: SceneObject, strategy: Strategy) -> Target:
         """An object as the target of a strategy: its view, and where on it the strategy's contacts are."""
@@ -497,7 +506,7 @@ class Matcher:
     def _in_view(self, task: _Task, tool_id: str, view: CanonicalView) -> _Seen:
         """The best different places of one view that can stand in for the contact."""
         contour = contours.extract(view.mask)
-        radius = task.target.contact.radius / view.metres_per_pixel if task.target is not None and task.round_target else None
+        radius = None if task.disc is None else task.disc / view.metres_per_pixel
         proposals = self.backend.propose(task.prepared, view, contour, radius, RESERVE * task.top_k, task.heatmap)
         # Which of several places is best together with others is not known before these: all are looked at.
         first = len(proposals.proposals) if task.further else OVERSAMPLING * task.top_k
@@ -528,7 +537,7 @@ class Matcher:
         ]
         choices: list[list[ContactCandidate]] = []
         for name, one in task.further:
-            radius = one.target.contact.radius / view.metres_per_pixel if one.target is not None and one.round_target else None
+            radius = None if one.disc is None else one.disc / view.metres_per_pixel
             proposals = self.backend.propose(one.prepared, view, contour, radius, RESERVE * task.top_k)
             found, why = self._refine(one, tool_id, view, contour, radius, proposals.proposals)
             if not found:
@@ -559,7 +568,7 @@ class Matcher:
     ) -> tuple[list[ContactCandidate], list[Refusal]]:
         """The local stage on proposals and the score of those that can stand in for the contact; why the others cannot."""
         reference, target = task.reference, task.target
-        scale = target.contact.radius if task.use_target and target is not None else contour.size * view.metres_per_pixel
+        scale = task.disc if task.use_target else contour.size * view.metres_per_pixel
         starts = np.array([contour.nearest(proposal.pixel) for proposal in proposals], dtype=int)
         estimates = curvature.estimate_many(contour, starts, reference.concave, two_step=self.two_step)
         pairs = [(p, e) for p, e in zip(proposals, estimates, strict=True) if e is not None]
@@ -600,7 +609,7 @@ class Matcher:
 
 @dataclass(frozen=True)
 class _Task:
-    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); round_target: the target is a disc that the tool is to hold;
+    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); disc: radius (m) of the disc that stands for the target, if one does;
     further: the same for further contacts, by name."""
 
     reference: Reference
@@ -609,7 +618,7 @@ class _Task:
     asked: Demands
     ratio: float
     target: Target | None
-    round_target: bool
+    disc: float | None
     use_target: bool
     top_k: int
     heatmap: bool

@@ -256,7 +256,7 @@ def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: 
     else:
         drawn = [tool_of(tool, strategy.view) for tool in tools]
         reference = _reference(strategy)
-        found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.radius)
+        found = matcher.match_views(reference, strategy.tool_contact, drawn, met, top_k, False, strategy.target_contact.disc_radius)
     return found.candidates, found.features
 
 

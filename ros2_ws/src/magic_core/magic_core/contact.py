@@ -20,6 +20,9 @@ from magic_core.surface import PrincipalFrame
 #: target_contact_from_tool_contact when the two surfaces touch squarely: half a turn about z.
 OPPOSED = np.diag([-1.0, -1.0, 1.0, 1.0])
 
+#: A round contact's scale is 1 to 4 times its radius; an edge is one that is so much less than its scale.
+SHARP = 0.2
+
 
 @dataclass(frozen=True)
 class Contact:
@@ -41,6 +44,12 @@ class Contact:
     scale: float
     object_from_contact: NDArray[np.float64]
     surface: PrincipalFrame | None = None
+
+    @property
+    def disc_radius(self) -> float | None:
+        """r where a disc stands for what is met there, m; ``None`` on a straight side, in a hollow, and where an edge or a corner is met:
+        rounded by less than :data:`SHARP` of the scale at which it is."""
+        return self.radius if np.isfinite(self.radius) and not self.concave and self.radius >= SHARP * self.scale else None
 
     @property
     def signed_curvature(self) -> float:
