@@ -10,7 +10,7 @@ it carries.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,13 +27,30 @@ from magic_verifier.simulation import DYNAMIC, Settings
 
 #: Of a target that is held where it is, kg/m^3.
 HELD_DENSITY = 5e4
+#: Tool and target meet again when they did not touch for so long, s.
+APART = 0.3
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """One stretch of contact: first and last seconds from the motion's start; contact points, outward normals (3,) as of a :class:`Replay`; and how
+    far (3,) the target had been moved, in its own frame as it stood, m, when it began and when it ended."""
+
+    first: float
+    last: float
+    tool_point: NDArray[np.float64]
+    tool_normal: NDArray[np.float64]
+    target_point: NDArray[np.float64]
+    target_normal: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Replay:
     """What a replay found: contact points p_T in the tool's and p_O in the target's frame (3,) metres, the unit outward
-    normal of each surface there (3,) in the same frames, the share of the goal phase in contact, how many points were read, and
-    when in the phase they touched first and last, seconds from the motion's start."""
+    normal of each surface there (3,) in the same frames, the share of the goal phase in contact, how many points were read,
+    when in the phase they touched first and last, seconds from the motion's start, and each stretch of contact in the phase."""
 
     tool_point: NDArray[np.float64]
     tool_normal: NDArray[np.float64]
@@ -43,6 +60,7 @@ class Replay:
     points: int
     first: float
     last: float
+    meetings: tuple[Meeting, ...] = ()
 
 
 class Shown(Protocol):
@@ -118,9 +136,9 @@ def replay(
         raise MagicError(Code.BAD_REQUEST, "phase to read contacts in", watched, [p.name for p in phases])
     # A ball rolls under the tool: its contact is a place on it as it stood, not on its turning surface.
     world_from_still = target.world_from_object.copy()
-    sums = {name: np.zeros(3) for name in ("tool_point", "tool_normal", "target_point", "target_normal")}
-    weight, count, touched, looked = 0.0, 0, 0, 0
-    moments: list[float] = []
+    target_from_start = transforms.inverse(target.world_from_object)
+    stretches: list[_Stretch] = []
+    count, touched, looked = 0, 0, 0
     while run.time < run.duration:
         run.advance()
         if held:
@@ -131,17 +149,16 @@ def replay(
         looked += 1
         touches = [t for t in run.world.touches(TOOL, TARGET, TOUCH) if np.linalg.norm(t.impulse) > 0]
         touched += bool(touches)
-        moments += [run.time] if touches else []
         world_from_still[:3, 3] = run.world.position(TARGET)
         tool_from_world, target_from_world = transforms.inverse(run.world.pose(TOOL)), transforms.inverse(world_from_still)
+        if touches and (not stretches or run.time - stretches[-1].last > APART):
+            stretches.append(_Stretch(run.time))
         for touch in touches:
-            force = float(np.linalg.norm(touch.impulse))
-            sums["tool_point"] += force * transforms.apply(tool_from_world, touch.position)
-            sums["target_point"] += force * transforms.apply(target_from_world, touch.position)
+            moved = target_from_start[:3, :3] @ world_from_still[:3, 3] + target_from_start[:3, 3]
             # The contact's normal points towards the tool: out of the target's surface.
-            sums["target_normal"] += force * (target_from_world[:3, :3] @ touch.normal)
-            sums["tool_normal"] -= force * (tool_from_world[:3, :3] @ touch.normal)
-            weight += force
+            points = (tool_from_world @ [*touch.position, 1.0])[:3], (target_from_world @ [*touch.position, 1.0])[:3]
+            normals = -tool_from_world[:3, :3] @ touch.normal, target_from_world[:3, :3] @ touch.normal
+            stretches[-1].add(run.time, float(np.linalg.norm(touch.impulse)), points, normals, moved)
             count += 1
     if count == 0:
         raise MagicError(
@@ -150,16 +167,45 @@ def replay(
             0,
             "at least one contact that carries a force",
         )
-    return Replay(
-        sums["tool_point"] / weight,
-        transforms.unit(sums["tool_normal"]),
-        sums["target_point"] / weight,
-        transforms.unit(sums["target_normal"]),
-        touched / max(looked, 1),
-        count,
-        moments[0],
-        moments[-1],
-    )
+    whole = _Stretch.joined(stretches)
+    return Replay(*whole.read(), touched / max(looked, 1), count, whole.first, whole.last, tuple(s.meeting() for s in stretches))
+
+
+@dataclass
+class _Stretch:
+    """What adds up to a meeting, each point weighted by its force."""
+
+    first: float
+    last: float = 0.0
+    weight: float = 0.0
+    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 3)))
+    moved: list[NDArray[np.float64]] = field(default_factory=list)
+
+    def add(
+        self,
+        time: float,
+        force: float,
+        points: tuple[NDArray[np.float64], NDArray[np.float64]],
+        normals: tuple[NDArray[np.float64], NDArray[np.float64]],
+        moved: NDArray[np.float64],
+    ) -> None:
+        """Points and outward normals of tool and target, each in its own frame."""
+        self.last, self.weight = time, self.weight + force
+        self.sums += force * np.stack([points[0], normals[0], points[1], normals[1]])
+        self.moved = [*self.moved[:1], moved]
+
+    @staticmethod
+    def joined(stretches: list[_Stretch]) -> _Stretch:
+        """All of them as one."""
+        weight, sums = sum(s.weight for s in stretches), np.sum([s.sums for s in stretches], axis=0)
+        return _Stretch(stretches[0].first, stretches[-1].last, weight, sums)
+
+    def read(self) -> tuple[NDArray[np.float64], ...]:
+        """Mean point and normal on the tool, then on the target."""
+        return self.sums[0] / self.weight, transforms.unit(self.sums[1]), self.sums[2] / self.weight, transforms.unit(self.sums[3])
+
+    def meeting(self) -> Meeting:
+        return Meeting(self.first, self.last, *self.read(), self.moved[0], self.moved[-1])
 
 
 def distance_in_view(view: CanonicalView, point: NDArray[np.float64], other: NDArray[np.float64]) -> float:

@@ -556,8 +556,13 @@ def _learn(given: argparse.Namespace) -> int:
         f"mode {strategy.mode}, matched in the view {strategy.view}, the target met at the {strategy.target_outline} outline; contacts of the "
         f"replay: {1000 * learned.tool_gap:.1f} mm from the strategy's on the tool, {1000 * learned.target_gap:.1f} mm on the target"
     )
+    if strategy.contacts:
+        print(
+            f"contacts, one after the other: {', '.join(pair.name for pair in strategy.contacts)}, and the one that the goal is reached with"
+        )
     for waypoint in strategy.waypoints:
-        print(f"  {waypoint.phase:9} {waypoint.name:12} " + " ".join(f"{1000 * x:7.1f}" for x in waypoint.offset) + " mm")
+        offset = " ".join(f"{1000 * x:7.1f}" for x in waypoint.offset)
+        print(f"  {waypoint.phase:9} {waypoint.name:12} {offset} mm{f' of {waypoint.contact}' if waypoint.contact else ''}")
     verdict = learned.verdict
     if verdict is None:
         print("not tried in simulation: it cannot judge this goal")

@@ -1,10 +1,12 @@
 """A strategy from one demonstration (paper, III-A): objects, the tool's motion, and what the motion was for.
 
 1. The motion is replayed in physics.  Where tool and target press on each other are the contact points p_T and p_O; when they
-   first do is when the contact is made.
+   first do is when the contact is made.  Where the tool parts from the target and goes on to move it from another place, each place is
+   a contact, the last one the strategy's first.
 2. The plane in which the contact is reasoned about is chosen: across the thinnest side of the tool in which both contacts are on an
    outline where they were shown.  Looked at from above if that direction is upright, else from the side; in section where the contact is
-   inside the silhouette, as a bowl's is.  The target may be met outside, in a hole or notch, or inside its cut.
+   inside the silhouette, as a bowl's is.  The target may be met outside, in a hole or notch, or inside its cut.  What is round was
+   met somewhere near the middle of the way that it was led: the contact is there.
 3. The part of the motion that belongs to the contact is kept, with its phases: approach, contact, goal, retreat.  Where the tool keeps
    its attitude it becomes waypoints (mode ``plan``), else it is carried over as it is (``retarget``).
 4. Where no goal is given it is found (:mod:`magic_verifier.inference`): of those that what was changed suggests, the strictest that the
@@ -20,18 +22,18 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from magic_core import transforms
-from magic_core.contact import OPPOSED, Contact, ContactCandidate
+from magic_core.contact import OPPOSED, Companion, Contact, ContactCandidate, contact_frame
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.rendering import canonical_view
 from magic_core.scene import VIEW_KINDS, CanonicalView, SceneObject
 from magic_core.shapes import section_view
-from magic_core.strategy import MODES, SIDES, Goal, Physics, Strategy, Waypoint
+from magic_core.strategy import MODES, SIDES, ContactPair, Goal, Physics, Strategy, Waypoint
 from magic_matcher import contour as contours
 from magic_matcher import curvature
 from magic_matcher.matching import target_contact, target_view, to_contact
 from magic_verifier import goals
-from magic_verifier.demonstration import Replay, replay
+from magic_verifier.demonstration import Meeting, Replay, replay
 from magic_verifier.floating import TARGET
 from magic_verifier.inference import Changed, changed, proposals
 from magic_verifier.posing import box_axes
@@ -46,6 +48,11 @@ SPACING = (0.002, np.deg2rad(1.0), 0.25)
 APPROACH, NEAR = 0.12, 0.02
 #: Rolling moves a contact: it is read until the tool has turned by so much since it was made (rad), for so long (s) at least.
 TURNED, READ = np.deg2rad(10.0), 0.2
+#: Tool and target meet in another place than before where the tool's normal is turned by so much (rad), or its point is so far (share of its
+#: size) from there; a touch that moves the target by less (m) is none.
+OTHERWISE, ELSEWHERE, MOVED = np.deg2rad(60.0), 0.15, 0.02
+#: A tool leads a target along a straight way if it is so long (m), and the path along it no longer than so many times that.
+LED, DETOUR = 0.03, 1.1
 #: Directions so near (rad) to upright or to level are taken to be so.
 NEARLY = np.deg2rad(20.0)
 #: A tool that turns less than this (rad) keeps its attitude.
@@ -142,9 +149,13 @@ def learn(demonstration: Demonstration, task: Task) -> Learned:
         seen = _changed(demonstration, task)
         task = replace(task, releases=task.releases or TARGET in seen.tool_on)
     motion = _motion(demonstration, task)
-    found, made, parted = _contacts(demonstration, task, motion)
-    draft, tool_gap, target_gap = _drafted(demonstration, task, motion, found, made)
-    strategy = _with_motion(draft, motion, made, parted, task.mode)
+    found, made, parted, meetings = _contacts(demonstration, task, motion)
+    draft, tool_gap, target_gap = _drafted(demonstration, task, motion, found, made, parted)
+    if len(meetings) > 1:
+        strategy = _with_motions(_with_earlier(draft, demonstration.target, meetings[:-1]), motion, meetings)
+    else:
+        strategy = _with_motion(draft, motion, made, parted, task.mode)
+    made = meetings[0].first if len(meetings) > 1 else made
     if seen is None:
         shown = _shown(demonstration, strategy, motion, made, parted)
         return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown)
@@ -176,45 +187,62 @@ def _changed(demonstration: Demonstration, task: Task) -> Changed:
     return changed(*scene, task.physics, motion.times, demonstration.target.world_from_object @ motion.target_from_tool)
 
 
-def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float) -> tuple[Strategy, float, float]:
+def _drafted(
+    demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float, parted: float
+) -> tuple[Strategy, float, float]:
     """The strategy but for its phases, looked at so that both contacts are where they were shown, and how far (m) each is from there.
 
-    The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  Raises BAD_REQUEST that says
-    how near the best of them came.
+    The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  A round thing that was met a
+    millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led, and so does the tool: there the
+    normals are those of the way.  Raises BAD_REQUEST that says how near the best of them came.
     """
     tool, target = demonstration.tool, demonstration.target
     world_from_tool = target.world_from_object @ motion.target_from_tool[motion.index(made)]
     came = world_from_tool[:3, 3] - (target.world_from_object @ motion.target_from_tool[_last_away(motion, found, made, APPROACH)])[:3, 3]
     towards = target.world_from_object[:3, :3] @ found.target_normal
+    way = target.world_from_object[:3, :3] @ _way(motion, found, made, parted)
+
+    def drawn(direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float, float]:
+        normal = levelled(transforms.unit(towards - (towards @ direction) * direction))
+        view, contact, tool_gap = _tool_contact(tool, world_from_tool, direction, read, task.view)
+        draft = Strategy(
+            name=task.name,
+            description=task.description,
+            view=view.kind,
+            mode="retarget",
+            tool_view=view,
+            tool_contact=contact,
+            target_view=view,
+            target_contact=contact,
+            target_normal=normal,
+            target_view_direction=direction,
+            times=motion.times,
+            target_from_tool=motion.target_from_tool,
+            tool_mesh=tool.mesh,
+            target_mesh=target.mesh,
+            waypoints=(),
+            goal=task.goal or Goal("none"),
+            physics=task.physics,
+            releases=task.releases,
+            simulatable=task.simulatable,
+        )
+        return *_target_contact(draft, target, read), tool_gap
+
     why: list[MagicError] = []
     for direction in view_directions(tool, world_from_tool, towards, came):
         if task.view and (task.view == "top") != (direction[2] != 0.0):
             continue
-        normal = levelled(transforms.unit(towards - (towards @ direction) * direction))
         try:
-            view, contact, tool_gap = _tool_contact(tool, world_from_tool, direction, found, task.view)
-            draft = Strategy(
-                name=task.name,
-                description=task.description,
-                view=view.kind,
-                mode="retarget",
-                tool_view=view,
-                tool_contact=contact,
-                target_view=view,
-                target_contact=contact,
-                target_normal=normal,
-                target_view_direction=direction,
-                times=motion.times,
-                target_from_tool=motion.target_from_tool,
-                tool_mesh=tool.mesh,
-                target_mesh=target.mesh,
-                waypoints=(),
-                goal=task.goal or Goal("none"),
-                physics=task.physics,
-                releases=task.releases,
-                simulatable=task.simulatable,
-            )
-            draft, target_gap = _target_contact(draft, target, found)
+            draft, target_gap, tool_gap = drawn(direction, towards, found)
+            if (
+                draft.target_outline == "outer"
+                and draft.target_contact.disc_radius
+                and way @ towards < -np.cos(NEARLY) * np.linalg.norm(way)
+            ):
+                led = levelled(transforms.unit(way - (way @ direction) * direction))
+                read = replace(found, tool_normal=world_from_tool[:3, :3].T @ led, target_normal=-target.world_from_object[:3, :3].T @ led)
+                draft, target_gap, tool_gap = drawn(direction, -led, read)
+                draft = replace(draft, tool_contact=_led(draft.tool_view, draft.tool_contact, read.tool_normal))
             return draft, tool_gap, target_gap
         except MagicError as error:
             why.append(error)
@@ -223,7 +251,37 @@ def _drafted(demonstration: Demonstration, task: Task, motion: _Motion, found: R
     raise MagicError(Code.BAD_REQUEST, "view", task.view, "one in which the contact is seen in profile; without --view it is found")
 
 
-def _target_contact(draft: Strategy, target: SceneObject, found: Replay) -> tuple[Strategy, float]:
+def _way(motion: _Motion, found: Replay, made: float, parted: float) -> Array:
+    """How far (3,), in the target's frame as it stood, the tool's contact point is led from when the contact is made until they part, m.
+
+    Zeros where that is less than LED, not straight, or the tool turns on it.
+    """
+    first, last = motion.index(made), motion.index(parted)
+    poses = motion.target_from_tool[first : last + 1]
+    points = poses[:, :3, :3] @ found.tool_point + poses[:, :3, 3]
+    way = points[-1] - points[0]
+    long = float(np.linalg.norm(way))
+    length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    turned = max(_apart(pose, poses[0])[1] for pose in poses)
+    return way if long >= LED and length <= DETOUR * long and turned <= TURNED else np.zeros(3)
+
+
+def _led(view: CanonicalView, contact: Contact, normal: Array) -> Contact:
+    """A tool's contact with the outward normal (3,) along which it was led, in the tool's frame: where its edge is square to that, if it is nearby."""
+    contour = contours.extract(view.mask)
+    towards = transforms.unit(normal @ view.object_from_view[:3, :2])
+    index = contour.nearest(contact.pixel)
+    reach = max(OFF_OUTLINE / view.metres_per_pixel, OFF_SHARE * contour.size)
+    near, _ = contour.window(np.array([index]), np.arange(-round(reach), round(reach) + 1))
+    # The bottom of a hollow, the top of a bulge; of a straight edge that is askew neither is there.
+    height = contour.points[near[0]] @ towards * (-1.0 if contact.concave else 1.0)
+    highest = np.flatnonzero(height >= height.max() - 0.25)
+    middle = int(highest[len(highest) // 2])
+    pixel = contour.points[near[0, middle]] if highest[0] > 0 and highest[-1] < len(height) - 1 else contact.pixel
+    return replace(contact, pixel=pixel, normal=towards, object_from_contact=contact_frame(view, pixel, towards))
+
+
+def _target_contact(draft: Strategy, target: SceneObject, found: Replay | Meeting) -> tuple[Strategy, float]:
     """The strategy with the first of the target's outlines whose contact is where it was shown, and how far (m) it is from there."""
     gaps: dict[str, float] = {}
     for outline in SIDES:
@@ -296,19 +354,63 @@ def _apart(a: Array, b: Array) -> tuple[float, float]:
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), transforms.rotation_angle(a, b)
 
 
-def _contacts(demonstration: Demonstration, task: Task, motion: _Motion) -> tuple[Replay, float, float]:
-    """What the replay reads, when the contact is made and when tool and target part, seconds."""
+def _contacts(demonstration: Demonstration, task: Task, motion: _Motion) -> tuple[Replay, float, float, tuple[Meeting, ...]]:
+    """What the replay reads of the contact that the goal is reached with, when it is made and when tool and target part, seconds; and, where the
+    target was moved from several places of a tool that keeps its attitude, one after the other, all of these meetings, that one the last."""
     end = float(motion.times[-1])
     scene = demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table
     if task.releases:
-        return replay(motion, *scene, phases=(Phase("goal", 0.0, end),)), end, end
+        return replay(motion, *scene, phases=(Phase("goal", 0.0, end),)), end, end, ()
     whole = replay(motion, *scene, phases=(Phase("goal", 0.0, end),))
-    made = motion.index(whole.first)
+    meetings = () if task.mode == "retarget" else _places(whole.meetings, demonstration.tool)
+    if len(meetings) > 1:
+        poses = motion.target_from_tool[motion.index(meetings[0].first) : motion.index(meetings[-1].last) + 1]
+        meetings = meetings if max(_apart(pose, poses[0])[1] for pose in poses) < ATTITUDE else ()
+    first, last = (meetings[-1].first, meetings[-1].last) if len(meetings) > 1 else (whole.first, whole.last)
+    made = motion.index(first)
     turned = [k for k in range(made, len(motion.times)) if _apart(motion.target_from_tool[k], motion.target_from_tool[made])[1] > TURNED]
-    until = min(whole.last, float(motion.times[turned[0]]) if turned else end)
-    until = min(max(until, whole.first + READ), end)
-    phases = (Phase("approach", 0.0, whole.first), Phase("contact", whole.first, until), Phase("goal", until, end + 1e-3))
-    return replay(motion, *scene, phases=phases, watched="contact"), whole.first, whole.last
+    until = min(last, float(motion.times[turned[0]]) if turned else end)
+    until = min(max(until, first + READ), end)
+    phases = (Phase("approach", 0.0, first), Phase("contact", first, until), Phase("goal", until, end + 1e-3))
+    found = replay(motion, *scene, phases=phases, watched="contact")
+    return found, first, last, meetings
+
+
+def _places(meetings: tuple[Meeting, ...], tool: SceneObject) -> tuple[Meeting, ...]:
+    """Of the stretches of contact in which the target was moved those that follow each other at different places of the tool.
+
+    What goes on where it was, after the tool was lifted, is one; a touch that moves nothing is none.
+    """
+    size = float(np.linalg.norm(tool.mesh.extents))
+    found: list[Meeting] = []
+    for meeting in meetings:
+        if np.linalg.norm(meeting.after - meeting.before) < MOVED:
+            continue
+        last = found[-1] if found else None
+        if last is not None and _same_place(last, meeting, size):
+            found[-1] = replace(last, last=meeting.last, after=meeting.after)
+        else:
+            found.append(meeting)
+    return tuple(found)
+
+
+def _same_place(one: Meeting, other: Meeting, size: float) -> bool:
+    alike = one.tool_normal @ other.tool_normal > np.cos(OTHERWISE)
+    return bool(alike and np.linalg.norm(one.tool_point - other.tool_point) < ELSEWHERE * size)
+
+
+def _with_earlier(draft: Strategy, target: SceneObject, earlier: tuple[Meeting, ...]) -> Strategy:
+    """The strategy with the contacts of earlier meetings, in its own views; raises BAD_REQUEST where one of them is not seen in profile there."""
+    pairs = []
+    for number, meeting in enumerate(earlier, 1):
+        contact, gap = _on_outline(draft.tool_view, meeting)
+        if contact is None:
+            raise _no_profile({f"{draft.view} of the last contact": gap})
+        towards = target.world_from_object[:3, :3] @ meeting.target_normal
+        normal = levelled(transforms.unit(towards - (towards @ draft.target_view_direction) * draft.target_view_direction))
+        met, _ = _target_contact(replace(draft, target_normal=normal), target, meeting)
+        pairs.append(ContactPair(f"contact_{number}", contact, met.target_contact, normal, met.target_outline))
+    return replace(draft, contacts=tuple(pairs))
 
 
 def _last_away(motion: _Motion, found: Replay, made: float, distance: float) -> int:
@@ -357,14 +459,26 @@ def _tool_contact(
     gaps: dict[str, float] = {}
     for tried in kinds:
         view = section_view(tool.mesh, along, up) if tried == "section" else canonical_view(tool.mesh, along, up, tried)
-        contour = contours.extract(view.mask)
-        pixel, towards = view.pixels(found.tool_point), found.tool_normal @ view.object_from_view[:3, :2]
-        away = np.linalg.norm(contour.points - pixel, axis=1) + np.where(contour.normals @ towards > 0.3, 0.0, np.inf)
-        index = int(away.argmin())
-        gaps[tried] = float(away[index]) * view.metres_per_pixel
-        if gaps[tried] <= max(OFF_OUTLINE, OFF_SHARE * contour.size * view.metres_per_pixel):
-            return view, to_contact(view, curvature.estimate(contour, index)), gaps[tried]
-    raise MagicError(
+        contact, gaps[tried] = _on_outline(view, found)
+        if contact is not None:
+            return view, contact, gaps[tried]
+    raise _no_profile(gaps)
+
+
+def _on_outline(view: CanonicalView, read: Replay | Meeting) -> tuple[Contact | None, float]:
+    """The place on the tool's outline where it met the target, ``None`` where that is not on it, and how far (m) it is from what was read."""
+    contour = contours.extract(view.mask)
+    pixel, towards = view.pixels(read.tool_point), read.tool_normal @ view.object_from_view[:3, :2]
+    away = np.linalg.norm(contour.points - pixel, axis=1) + np.where(contour.normals @ towards > 0.3, 0.0, np.inf)
+    index = int(away.argmin())
+    gap = float(away[index]) * view.metres_per_pixel
+    if gap > max(OFF_OUTLINE, OFF_SHARE * contour.size * view.metres_per_pixel):
+        return None, gap
+    return to_contact(view, curvature.estimate(contour, index)), gap
+
+
+def _no_profile(gaps: dict[str, float]) -> MagicError:
+    return MagicError(
         Code.BAD_REQUEST,
         "distance of the contact from the tool's outline",
         ", ".join(f"{1000 * gap:.0f} mm in the view {name}" for name, gap in gaps.items()),
@@ -390,6 +504,52 @@ def _with_motion(strategy: Strategy, motion: _Motion, made: float, parted: float
     times = motion.times[start:] - motion.times[start]
     target_from_tool = target_from_contact @ contacts[start:] @ transforms.inverse(tool_from_contact)
     return replace(strategy, mode=mode, times=times, target_from_tool=target_from_tool, waypoints=waypoints)
+
+
+def _with_motions(strategy: Strategy, motion: _Motion, meetings: tuple[Meeting, ...]) -> Strategy:
+    """The strategy with a motion that meets the target in one place after the other, in mode ``plan``.
+
+    meetings: in their order, those of the strategy's further contacts and at last of its first.  Offsets are from where the target stood
+    when the motion began: a contact that is made after the target was moved is made as far from there.
+    """
+    pairs = [*((p.name, p.target, p.tool) for p in strategy.contacts), ("", strategy.target_contact, strategy.tool_contact)]
+    legs = []
+    for (name, target, tool), meeting in zip(pairs, meetings, strict=True):
+        contact_from_target = transforms.inverse(target.object_from_contact)
+        contacts = contact_from_target @ motion.target_from_tool @ tool.object_from_contact
+        first, last = motion.index(meeting.first), motion.index(meeting.last)
+        contacts[:, :2, 3] += (contact_from_target[:3, :3] @ meeting.before)[:2] - contacts[first, :2, 3]
+        legs.append((name, contacts, first, last))
+
+    def away(leg: tuple[str, Array, int, int], at: int) -> Array:
+        return np.linalg.norm(leg[1][:, :3, 3] - leg[1][at, :3, 3], axis=1)
+
+    end = len(motion.times) - 1
+    far = np.flatnonzero(away(legs[0], legs[0][2])[: legs[0][2]] >= APPROACH)
+    start = begin = int(far[-1]) if len(far) else 0
+    waypoints: list[Waypoint] = []
+    for number, leg in enumerate(legs):
+        name, contacts, first, last = leg
+        far = np.flatnonzero(away(leg, first)[begin:first] >= NEAR)
+        near = begin + int(far[-1]) if len(far) else begin
+        ends = [(near, "over"), (first, "over" if name else "goal")] if number else [(near, "approach"), (first, "contact")]
+        over = end
+        if name:
+            # The tool goes over to the next contact where it is farthest from both.
+            meets = legs[number + 1][2]
+            over = last + int(np.minimum(away(leg, last), away(legs[number + 1], meets))[last : meets + 1].argmax())
+        ends += [(last, name or "goal"), (over, "over" if name else "retreat")]
+        ends = [(k, phase) for n, (k, phase) in enumerate(ends) if k > (ends[n - 1][0] if n else begin)]
+        made = _waypoints(motion.times, contacts[:, :3, 3], begin, ends, every=True)
+        waypoints += [replace(w, name=f"{w.name}_{number}" if number else w.name, contact=name) for w in made[number > 0 :]]
+        begin = over
+    # Within a leg a phase may end twice: on the way, and where the contact is made.
+    named = [w.name for w in waypoints]
+    waypoints = [replace(w, name=f"{w.name}_made") if w.name in named[:k] else w for k, w in enumerate(waypoints)]
+    target_from_contact, tool_from_contact = (c.object_from_contact for c in (strategy.target_contact, strategy.tool_contact))
+    target_from_tool = target_from_contact @ legs[-1][1][start:] @ transforms.inverse(tool_from_contact)
+    times = motion.times[start:] - motion.times[start]
+    return replace(strategy, mode="plan", times=times, target_from_tool=target_from_tool, waypoints=tuple(waypoints))
 
 
 def _waypoints(times: Array, offsets: Array, start: int, ends: list[tuple[int, str]], every: bool) -> tuple[Waypoint, ...]:
@@ -429,7 +589,16 @@ def _tried(demonstration: Demonstration, strategy: Strategy) -> Verdict | None:
     goals.require(strategy)
     scene = demonstration.tool, demonstration.target
     candidate = ContactCandidate(
-        demonstration.tool.id, strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4)
+        demonstration.tool.id,
+        strategy.tool_contact,
+        strategy.target_contact,
+        0.0,
+        False,
+        1.0,
+        1.0,
+        1.0,
+        np.eye(4),
+        tuple(Companion(pair.name, pair.tool, pair.target) for pair in strategy.contacts),
     )
     try:
         motion = plan_tool_motion(strategy, *scene, candidate, "keep", demonstration.table, demonstration.obstacles)

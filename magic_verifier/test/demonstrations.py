@@ -80,3 +80,23 @@ def pressing():
     peg = scenes.item("target", [scenes.standing_cylinder(0.02)], _at(0.55, 0.0, 0.02))
     way = [(LYING, 0.0), (LYING, 0.5), (_at(0.45, 0, 0.2), 1.5), (_at(0.45, 0, 0.06), 1.0), (_at(0.45, 0, 0.039), 1.0)]
     return shown(tool, peg, [*way, (_at(0.45, 0, 0.039), 0.5), (_at(0.45, 0, 0.1), 1.0)])
+
+
+def shunting():
+    """A block is pushed away by the outside of a hook's tip, then, the tool lifted over it, pulled nearer by its inside; the target's way of each."""
+    tool = scenes.item(
+        "tool", [scenes.block((-0.25, 0.0), (-0.01, 0.01), (0.0, 0.02)), scenes.block((-0.02, 0.0), (0.01, 0.08), (0.0, 0.02))], LYING
+    )
+    block = scenes.item("target", [scenes.block((-0.02, 0.02), (-0.025, 0.025), (-0.02, 0.02))], _at(0.55, 0.0, 0.02))
+    low, aside, out, back = 0.003, -0.045, 0.53, 0.57 + 0.02
+    way = [
+        (LYING, 0.0),
+        (LYING, 0.5),
+        (_at(out - 0.1, aside, 0.1), 1.5),
+        (_at(out - 0.1, aside, low), 1.0),
+        (_at(out - 0.01, aside, low), 1.0),
+    ]
+    way += [(_at(out + 0.06, aside, low), 1.0), (_at(out + 0.03, aside, low), 0.5), (_at(out + 0.03, aside, 0.1), 1.0)]
+    way += [(_at(back + 0.11, aside, 0.1), 1.5), (_at(back + 0.11, aside, low), 1.0), (_at(back + 0.07, aside, low), 1.0)]
+    way += [(_at(back - 0.12, aside, low), 2.0), (_at(back - 0.09, aside, low), 0.5), (_at(back - 0.09, aside, 0.1), 1.0)]
+    return shown(tool, block, way)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from demonstrations import demonstration, pressing, pushing, ring_pulling
+from demonstrations import demonstration, pressing, pushing, ring_pulling, shunting
 
 pytest.importorskip("magic_planner.object_motion")
 
@@ -14,6 +14,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.goal import shipped as shipped_goal
 from magic_core.strategy import Goal, Physics, load, save
 from magic_matcher.matching import target_contact, target_view
+from magic_verifier import learning
+from magic_verifier.demonstration import Meeting
 from magic_verifier.inference import Changed, asked, proposals
 from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, learn, levelled, smoothed
 
@@ -35,6 +37,7 @@ def test_what_is_learned_is_what_was_annotated(name, view, mode, tmp_path):
     seen, task, annotated = shipped(name)
     learned = learn(seen, task)
     assert (learned.strategy.view, learned.strategy.mode) == (view, mode)
+    assert learned.strategy.contacts == ()
     for ours, theirs in (
         (learned.strategy.tool_contact, annotated.tool_contact),
         (learned.strategy.target_contact, annotated.target_contact),
@@ -50,6 +53,23 @@ def test_what_is_learned_is_what_was_annotated(name, view, mode, tmp_path):
     save(learned.strategy, tmp_path / name)
     again = load(tmp_path / name)
     np.testing.assert_allclose(again.target_from_tool, learned.strategy.target_from_tool, atol=1e-6)
+
+
+@pytest.mark.parametrize("aside", [0.003, -0.004])
+def test_a_ball_met_aside_of_its_middle_is_pulled_the_way_it_was_led(aside, monkeypatch):
+    seen, task, _ = shipped("hooking")
+    poses = seen.world_from_tool.copy()
+    poses[:, 1, 3] += aside
+    monkeypatch.setattr(learning, "verify", lambda *given, **named: None)
+    strategy = learn(replace(seen, world_from_tool=poses), task).strategy
+    # By the normals of where they met the way would be up to 9 degrees askew of the contact.
+    np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.01)
+    pulled = next(w for w in strategy.waypoints if w.name == "goal").offset
+    assert abs(pulled[1]) < 0.01 * abs(pulled[0])
+    # The tool is held as it was shown.
+    at = np.abs(strategy.target_from_tool[:, 0, 3] - strategy.target_from_tool[0, 0, 3]).argmin()
+    frames = strategy.target_from_tool[at] @ strategy.tool_contact.object_from_contact
+    assert frames[:3, 0] @ strategy.target_normal < -0.999
 
 
 def test_the_waypoints_tell_the_motion_that_was_shown():
@@ -114,6 +134,42 @@ def test_a_push_is_learned_and_where_the_box_was_met():
     np.testing.assert_allclose(strategy.target_normal, [-1, 0, 0], atol=0.05)
     np.testing.assert_allclose(strategy.target_contact.object_from_contact[:2, 3], [-0.03, 0], atol=0.002)
     assert learned.target_gap < 0.011 and advice(learned) == []
+
+
+def test_a_push_and_then_a_pull_are_two_contacts(tmp_path):
+    learned = learn(shunting(), Task("shunting", Goal("hook", {"distance": 0.05, "noise": 0.0, "hold": 0.0}), Physics(0.3)))
+    strategy = learned.strategy
+    # The pull is what reaches the goal; the push, with the other side of the tip and on the other side of the block, comes before it.
+    np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.02)
+    np.testing.assert_allclose(strategy.target_contact.object_from_contact[:2, 3], [0.02, 0], atol=0.002)
+    np.testing.assert_allclose(strategy.tool_contact.object_from_contact[:2, 3], [-0.02, 0.045], atol=0.002)
+    (pair,) = strategy.contacts
+    np.testing.assert_allclose(pair.target_normal, [-1, 0, 0], atol=0.02)
+    np.testing.assert_allclose(pair.target.object_from_contact[:2, 3], [-0.02, 0], atol=0.002)
+    np.testing.assert_allclose(pair.tool.object_from_contact[:2, 3], [0, 0.045], atol=0.002)
+    assert [w.contact for w in strategy.waypoints] == sorted((w.contact for w in strategy.waypoints), reverse=True)
+    pushed = next(w for w in strategy.waypoints if w.phase == pair.name)
+    met = next(w for w in strategy.waypoints if w.phase == "goal")
+    assert pushed.offset[0] == pytest.approx(-0.056, abs=0.003) and met.offset[0] == pytest.approx(0.056, abs=0.003)
+    assert learned.verdict.success, learned.verdict.message
+    assert learned.shown.success, learned.shown.message
+    save(strategy, tmp_path / "shunting")
+    assert [w.name for w in load(tmp_path / "shunting").waypoints] == [w.name for w in strategy.waypoints]
+
+
+def test_a_contact_that_is_made_again_where_it_was_is_one():
+    def meeting(first, last, point, normal, before, after):
+        row = [np.array(v, dtype=float) for v in (point, normal, point, normal)]
+        return Meeting(first, last, *row, np.array([before, 0, 0]), np.array([after, 0, 0]))
+
+    tool = pushing().tool
+    push = meeting(1, 2, [0, 0, 0], [1, 0, 0], 0.0, 0.1)
+    again = meeting(3, 4, [0, 0.01, 0], [0.98, 0.2, 0], 0.1, 0.2)
+    brushed = meeting(5, 6, [0, 0, 0], [-1, 0, 0], 0.2, 0.201)
+    pull = meeting(7, 8, [0, 0, 0], [-1, 0, 0], 0.201, 0.1)
+    (one,) = learning._places((push, again, brushed), tool)
+    assert (one.first, one.last, one.after[0]) == (1, 4, 0.2)
+    assert [m.first for m in learning._places((push, again, brushed, pull), tool)] == [1, 7]
 
 
 def test_a_contact_that_no_new_target_would_be_given_is_refused():
