@@ -55,17 +55,19 @@ def test_what_is_learned_is_what_was_annotated(name, view, mode, tmp_path):
     np.testing.assert_allclose(again.target_from_tool, learned.strategy.target_from_tool, atol=1e-6)
 
 
-@pytest.mark.parametrize("aside", [0.003, -0.004])
-def test_a_ball_met_aside_of_its_middle_is_pulled_the_way_it_was_led(aside, monkeypatch):
+@pytest.mark.parametrize(("aside", "turn"), [(0.006, 0.0), (0.0, -5.0)])
+def test_a_ball_met_aside_of_its_middle_is_pulled_the_way_it_was_led(aside, turn, monkeypatch):
+    """As after a tracker's errors: m aside, and the tool turned by so many degrees about the upright."""
     seen, task, _ = shipped("hooking")
-    poses = seen.world_from_tool.copy()
+    poses = seen.world_from_tool @ transforms.from_rpy(0, 0, np.deg2rad(turn))
     poses[:, 1, 3] += aside
+    task = replace(task, physics=replace(task.physics, friction=0.5))
     monkeypatch.setattr(learning, "verify", lambda *given, **named: None)
     strategy = learn(replace(seen, world_from_tool=poses), task).strategy
-    # By the normals of where they met the way would be up to 9 degrees askew of the contact.
-    np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.01)
+    # By the normals of where they met the way is 2.4 degrees askew of the contact for the turned tool.
+    np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.005)
     pulled = next(w for w in strategy.waypoints if w.name == "goal").offset
-    assert abs(pulled[1]) < 0.01 * abs(pulled[0])
+    assert abs(pulled[1]) < 0.005 * abs(pulled[0])
     # The tool is held as it was shown.
     at = np.abs(strategy.target_from_tool[:, 0, 3] - strategy.target_from_tool[0, 0, 3]).argmin()
     frames = strategy.target_from_tool[at] @ strategy.tool_contact.object_from_contact
