@@ -20,13 +20,17 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from magic_core import conversions, transforms
 from magic_core.errors import Code, MagicError
+from magic_core.robot import Description
+from magic_core.robot_pictures import link_mesh
 from magic_core.scene import UNSEEN
 from magic_core.strategy import Strategy
 from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
@@ -493,7 +497,7 @@ class ClosedLoop:
         looks = self._sight(job.stages.scene, False), self._sight(first, True), self._sight(second, True)
         let_go = None if self._carried is None else self._carried.let_go_at
         away = None if let_go is None else float(np.linalg.norm((self._server.hand() - let_go)[:3, 3]))
-        hand = seen_goal.Hand(self._held is None, away)
+        hand = seen_goal.Hand(self._held is None, away, self._arm_surface())
         phases = [phase.name for phase in outcome.plan.phases]
         seen = seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
         if seen.met is None:
@@ -501,6 +505,11 @@ class ClosedLoop:
         if not seen.met:
             raise MagicError(Code.GOAL_MISSED, f"carried out, but the goal is not met by what is seen: {seen.message}")
         return seen.message
+
+    def _arm_surface(self) -> NDArray[np.float64]:
+        """Points (N, 3) on arm and hand where the joints are now."""
+        poses = self._server.robot.poses({name: joint.position for name, joint in self._server.joints.all().items()})
+        return np.concatenate([transforms.apply(poses[link], points) for link, points in surfaces(self._server.robot).items()])
 
     def _sight(self, scene: SceneObjectArray, after: bool) -> seen_goal.Sight:
         """Things where they were seen.  After the motion the tool is where the hand has it, or where its shape is seen once that has let it go, and ids may
@@ -551,6 +560,17 @@ class ClosedLoop:
         expected, points = carried.held.pose(carried.let_go_at), self._points(scene, self.jobs[-1])
         found = in_hand.locate(carried.held.shape, expected, points, carried.let_go_at, self._closing, in_hand.LET_GO)
         return None if found is None else Placed(carried.held.tool.id, carried.held.shape, found.world_from_tool)
+
+
+@lru_cache(maxsize=2)
+def surfaces(robot: Description) -> dict[str, NDArray[np.float64]]:
+    """Points (N, 3) on the surface of each link beyond the base, in its frame."""
+    meshes = {link: link_mesh(robot, link, ("collision", "visual")) for link in robot.links if link != robot.base}
+    return {
+        link: np.asarray(trimesh.sample.sample_surface(mesh.to_trimesh(), seen_goal.SURFACE, seed=0)[0])
+        for link, mesh in meshes.items()
+        if mesh is not None and len(mesh.faces)
+    }
 
 
 def contact_time(plan: MotionPlan) -> float:

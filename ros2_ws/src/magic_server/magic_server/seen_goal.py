@@ -94,11 +94,12 @@ class _Told:
 
 @dataclass(frozen=True)
 class Hand:
-    """The hand when the motion was over: whether it has let the tool go, and how far (m) it is from where it did, ``None`` where that is
-    not known."""
+    """The hand when the motion was over: whether it has let the tool go, how far (m) it is from where it did, and points (N, 3) on the surface of arm and
+    hand in the world; ``None`` where that is not known."""
 
     released: bool
     away: float | None = None
+    points: Array | None = None
 
 
 def patience(strategy: Strategy, accuracy: float) -> tuple[float, float]:
@@ -301,12 +302,16 @@ class _Asked:
         thing = self.thing(what, self.now)
         if whom == "table":
             return float((thing.points @ self.table[:3] + self.table[3]).min())
+        if whom in HAND:
+            assert self.hand.points is not None
+            return float(cKDTree(self.hand.points).query(thing.points)[0].min())
         return float(cKDTree(self.thing(whom, self.now).points).query(thing.points)[0].min())
 
     def _touching(self, what: str, whom: str) -> _Told:
-        if whom in HAND:
-            held = what == "tool" and not self.hand.released
-            return _Told(True if held else None, "the tool is in the hand" if held else f"whether the hand touches the {what} is not seen")
+        if whom in HAND and what == "tool" and not self.hand.released:
+            return _Told(True, "the tool is in the hand")
+        if whom in HAND and self.hand.points is None:
+            return _Told(None, f"whether the hand touches the {what} is not seen")
         gap = self.gap(what, whom)
         # Surfaces are known to the accuracy of both, and between their points is room.
         truth = True if gap <= self.accuracy else (False if gap > 3 * self.accuracy else None)
@@ -315,6 +320,7 @@ class _Asked:
     def _touching_only(self, what: str, whom: str) -> _Told:
         own = {self.names.get(what, what), self.names.get(whom, whom)}
         others = [name for name in ("table", *self.now.things) if name != whom and name not in own]
+        others += [HAND[0]] if self.hand.points is not None and whom not in HAND else []
         found = [self._touching(what, other) for other in others]
         if what == "tool" and not self.hand.released and whom not in HAND:
             return _Told(False, "the tool is in the hand")

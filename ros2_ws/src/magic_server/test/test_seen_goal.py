@@ -102,6 +102,16 @@ def test_what_hangs_beside_something_else_may_hang_on_that():
     assert found.met is None and "from the object_3" in found.message
 
 
+def test_what_leans_on_the_hand_may_be_held_by_it():
+    now = {**STAND, "object_1": at(0.5, 0.0, 0.376, UPRIGHT)}
+    finger = at(0.5, 0.0, 0.376, UPRIGHT).points.mean(axis=0) + np.array([[0.0, 0.0, -0.05]])
+    apart = np.linalg.norm(now["object_1"].points - finger, axis=1).min()
+    assert asked("hang", STAND, now, replace(AWAY, points=finger - [0, 0, 0.05])).met
+    beside = finger + [0, 0, apart - 0.004]
+    found = asked("hang", STAND, now, replace(AWAY, points=beside))
+    assert found.met is None and "from the hand" in found.message
+
+
 def test_what_no_camera_tells_is_said():
     found = asked(tree({"upright": {"what": "target"}}), BESIDE, BESIDE)
     assert found.met is None and "no camera tells" in found.message
