@@ -197,6 +197,7 @@ class ArmPlanner:
             marks=motion.marks or waypoint_times(strategy),
             cloud=unexplained((target, *obstacles), tool, plane, self.cloud),
             searches=self.settings.searches,
+            roomy_searches=self.settings.searches,
         )
         self.space.build(request)
         held = grasp_in_hand(robot, tool, start) if tool.hanging else None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from magic_planner.workspace import Workspace
 Array = NDArray[np.float64]
 #: Searches for one free path, each with its own random numbers.
 SEARCHES = 2
+#: The longest that a search may take by the clock, in times of what it may take of the processor.
+LONGEST = 8.0
 #: Joint step, rad, at which a path is looked at that will be moved along, and one that is only tried.
 FINE, COARSE = 0.03, 0.08
 
@@ -34,20 +37,11 @@ class FreeMotion:
         What was seen may stand some millimetres elsewhere: a finger that just clears a rim in the scene as given pushes the tool off in
         the true one, and no grasp is where it was planned any more.
         """
-        robot, left = self.robot, request.searches
         try:
-            for room in (self.settings.room, self.settings.room / 3):
-                self.space.come(request, room)
-                if robot.collides(request.start) or robot.collides(goal):
-                    continue
-                try:
-                    return self._free(request, request.start, goal, "approach")
-                except StageError:
-                    # What is left to search with was meant for ways that may be as narrow as they are.
-                    request.searches = min(left, 1)
+            path = self._roomy(request, request.start, goal, "approach", lambda room: self.space.come(request, room), lambda path: True)
         finally:
             self.space.come(request, 0.0)
-        return self._free(request, request.start, goal, "approach")
+        return self._free(request, request.start, goal, "approach") if path is None else path
 
     def carry(self, request: Request, branch: Branch, start: Array, goal: Array) -> Array:
         """Joint path (n, J) with the tool in hand from the lift to the start of the task; raises StageError."""
@@ -62,22 +56,45 @@ class FreeMotion:
                         Code.PATH_IN_COLLISION, f"the tool {what}: {pair}", "in collision", "a tool in the hand clear of everything"
                     ),
                 )
-        # A tool shifts a little in the hand when it is gripped: it is carried with room about it, where its ends leave that.
-        for room in (self.settings.room, self.settings.room / 3):
+
+        def hold(room: float) -> None:
             self.space.hold(request, branch.grasp, request.roomy(request.tool, room))
             robot.allow(request.tool.id, "table")
-            if robot.collides(start) or robot.collides(goal):
-                continue
-            try:
-                path = self._free(request, start, goal, "transfer")
-            except StageError:
-                continue
+
+        def clear(path: Array) -> bool:
             # What was left out: the table, above which the task may begin by a hair.
             self.space.hold(request, branch.grasp)
-            if robot.free(timing.swept(path, FINE), request.budget, "transfer"):
-                return path
+            return robot.free(timing.swept(path, FINE), request.budget, "transfer")
+
+        # A tool shifts a little in the hand when it is gripped: it is carried with room about it, where its ends leave that.
+        path = self._roomy(request, start, goal, "transfer", hold, clear)
+        if path is not None:
+            return path
         self.space.hold(request, branch.grasp)
         return self._free(request, start, goal, "transfer")
+
+    def _roomy(
+        self, request: Request, start: Array, goal: Array, stage: str, world: Callable[[float], None], clear: Callable[[Array], bool]
+    ) -> Array | None:
+        """A joint path (n, J) in ``world(room)``, with as much room (m) as its ends leave, that is ``clear``; ``None`` where none is found.
+
+        It has searches of its own, so that those for a way that may be narrow are still there.
+        """
+        kept, request.searches = request.searches, request.roomy_searches
+        try:
+            for room in (self.settings.room, self.settings.room / 3):
+                world(room)
+                if self.robot.collides(start) or self.robot.collides(goal):
+                    continue
+                try:
+                    path = self._free(request, start, goal, stage)
+                except StageError:
+                    continue
+                if clear(path):
+                    return path
+            return None
+        finally:
+            request.searches, request.roomy_searches = kept, request.searches
 
     def _free(self, request: Request, start: Array, goal: Array, stage: str) -> Array:
         """A collision-free joint path (n, J): straight where that is free, else around things and shortened."""
@@ -106,8 +123,6 @@ class FreeMotion:
 
     def _candidates(self, request: Request, start: Array, goal: Array, stage: str) -> Iterator[Array]:
         """Paths (n, J) that may be free: by way of home, where the arm is out of the way of most things, then by RRT-Connect."""
-        import mplib
-
         robot = self.robot
         by_home = np.stack([start, robot.home, goal])
         if all(robot.free(straight(a, b, FINE), request.budget, stage) for a, b in itertools.pairwise(by_home)):
@@ -116,13 +131,29 @@ class FreeMotion:
             request.budget.check(stage)
             if request.searches < 1:
                 return
-            mplib.set_global_seed(int(request.seed) % 100_000 * 10 + n + 1)
-            seconds = min(self.settings.free_time, max(0.05, request.budget.left))
-            status, path = robot.planner.planner.plan(start, [goal], time=seconds, range=0.3, simplify=False)
-            if str(status).startswith("Exact"):
+            status, path = self._search(request, start, goal, int(request.seed) % 100_000 * 10 + n + 1)
+            if status.startswith("Exact"):
                 yield np.asarray(path, dtype=float)
             else:
                 request.searches -= 1
+
+    def _search(self, request: Request, start: Array, goal: Array, seed: int) -> tuple[str, Array]:
+        """RRT-Connect's status and path (n, J), after ``free_time`` seconds of the processor at most.
+
+        The library counts seconds of the clock.  A search that other work kept from the processor is done again, for longer, or a busy
+        machine would find other paths than an idle one.
+        """
+        import mplib
+
+        wanted = seconds = self.settings.free_time
+        while True:
+            mplib.set_global_seed(seed)
+            seconds, used = min(seconds, max(0.05, request.budget.left)), time.thread_time()
+            status, path = self.robot.planner.planner.plan(start, [goal], time=seconds, range=0.3, simplify=False)
+            used = time.thread_time() - used
+            if str(status).startswith("Exact") or used > 0.8 * wanted or seconds >= min(LONGEST * wanted, request.budget.left):
+                return str(status), path
+            seconds = min(LONGEST, 1.5 * wanted / max(used, 0.01)) * wanted
 
 
 def straight(start: Array, goal: Array, step: float) -> Array:

@@ -30,7 +30,8 @@ class ArmSettings:
     lift, retreat: metres.  room: metres about a tool that is
     carried, and about all that the empty hand passes.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
     neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path (it
-    takes some 30 ms; the limit is wide so that a loaded machine finds the same path).  searches: how many of a request may fail."""
+    takes some 30 ms; the limit is wide so that a loaded machine finds the same path).  searches: how many of a request may fail, of those
+    that keep room about things and of the others."""
 
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
@@ -78,6 +79,7 @@ class Request:
     marks: tuple[tuple[str, float], ...]  # names of the places the tool's motion passes, and when
     cloud: dict[str, Array]  # by object: measured points (N, 3) that no shape accounts for
     searches: int  # that may still fail
+    roomy_searches: int  # the same, of those that keep room about things
 
     @staticmethod
     def roomy(item: SceneObject, margin: float) -> list[Any]:

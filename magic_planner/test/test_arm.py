@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import planner_scenes as scenes
@@ -262,10 +263,28 @@ def test_the_empty_hand_keeps_room_about_what_it_passes(arm, monkeypatch):
     height = next(z for z in np.arange(middle[2], 0.0, -0.001) if clear(path, z, 0.0)) - 0.002
     assert not clear(path, height, 0.005)
     request = dataclasses.replace(
-        request, obstacles=(scenes.item("plate", [plate], transforms.make(translation=[*middle[:2], height])),), searches=2
+        request, obstacles=(scenes.item("plate", [plate], transforms.make(translation=[*middle[:2], height])),), roomy_searches=2
     )
     arm.space.build(request)
     assert clear(come(request, goal), height, 0.005)
+
+
+@pytest.mark.parametrize("share, asked", [(1.0, [0.5]), (0.25, [0.5, 3.0]), (0.01, [0.5, 4.0])])
+def test_a_search_that_other_work_kept_from_the_processor_is_done_again_for_longer(arm, monkeypatch, share, asked):
+    """``share``: of the clock's seconds that the search has the processor."""
+    seconds, worked = [], [0.0]
+
+    class Library:
+        def plan(self, start, goals, time, **kwargs):
+            seconds.append(time)
+            worked[0] += share * time
+            return "Timeout", None
+
+    monkeypatch.setattr(arm.robot.planner, "planner", Library())
+    monkeypatch.setattr("magic_planner.free_motion.time.thread_time", lambda: worked[0])
+    request = SimpleNamespace(budget=Budget(60.0))
+    status, _ = arm.free._search(request, arm.robot.home, arm.robot.home, 1)
+    assert status == "Timeout" and seconds == pytest.approx(asked)
 
 
 def test_the_straight_way_to_a_grasp_begins_with_room_about_the_tool_where_it_can(arm, solved):
