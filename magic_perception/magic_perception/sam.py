@@ -71,7 +71,7 @@ class SamSegmenter:
         masks = self.masks(looked.frame.color, [labels == n for n in numbers])
         result = np.where(labels < 0, labels, 0).astype(np.int32)
         best = np.zeros(labels.shape, np.float32)
-        possible = foreground(looked, parameters)
+        possible, _ = foreground(looked, parameters)
         for number, (probability, _) in zip(numbers, masks, strict=True):
             prompt = labels == number
             mask = probability > 0.5

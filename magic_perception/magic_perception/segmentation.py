@@ -20,7 +20,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
-from magic_perception import attached, clusters, convexity, smear
+from magic_perception import attached, between, clusters, convexity, smear
 from magic_perception.parameters import Parameters
 from magic_perception.seams import Judge, learned
 from magic_perception.table import Plane, fit_plane, supports
@@ -285,8 +285,9 @@ def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np
     return distance, shaded, threshold
 
 
-def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
-    """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it."""
+def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it; and (H, W)
+    those of the table's colour, in the light or in a shadow."""
     h, inside = looked.heights, looked.open
     valid = np.isfinite(h)
     zero = np.where(valid, h, np.float32(0))
@@ -294,14 +295,14 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     raised = (zero > limit) & inside
     raised = cv2.morphologyEx(raised.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(bool)
     if not parameters.use_color:
-        return raised
+        return raised, np.zeros_like(raised)
     around = cv2.dilate(raised.view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
     table = _outside(valid & (np.abs(zero) < limit) & inside & ~around, raised)
     if np.count_nonzero(table) < 500:
-        return raised
+        return raised, np.zeros_like(raised)
     distance, shaded, threshold = color_distance(looked, table)
     if not np.isfinite(threshold):
-        return raised
+        return raised, np.zeros_like(raised)
     other = (distance > threshold) & inside
     # Of another colour and a little above the table on the average of a window: a thin thing.  A shadow or a print lies at 0.
     near = other & valid & (zero < 0.03)
@@ -318,7 +319,7 @@ def foreground(looked: Looked, parameters: Parameters) -> NDArray[np.bool_]:
     firm = result & ~(jump := smear.falls_back(result, depth, focal))
     result = smear.cleared(result, color, depth, table, shaded, inside & (distance > 9), jump, focal)
     result = _two_colors(result, looked, table, firm)
-    return open_by_two(result)
+    return open_by_two(result), shaded < smear.LIKE
 
 
 def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:
@@ -444,12 +445,13 @@ def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...],
 class Clusters:
     """What is above the table, by what hangs together in space.
 
-    masks (H, W) for each look, without what is known; fixed (H, W): what is.  spots: rows and columns of the mask's pixels with depth in
+    masks (H, W) for each look, without what is known; fixed (H, W): what is; table (H, W): what has the table's colour.  spots: rows and columns of the mask's pixels with depth in
     each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1 for noise.
     """
 
     masks: list[NDArray[np.bool_]]
     fixed: list[NDArray[np.bool_]]
+    table: list[NDArray[np.bool_]]
     spots: list[tuple[NDArray, NDArray]]
     cloud: NDArray[np.float32]
     instance: NDArray[np.int64]
@@ -457,7 +459,7 @@ class Clusters:
 
 def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> Clusters:
     """The clusters in all looks together; known: meshes (world) that are left out."""
-    masks = each(lambda looked: foreground(looked, parameters), looks, parameters.workers)
+    masks, tables = zip(*each(lambda looked: foreground(looked, parameters), looks, parameters.workers), strict=True)
     fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
     masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
     spots = [
@@ -470,7 +472,7 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
     # A cluster of nothing but bridges is none.
     instance = instance[: len(cloud)]
     instance[instance >= 0] = np.unique(instance[instance >= 0], return_inverse=True)[1]
-    return Clusters(masks, fixed, spots, cloud, instance)
+    return Clusters(masks, fixed, list(tables), spots, cloud, instance)
 
 
 #: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise, m.
@@ -569,7 +571,9 @@ class DepthSegmenter:
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`Segmenter`."""
         found = clustered(looks, known, parameters)
-        instance = _parted(looks, found, self._judge) if parameters.split else found.instance
+        instance = (
+            between.parted(looks, found, _parted(looks, found, self._judge), parameters.min_pixels) if parameters.split else found.instance
+        )
         labels = []
         start = 0
         for mask, where in zip(found.masks, found.spots, strict=True):
