@@ -28,6 +28,8 @@ from magic_verifier.workers import Workers
 #: More repetitions than this in one goal are refused.
 MAX_REPETITIONS = 1000
 NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
+#: Feedback is for people: each phase once, and else no more often than so, s.  A rollout takes a fraction of the time that the motion itself takes.
+FEEDBACK_PERIOD = 0.1
 #: Goals that end so were not judged.
 UNJUDGED = (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY)
 
@@ -168,7 +170,16 @@ class VerifierNode(Node):
         motion_check.check_trajectory(goal.plan.tool_trajectory, tool.id, plan.tool_motion)
         candidate = convert.candidate_from_msg(goal.candidate) if goal.candidate.tool_id else None
 
+        told: set[str] = set()
+        last = started
+
         def feedback(phase: str, simulated: float) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if phase in told and now - last < FEEDBACK_PERIOD:
+                return
+            told.add(phase)
+            last = now
             handle.publish_feedback(VerifyMotion.Feedback(phase=phase, simulated=float(simulated)))
 
         # What obstacles look like is in the film alone.

@@ -51,6 +51,20 @@ def test_a_good_motion_passes_with_metrics_film_and_feedback(graph):
     assert not result.failures or " of " in result.failures[0]
 
 
+def test_each_phase_is_told_once_and_not_every_moment_of_it(graph, monkeypatch):
+    def told(seed):
+        heard = []
+        ask(graph, goal_message("pulling", seed=seed, repetitions=3), lambda message: heard.append(message.feedback.phase))
+        return heard
+
+    monkeypatch.setattr(verifier_node, "FEEDBACK_PERIOD", 1e9)
+    few = told(11)
+    assert "goal" in few and len(few) == len(set(few))
+    monkeypatch.setattr(verifier_node, "FEEDBACK_PERIOD", 0.0)
+    many = told(12)
+    assert set(many) == set(few) and len(many) > len(few)
+
+
 def test_a_tool_by_another_name_is_refused(graph):
     goal = goal_message()
     goal.plan.tool_trajectory.joint_names = ["spoon"]

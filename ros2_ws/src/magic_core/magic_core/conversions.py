@@ -638,10 +638,10 @@ def arm_motion_to_msg(motion: ArmMotion, frame_id: str = "panda_link0") -> Joint
         header=header(frame_id),
         joint_names=list(motion.joint_names),
         points=[
-            JointTrajectoryPoint(
-                positions=p.tolist(), velocities=v.tolist(), accelerations=a.tolist(), time_from_start=duration_to_msg(float(t))
+            JointTrajectoryPoint(positions=p, velocities=v, accelerations=a, time_from_start=duration_to_msg(t))
+            for t, p, v, a in zip(
+                motion.times.tolist(), motion.positions.tolist(), motion.velocities.tolist(), motion.accelerations.tolist(), strict=True
             )
-            for t, p, v, a in zip(motion.times, motion.positions, motion.velocities, motion.accelerations, strict=True)
         ],
     )
 
