@@ -20,7 +20,8 @@ def test_a_polynomial_of_the_fifth_degree_is_found_again(coefficients, length, c
         assert values.shape == (count - 1, 1)
         for i in range(count - 1):
             true = np.abs(course.deriv(order)(np.linspace(times[i], times[i + 1], 400))).max()
-            assert values[i, 0] <= true * (1 + 1e-6) + 1e-5 * (1 + 1 / length**3)
+            # The largest of 400 places falls short of the largest there is by some 1e-5 of it.
+            assert values[i, 0] <= true * (1 + 1e-4) + 1e-5 * (1 + 1 / length**3)
             assert values[i, 0] >= true * 0.9 - 1e-5
 
 

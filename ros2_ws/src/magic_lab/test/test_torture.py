@@ -48,8 +48,9 @@ class Rig:
     def __init__(self, folder):
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=free_domain())
-        self.lab = self.made(magic_lab.node.LabNode, camera_rate=0.1, rate=2.0)
-        settings = {"objects_age": 1.5, "state_age": 1.0, "objects_timeout": 1.0, "server_timeout": 5.0, "effort": 40.0, **fakes.OPEN_LOOP}
+        self.lab = self.made(magic_lab.node.LabNode, camera_rate=0.1, rate=1.0)
+        # All nodes share one interpreter: what is told may come a second late, on a busy machine more.
+        settings = {"objects_age": 1.5, "state_age": 2.0, "objects_timeout": 1.0, "server_timeout": 5.0, "effort": 40.0, **fakes.OPEN_LOOP}
         self.server = self.made(StrategyServer, strategies=folder, execute=True, autostart=True, use_sim_time=True, **settings)
         self.fakes = fakes.FakeServers(context=self.context)
         self.fakes.on_match = self.match
