@@ -75,7 +75,7 @@ class Workspace:
 
     def come(self, request: Request, room: float) -> None:
         """The world of the empty hand on its way to the tool, everything but the table with so much room (m) about it; nothing may be
-        touched.  What is set up after it needs ``come(request, 0.0)`` first."""
+        touched.  What is set up after it needs ``surround(request, 0.0)`` first."""
         self.surround(request, room)
         self.lay(request, request.tool.world_from_object, request.roomy(request.tool, room))
         self.robot.allow(request.tool.id, *self.robot.finger_links, allowed=False)
