@@ -97,7 +97,14 @@ logged() {
   return $status
 }
 # The last line of the log that looks like the reason.
-reason() { grep -aiE 'error|fatal|unable|cannot|not found|failed' "$LOG" | grep -avE '^WARNING' | tail -n 1 | cut -c1-200; }
+reason() {
+  local said why
+  said=$(grep -aiE 'error|fatal|unable|cannot|not found|failed' "$LOG" | grep -avE '^WARNING' | tail -n 1 | cut -c1-200)
+  # What pip cannot reach it calls a package that does not exist.
+  why=$(grep -aoE "connection broken by '[A-Za-z]+" "$LOG" | tail -n 1)
+  case $said in *"No matching distribution"*) [ -z "$why" ] || said="$said; the package index was not reached: ${why##*\'}" ;; esac
+  echo "$said"
+}
 
 # ------------------------------------------------------------------------------------------------ system packages
 fits() { command -v "$1" >/dev/null && "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' >/dev/null 2>&1; }

@@ -29,6 +29,9 @@ from magic_perception.sight import agreement
 from magic_perception.smear import behind
 from magic_perception.solids import hull_of
 
+#: Round an object in its picture, as a share of its longer side.
+MARGIN = 0.15
+
 
 @dataclass
 class Report:
@@ -208,7 +211,7 @@ def _at_rest(labels: NDArray[np.int32], hanging: set[int]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class _Built:
-    """A solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, and its pixels there."""
+    """A solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, its pixels there, and the picture (h, w, 3) about it."""
 
     solid: Reconstruction
     points: NDArray[np.float64]
@@ -216,6 +219,7 @@ class _Built:
     mask: NDArray[np.bool_]
     camera: str
     pixels: int
+    picture: NDArray[np.uint8]
     cut_off: list[int | str]
     evidence: Evidence
     hanging: bool
@@ -282,7 +286,15 @@ def _build(
         bool(cut),
     )
     best = int(np.argmax(counts[:now] if max(counts[:now]) else counts))
-    return _Built(solid, points, colors, labels[best] == label, looks[best].frame.camera, counts[best], cut, evidence, hanging)
+    mask, frame = labels[best] == label, looks[best].frame
+    return _Built(solid, points, colors, mask, frame.camera, counts[best], _about(mask, frame.color), cut, evidence, hanging)
+
+
+def _about(mask: NDArray[np.bool_], color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The part of a picture about a mask, with a margin that shows what the thing stands on."""
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    margin = round(MARGIN * max(w, h))
+    return color[max(y - margin, 0) : y + h + margin, max(x - margin, 0) : x + w + margin].copy()
 
 
 def _places(sights: list[Sight]) -> int:
@@ -314,7 +326,7 @@ def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObj
     local = Mesh(local.vertices, local.faces, _paint(local, built.points, built.colors, transforms.inverse(pose)))
     pieces = tuple(piece.transformed(object_from_table) for piece in built.solid.pieces)
     return SceneObject(
-        "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera,
+        "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera, built.picture,
         world_from_box=pose, box_extents=local.extents, confidence=chance(built.evidence),
     )  # fmt: skip
 

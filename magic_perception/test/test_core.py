@@ -206,6 +206,12 @@ def test_lying_tools(hooking):
         truth = captured[[c[0].camera for c in captured].index(item.camera)][1] == label
         assert (truth & item.mask).sum() / (truth | item.mask).sum() > 0.85
         assert item.mesh.colors is not None and len(item.points) == len(item.colors) > 100
+        # The picture is that camera's, about the mask and a margin on each side.
+        rows, columns = np.nonzero(item.mask)
+        frame = captured[[c[0].camera for c in captured].index(item.camera)][0]
+        margin = round(0.15 * (max(np.ptp(rows), np.ptp(columns)) + 1))
+        cut = frame.color[rows.min() - margin : rows.max() + margin + 1, columns.min() - margin : columns.max() + margin + 1]
+        np.testing.assert_array_equal(item.picture, cut)
     hook, tin, scissors = (nearest(scene, m) for m in meshes)
     assert report.shapes[tin.id] == "cylinder"
     assert tin.box_extents[2] == pytest.approx(meshes[1].extents[2], abs=0.002)

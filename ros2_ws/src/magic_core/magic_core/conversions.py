@@ -394,6 +394,8 @@ def object_to_msg(item: SceneObject, header: Header) -> mi.SceneObject:
     msg.cloud = cloud_to_msg(item.points, item.colors, header)
     if item.mask is not None:
         msg.mask = image_to_msg(item.mask, "mono8")
+    if item.picture is not None:
+        msg.picture = image_to_msg(item.picture, "rgb8")
     return msg
 
 
@@ -404,7 +406,7 @@ _NO_VIEW = CanonicalView(np.zeros((1, 1, 3), np.uint8), np.zeros((1, 1), bool), 
 def object_from_msg(msg: mi.SceneObject, pictures: bool = True) -> SceneObject:
     """Message to SceneObject; raises BAD_MESH where there is more of it than MOST_TRIANGLES.
 
-    pictures: false leaves view and mask out, whether they came or not (a blank view, no mask).
+    pictures: false leaves view, mask and picture out, whether they came or not (a blank view).
     """
     for what in ("triangles", "vertices"):
         count = sum(len(getattr(mesh, what)) for mesh in (msg.mesh, *msg.pieces))
@@ -428,6 +430,7 @@ def object_from_msg(msg: mi.SceneObject, pictures: bool = True) -> SceneObject:
         colors=point_colors,
         mask=mask_from_msg(msg.mask) if pictures and len(msg.mask.data) else None,
         camera=msg.camera,
+        picture=color_from_msg(msg.picture, Code.BAD_REQUEST_IMAGE) if pictures and len(msg.picture.data) else None,
         world_from_box=pose_from_msg(msg.box_pose),
         box_extents=np.array([msg.box_size.x, msg.box_size.y, msg.box_size.z]),
         confidence=float(msg.confidence),
@@ -439,10 +442,10 @@ def object_from_msg(msg: mi.SceneObject, pictures: bool = True) -> SceneObject:
 
 
 def without_pictures(msg: mi.SceneObject, cloud: bool, surface: bool) -> mi.SceneObject:
-    """What planner and verifier need of an object's message: view and mask left out, and without ``cloud`` its points, without ``surface``
+    """What planner and verifier need of an object's message: view, mask and picture left out, and without ``cloud`` its points, without ``surface``
     its mesh, where convex pieces say the same.  Nothing is copied."""
     light = copy.copy(msg)
-    light.view, light.mask = mi.CanonicalView(), Image()
+    light.view, light.mask, light.picture = mi.CanonicalView(), Image(), Image()
     if not cloud:
         light.cloud = PointCloud2(header=msg.cloud.header)
     if not surface and any(piece.vertices for piece in msg.pieces):

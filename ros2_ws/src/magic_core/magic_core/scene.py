@@ -86,7 +86,7 @@ class SceneObject:
     mesh and pieces are in the object frame; the pieces are convex and together
     fill the mesh (they are what physics and planning use).  points (N, 3) world
     metres with colors (N, 3) uint8 are the cleaned cloud.  mask (H, W) bool in the
-    image of ``camera``.  box_extents (3,) metres along the axes of world_from_box.
+    image of ``camera``; picture (h, w, 3) uint8 RGB: that image about it, with a margin.  box_extents (3,) metres along the axes of world_from_box.
     ``hanging``: it is above the table with nothing below that could carry it: a hand,
     the arm, a cable, and no thing to plan with.
     ``source`` is ``camera``, or ``known`` for a calibrated fixture or a given mesh.
@@ -106,6 +106,7 @@ class SceneObject:
     colors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     mask: NDArray[np.bool_] | None = None
     camera: str = ""
+    picture: NDArray[np.uint8] | None = None
     world_from_box: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     box_extents: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     confidence: float = 1.0

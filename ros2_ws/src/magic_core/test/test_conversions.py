@@ -466,15 +466,17 @@ def test_views_of_no_possible_scale_are_refused(scale):
 
 def test_what_planner_and_verifier_are_sent_is_the_object_without_its_pictures():
     item = dataclasses.replace(shapes.make("mug", 1).as_object("mug", tf.from_rpy(0, 0, 0.3, [0.4, 0.1, 0.0])), points=np.ones((5, 3)))
-    item = dataclasses.replace(item, colors=np.zeros((5, 3), np.uint8), mask=np.ones((4, 6), bool), camera="left", cut_off=("picture",))
+    shown = {"mask": np.ones((4, 6), bool), "camera": "left", "picture": np.ones((3, 5, 3), np.uint8)}
+    item = dataclasses.replace(item, colors=np.zeros((5, 3), np.uint8), **shown, cut_off=("picture",))
     whole = cv.object_to_msg(item, cv.header("panda_link0"))
     light = cv.without_pictures(whole, cloud=False, surface=False)
     assert len(serialize_message(light)) < 0.2 * len(serialize_message(whole))
     assert light.cloud.header == whole.cloud.header and len(whole.view.image.data) and len(whole.mask.data), "the whole one is as it was"
+    np.testing.assert_array_equal(cv.object_from_msg(whole).picture, item.picture)
     same, bare = cv.object_from_msg(whole, pictures=False), cv.object_from_msg(light, pictures=False)
     for got in (same, bare):
         assert (got.id, got.camera, got.cut_off, got.confidence) == (item.id, "left", ("picture",), item.confidence)
-        assert got.mask is None and not got.view.mask.any()
+        assert got.mask is None and got.picture is None and not got.view.mask.any()
         np.testing.assert_array_equal(got.world_from_object, same.world_from_object)
         assert len(got.pieces) == len(item.pieces)
         for a, b in zip(got.pieces, item.pieces):

@@ -62,7 +62,7 @@ GRASP_ONLY = frozenset({Code.GRASP_SLIPPED})
 
 @dataclass(frozen=True)
 class Request:
-    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`) or empty: the matcher chooses.  timeout in seconds for everything."""
+    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`, :mod:`magic_core.open_words`) or empty: the matcher chooses.  timeout in seconds for everything."""
 
     strategy: str
     variant: str

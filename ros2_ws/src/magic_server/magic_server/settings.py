@@ -23,7 +23,7 @@ class Settings:
     a whole run where the goal says nothing.  presence: s to wait for a server that is not there.  objects, match, plan, verify:
     s for each.  grace: s that an answer may come late.  required_rate: least lower end of the success rate's interval;
     objects_age: s that objects may be old, and object_tolerance: m that they may have moved, where a trajectory is published or
-    the arm begins to move.  recorded: what comes in is a recording.  autostart: whether the lifecycle begins in
+    the arm begins to move.  recorded: what comes in is a recording.  words_weights: of the network that reads open words, empty: none.  autostart: whether the lifecycle begins in
     its state active, in which alone the arm moves.
     """
 
@@ -47,6 +47,7 @@ class Settings:
     object_tolerance: float
     required_rate: float
     recorded: bool
+    words_weights: str
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,13 @@ def read(node: Node, preset: str = "") -> Settings:
         ),
         recorded=parameter(
             node, "recorded", False, "what comes in is a recording: it gets no older, and no arm is moved by it", read_only=True
+        ),
+        words_weights=parameter(
+            node,
+            "words_weights",
+            "",
+            "weights of CLIP or SigLIP, a hub name or a folder, for names in other words than the known ones; empty: such names are refused",
+            read_only=True,
         ),
     )
 

@@ -19,6 +19,7 @@ from sensor_msgs.msg import Image, JointState
 from magic_core import conversions, naming, transforms
 from magic_core.conversions import without_pictures as light
 from magic_core.errors import Code, MagicError
+from magic_core.open_words import OpenWords
 from magic_core.robot import Description
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import ContactCandidate, MotionPlan, SceneObject, SceneObjectArray
@@ -59,6 +60,7 @@ class Server(Protocol):
     verifier: RemoteAction
     scene: SceneObjectArray | None
     joints: JointStates
+    words: OpenWords | None
     ahead: Ahead[pipeline.Planned]
     objects_topic: str
 
@@ -145,7 +147,11 @@ class Stages:
         if not given:
             return request, ""
         objects = [conversions.object_from_msg(o) for o in self.scene.objects]
-        readings = {what: naming.resolve(value, objects) for what, value in given.items()}
+        words = self._server.words
+        readings = {
+            what: naming.resolve(value, objects) if words is None or naming.is_name(value) else words.resolve(value, objects)
+            for what, value in given.items()
+        }
         request = replace(request, **{what: reading.id for what, reading in readings.items()})
         pipeline.check_different(request)
         return request, "; ".join(reading.sentence for reading in readings.values())
@@ -187,7 +193,7 @@ class Stages:
     def _unknown(self, scene: SceneObjectArray, request: pipeline.Request) -> tuple[str, str] | None:
         ids = [o.id for o in scene.objects]
         for what, value in (("tool_id", request.tool_id), ("target_id", request.target_id)):
-            if value and ids and value not in ids and not naming.is_name(value):
+            if value and ids and value not in ids and not naming.is_name(value) and self._server.words is None:
                 return what, value
         return None
 

@@ -28,6 +28,7 @@ from magic_core import strategy as strategies
 from magic_core.diagnostics import Diagnostics, clock_complaint, status
 from magic_core.errors import Code, MagicError
 from magic_core.node import RESULT_TIMEOUT, describe, robot_parameters, run
+from magic_core.open_words import OpenWords
 from magic_core.robot import Description, RobotConfig
 from magic_core.scene import UNSEEN
 from magic_core.tf_listener import TransformListener
@@ -99,6 +100,7 @@ class StrategyServer(LifecycleNode):
             raise MagicError(
                 Code.BAD_REQUEST, "parameters execute and recorded", "both true", "one of them: no arm is moved by a recording"
             )
+        self.words = OpenWords(settings.words_weights) if settings.words_weights else None
         self._limits = Limits(
             self.robot.base_frame,
             settings.required_rate,
