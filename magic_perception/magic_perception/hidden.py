@@ -19,8 +19,11 @@ GAP, LEVEL = 0.20, 0.02
 COLOR = 40.0
 #: Depth farther than this behind a place, metres, shows that the place is empty.
 EMPTY = 0.02
-#: What hangs: its lowest seen part is so high above the table, metres, and for most of it the space right below is seen to be empty.
+#: What hangs: its lowest seen part is so high above the table, metres, and for most of it, and under its middle, the space below is seen to be empty.
 CLEAR, MOST = 0.03, 0.5
+#: What carries a thing out of sight is under its middle, within this, m, and is a part of it: no more than this share of its height, as a ball's or an egg's
+#: underside and a vase's foot are.
+FOOT, UNDERSIDE = 0.01, 0.4
 
 
 def veil(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray[np.int32]]:
@@ -120,7 +123,8 @@ def _at(look: Looked, labels: NDArray[np.int32], points: NDArray[np.float64]) ->
 def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixtures: tuple[Mesh, ...] = ()) -> bool:
     """Whether a thing is above the table with nothing below that could carry it: a hand, an arm, a cable.
 
-    What touches a fixture (world) may hang on it.  Where no camera sees what is below, a thing is taken to stand.
+    What touches a fixture (world) may hang on it.  Where no camera sees what is below, a thing is taken to stand: so does a large ball, which
+    goes on down out of sight from the lowest that is seen of it, to where it touches the table under its own middle.
     """
     clouds, heights = [], []
     for look, image in zip(looks, labels, strict=True):
@@ -134,16 +138,28 @@ def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixt
         return False
     order = np.argsort(height)[: max(20, len(points) // 10)]
     order = order[:: max(1, len(order) // 150)]
-    lowest, height = points[order], height[order].astype(float)
-    steps = np.linspace(0.1, 0.9, 9)[:, None]
-    # From the thing down to the table: heights of the places, from just above the one to just below the other.
-    at = 0.005 + steps * (height - 0.015 - 0.005)
-    ways = lowest - (height - at)[..., None] * looks[0].normal
+    feet = points - height[:, None] * looks[0].normal
+    seen_through = _seen_through(looks, labels, feet[order], height[order])
+    if np.mean(seen_through) <= MOST:
+        return False
+    if np.percentile(height, 1) > UNDERSIDE * np.percentile(height, 98):
+        return True
+    low, high = np.percentile(feet, [2, 98], axis=0)
+    beside = np.stack(np.meshgrid(*[np.linspace(-FOOT, FOOT, 5)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    under = (low + high) / 2 + beside
+    return float(np.mean(_seen_through(looks, labels, under, np.full(len(under), np.percentile(height, 5))))) > MOST
+
+
+def _seen_through(
+    looks: list[Looked], labels: list[NDArray[np.int32]], feet: NDArray[np.float64], height: NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """(N,): whether a camera sees an empty place in the columns that rise from the table at ``feet`` (N, 3) to just below ``height`` (N,), m."""
+    at = 0.005 + np.linspace(0.1, 0.9, 9)[:, None] * (height.astype(float) - 0.015 - 0.005)
+    ways = feet + at[..., None] * looks[0].normal
     empty = np.zeros(ways.shape[:2], bool)
     for look, image in zip(looks, labels, strict=True):
-        _, free = _at(look, image, ways)
-        empty |= free
-    return float(empty.any(axis=0).mean()) > MOST
+        empty |= _at(look, image, ways)[1]
+    return empty.any(axis=0)
 
 
 def _touches(points: NDArray[np.float64], fixtures: tuple[Mesh, ...], reach: float = 0.02) -> bool:

@@ -84,6 +84,46 @@ def test_a_can_on_its_side():
     assert solid.volume == pytest.approx(truth.to_trimesh().volume, rel=0.1)
 
 
+PLACES = ((0.38, -0.28), (0.62, -0.2), (0.42, 0.02), (0.66, 0.1), (0.4, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("kind", "radii"),
+    [
+        ("sphere", (0.015, 0.025, 0.035, 0.045, 0.06)),
+        ("sphere", (0.055, 0.05, 0.04, 0.03, 0.02)),
+        ("cylinder", (0.015, 0.025, 0.035, 0.045, 0.06)),
+    ],
+)
+def test_balls_and_cylinders_of_all_sizes_stand(kind, radii):
+    """Nothing of a large ball is seen as low as the table, and beside its underside both cameras look past it: it stands all the same."""
+    made = {"sphere": lambda r: trimesh.creation.icosphere(4, r), "cylinder": lambda r: trimesh.creation.cylinder(r, 2 * r, sections=64)}
+    meshes = [
+        scenes.placed(Mesh(m.vertices, m.faces), *at).painted((180, 60, 50)) for at, m in zip(PLACES, map(made[kind], radii), strict=True)
+    ]
+    caster = sensor.scene_raycaster(meshes)
+    frames = [
+        sensor.capture([], sensor.D435, pose, [3, i], camera=name, raycaster=caster, model=sensor.SMEARED)
+        for i, (name, pose) in enumerate(sensor.STATION.items())
+    ]
+    report = Report()
+    objects = perceive(frames, parameters=Parameters(), report=report).objects
+    assert len(objects) == len(radii)
+    for radius, (x, y) in zip(radii, PLACES, strict=True):
+        item = min(objects, key=lambda o: np.hypot(*(o.world_from_box[:2, 3] - (x, y))))
+        assert not item.hanging and report.shapes[item.id] == kind
+        assert item.mesh.extents == pytest.approx([2 * radius] * 3, abs=0.003)
+        assert item.world_from_box[:3, 3] == pytest.approx([x, y, radius], abs=0.003)
+
+
+@pytest.mark.parametrize("size", [(0.18, 0.09, 0.03), (0.1, 0.1, 0.1)])
+def test_what_is_well_above_the_table_hangs_however_broad(size):
+    box = trimesh.creation.box(extents=size)
+    truth = Mesh(box.vertices + [0.5, 0.05, 0.08 + size[2] / 2], box.faces).painted((180, 60, 50))
+    item, shape = seen(truth, ("left", "right"), poses=sensor.STATION)
+    assert item.hanging and shape == "hull"
+
+
 @pytest.mark.parametrize("names", [("left",), ("left", "right")])
 def test_a_wide_tin_is_a_cylinder(names):
     tin = trimesh.creation.cylinder(0.1, 0.068, sections=64)
