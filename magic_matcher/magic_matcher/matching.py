@@ -23,6 +23,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.placement import Relative, placement, relative
 from magic_core.placement import mirrored as mirrored_place
+from magic_core.recent import Recent
 from magic_core.rendering import canonical_view
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.shapes import section_view
@@ -35,6 +36,7 @@ from magic_matcher.contour import Contour
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
 from magic_matcher.plausible import Demands, Refusal, demands, refusals
+from magic_matcher.same import digest
 
 #: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
 #: all of these are refused.
@@ -47,6 +49,8 @@ COMPANIONS = 8
 FEATURES = 8
 #: Narrower ways across (share of the object's size) are the raster's.
 LEAST_ACROSS = 0.03
+#: Bytes of the pictures of targets that are kept: some fifteen.
+DRAWN = 16 * 2**20
 #: By so much a match in another view must be better for the tool to be turned for it.
 WORTH_TURNING = 0.05
 
@@ -274,14 +278,16 @@ def likeness(reference: CanonicalView, view: CanonicalView) -> float:
     return overlap * (sizes[0] / max(sizes[1], 1e-12))
 
 
-def choose_target(strategy: Strategy, objects: Sequence[SceneObject]) -> SceneObject:
-    """The object that looks most like the demonstration's target, seen as the target is, in shape and size."""
+def choose_target(
+    strategy: Strategy, objects: Sequence[SceneObject], seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view
+) -> SceneObject:
+    """The object that looks most like the demonstration's target, seen as the target is, in shape and size; seen: what draws it (:func:`target_view`)."""
     if not objects:
         raise MagicError(Code.UNKNOWN_OBJECT, "objects to choose the target from", 0, "at least one")
 
     def alike(item: SceneObject) -> float:
         try:
-            return likeness(strategy.target_view, target_view(item, strategy))
+            return likeness(strategy.target_view, seen(item, strategy))
         except MagicError:  # what cannot be drawn as the target was (a mesh that is not closed has no cut) is not like it
             return -1.0
 
@@ -305,7 +311,9 @@ class Matcher:
     two_step: bool = True
     cache: Any = None
     _prepared: dict[str, Any] = field(default_factory=dict, repr=False)
+    _drawn: Recent[bytes, CanonicalView] = field(default_factory=lambda: Recent(DRAWN), repr=False, compare=False)
     _lock: Any = field(default_factory=threading.Lock, repr=False, compare=False)
+    _drawing: Any = field(default_factory=threading.Lock, repr=False, compare=False)
 
     def prepare(self, reference: Reference) -> Any:
         """The backend's view of a reference, computed once."""
@@ -451,9 +459,21 @@ class Matcher:
             )
         return max(looking, key=lambda c: c.score).tool
 
+    def target_view(self, item: SceneObject, strategy: Strategy) -> CanonicalView:
+        """As the function of that name; what was drawn lately is not drawn again: it is looked at to choose the target, and when it is chosen."""
+        key = digest((item.mesh, item.world_from_object, strategy.target_view_direction, strategy.target_outline, strategy.view))
+        with self._drawing:
+            view = self._drawn.get(key)
+        if view is None:
+            view = target_view(item, strategy)
+            with self._drawing:
+                if self._drawn.get(key) is None:
+                    self._drawn.put(key, view, view.image.nbytes + view.mask.nbytes + (0 if view.depth is None else view.depth.nbytes))
+        return view
+
     def target_of(self, item: SceneObject, strategy: Strategy) -> Target:
         """An object as the target of a strategy: its view, and where on it the strategy's contacts are."""
-        view = target_view(item, strategy)
+        view = self.target_view(item, strategy)
         return Target(item.id, view, *self._contacts_on(view, strategy, item.world_from_object))
 
     def _contacts_on(
@@ -749,8 +769,14 @@ def match(
     return Matcher(backend).match(strategy, tools, target, top_k, heatmap)
 
 
-def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id: str) -> tuple[list[SceneObject], SceneObject]:
-    """The tools and the target that a request names, or that are meant by naming none.
+def select(
+    scene: Scene,
+    strategy: Strategy,
+    tool_ids: Sequence[str],
+    target_id: str,
+    seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view,
+) -> tuple[list[SceneObject], SceneObject]:
+    """The tools and the target that a request names, or that are meant by naming none; seen: as for :func:`choose_target`.
 
     No tool: every object that was seen by the cameras, but the target; where there is
     none of them, every other object.  No target: the one most like the demonstration's
@@ -780,7 +806,7 @@ def select(scene: Scene, strategy: Strategy, tool_ids: Sequence[str], target_id:
             raise MagicError(
                 Code.UNKNOWN_OBJECT, "objects left to be the target", 0, "name a target_id, or have one more object on the table"
             )
-        target = choose_target(strategy, rest)
+        target = choose_target(strategy, rest, seen)
     if target.id in set(tool_ids):
         raise MagicError(Code.BAD_REQUEST, "target_id", target.id, "an object that is not one of tool_ids")
     if named:

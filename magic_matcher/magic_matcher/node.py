@@ -24,6 +24,7 @@ from magic_interfaces.srv import MatchContact
 from magic_matcher import features, global_stage, matching
 from magic_matcher.cache import Cache
 from magic_matcher.features import BACKENDS
+from magic_matcher.remembered import Remembered
 
 
 class MatcherNode(Node):
@@ -58,6 +59,7 @@ class MatcherNode(Node):
             self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True
         )
         self._matcher = matching.Matcher(features.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
+        self._remembered = Remembered(self._matcher)
         self._scene: Scene | None = None
         self._strategies: dict[str, tuple[int, Strategy]] = {}
         self._lock = threading.Lock()
@@ -169,7 +171,10 @@ class MatcherNode(Node):
         found = self._strategy(request.strategy)
         tools, target, poses = self._parties(request, found)
         top_k = int(request.top_k) or int(self.get_parameter("top_k").value)
-        result = self._matcher.match(found, tools, target, top_k, request.want_heatmap)
+        if isinstance(target, SceneObject) and all(isinstance(tool, SceneObject) for tool in tools):
+            result = self._remembered.match(found, tools, target, top_k, request.want_heatmap)
+        else:
+            result = self._matcher.match(found, tools, target, top_k, request.want_heatmap)
         response.code, response.message = int(Code.OK), f"{len(result.candidates)} candidates on {len(tools)} tool(s)"
         if result.refused:
             response.message += f"; none on: {'; '.join(result.refused)}"
@@ -200,7 +205,7 @@ class MatcherNode(Node):
             items = [scene.find(name) for name in request.tool_ids] or [item for item in scene.objects if item.source != "known"]
             tools: list[SceneObject] = items
         else:
-            tools, target = matching.select(scene, found, list(request.tool_ids), request.target_id)
+            tools, target = matching.select(scene, found, list(request.tool_ids), request.target_id, self._matcher.target_view)
         return tools, target, {item.id: item.world_from_object for item in tools}
 
     def _objects(self) -> Scene:

@@ -14,8 +14,8 @@ from scipy.spatial import ConvexHull, QhullError
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_core.recent import Recent
 from magic_core.scene import SceneObject
-from magic_planner.recent import Recent
 
 #: Vertices (V, 3) and outward faces (F, 3) of a convex hull.
 Hull = tuple[NDArray[np.float64], NDArray[np.int32]]

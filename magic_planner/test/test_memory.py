@@ -11,9 +11,9 @@ import planner_scenes as scenes
 from hypothesis import given
 from hypothesis import strategies as st
 
+from magic_core.recent import Recent
 from magic_planner import collision, timing
 from magic_planner.object_motion import plan_tool_motion
-from magic_planner.recent import Recent
 
 
 def planned() -> list[weakref.ref]:
