@@ -35,6 +35,7 @@ setup(
         "shapely",
         "mapbox_earcut",
         "contourpy",
+        "manifold3d",
         beside("magic_core"),
     ],
     extras_require={"sam": ["torch", "transformers"], "learn": ["scikit-learn"]},

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.contact import Companion, Contact, ContactCandidate, contact_frame, turned_over
+from magic_core.content import digest
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.placement import Relative, placement, relative
@@ -36,7 +37,6 @@ from magic_matcher.contour import Contour
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
 from magic_matcher.plausible import Demands, Refusal, demands, refusals
-from magic_matcher.same import digest
 
 #: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
 #: all of these are refused.

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from magic_core.content import digest
 from magic_core.recent import Recent
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_matcher.matching import Matcher, MatchResult
-from magic_matcher.same import digest
 
 #: Bytes of pictures in the answers that are kept: some twenty.
 MOST = 48 * 2**20

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from magic_core import shapes, transforms
+from magic_core.content import digest
 from magic_core.scene import SceneObject
 from magic_matcher import matching, remembered
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.matching import Matcher, MatchResult
 from magic_matcher.remembered import Remembered
-from magic_matcher.same import digest
 
 
 class Counted:

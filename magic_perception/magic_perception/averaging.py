@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -41,21 +42,27 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
     used = np.stack([*older, np.ones_like(older[0])])
     depth = np.stack([f.depth for f in frames]).astype(np.float32)
     valid = np.isfinite(depth) & used
-    count = valid.sum(axis=0)
-    filled = np.where(valid, depth, 0)
-    mean = filled.sum(axis=0) / np.maximum(count, 1)
-    wide = np.where(valid, depth, -np.inf).max(axis=0) - np.where(valid, depth, np.inf).min(axis=0) > spread
+    # Frame by frame: numpy reduces a short axis slowly.
+    count, uses = _summed(valid.view(np.uint8)), _summed(used.view(np.uint8))
+    mean = _summed(np.where(valid, depth, np.float32(0))) / np.maximum(count, 1)
+    nearest, farthest = np.where(valid, depth, np.float32(np.inf)), np.where(valid, depth, np.float32(-np.inf))
+    wide = reduce(np.maximum, farthest) - reduce(np.minimum, nearest) > spread
     if wide.any():
         ordered = np.sort(np.where(valid[:, wide], depth[:, wide], np.inf), axis=0)
-        mean[wide] = np.take_along_axis(ordered, ((count[wide] - 1) // 2)[None], axis=0)[0]
-    mean[2 * count < used.sum(axis=0)] = np.nan
+        mean[wide] = np.take_along_axis(ordered, ((count[wide].astype(np.intp) - 1) // 2)[None], axis=0)[0]
+    mean[2 * count < uses] = np.nan
     if last.blind is not None:
         mean[last.blind] = np.nan
     total = np.zeros(last.color.shape, np.float32)
     for frame, counts in zip(frames, used, strict=True):
         cv2.accumulate(frame.color, total, mask=counts.view(np.uint8))
-    color = np.clip(total / used.sum(axis=0)[..., None] + 0.5, 0, 255).astype(np.uint8)
-    return replace(last, depth=mean.astype(np.float32), color=color)
+    color = np.clip(total / uses[..., None] + np.float32(0.5), 0, 255).astype(np.uint8)
+    return replace(last, depth=mean, color=color)
+
+
+def _summed(stack: NDArray) -> NDArray[np.float32]:
+    """The sum (H, W) over a stack (N, H, W)."""
+    return reduce(np.add, stack, np.float32(0))
 
 
 def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
@@ -77,7 +84,8 @@ def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
 
 def _recolored(frame: RgbdFrame, other: RgbdFrame, least: float) -> NDArray[np.bool_]:
     """(H, W): where two frames differ in colour, by more than ``least`` (of 255) and than elsewhere."""
-    difference = cv2.GaussianBlur(cv2.absdiff(frame.color, other.color).max(axis=2), (0, 0), 1.0)
+    red, green, blue = cv2.split(cv2.absdiff(frame.color, other.color))
+    difference = cv2.GaussianBlur(cv2.max(cv2.max(red, green), blue), (0, 0), 1.0)
     return difference > max(least, NOISES * float(np.median(difference)))
 
 

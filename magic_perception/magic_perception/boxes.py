@@ -85,19 +85,14 @@ def _start(points: NDArray[np.float64], height: float) -> Box | None:
     side = points[(points[:, 2] < 0.9 * height - 0.003) & (points[:, 2] > 0.1 * height), :2]
     flat = side if len(side) > 60 else points[:, :2]
     flat = flat[:: max(1, len(flat) // 300)]
-    best: tuple[float, float] | None = None
-    for yaw in np.radians(np.arange(0, 90, 1.5)):
-        c, s = np.cos(yaw), np.sin(yaw)
-        gaps = []
-        for along in (flat @ [c, s], flat @ [-s, c]):
-            low, high = np.percentile(along, [2, 98])
-            gaps.append(np.minimum(np.abs(along - low), np.abs(high - along)))
-        value = float(np.minimum(np.minimum(*gaps), 0.01).mean())
-        if best is None or value < best[0]:
-            best = (value, yaw)
-    if best is None:
+    if not len(flat):
         return None
-    yaw = best[1]
+    yaws = np.radians(np.arange(0, 90, 1.5))
+    c, s = np.cos(yaws), np.sin(yaws)
+    along = np.stack([np.column_stack([c, s]), np.column_stack([-s, c])]) @ flat.T  # (2, yaws, points)
+    low, high = np.percentile(along, [2, 98], axis=2, keepdims=True)
+    gaps = np.minimum(np.abs(along - low), np.abs(high - along))
+    yaw = float(yaws[int(np.argmin(np.minimum(gaps.min(axis=0), 0.01).mean(axis=1)))])
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     low, high = np.percentile(points[:, :2] @ turn.T, [1, 99], axis=0)
     return Box(turn.T @ ((low + high) / 2), np.array([*(high - low), height]), yaw)

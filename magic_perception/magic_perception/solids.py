@@ -42,6 +42,10 @@ def hull_of(points: NDArray[np.float64]) -> Mesh | None:
     return Mesh(vertices, faces)
 
 
+#: How far what a quick hull (manifold3d) fills may be from what Qhull says, over half of its surface, m: the rounding of both, with room.
+_QUICK = 1e-6
+
+
 def joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: int = 40, limit: float = 0.0025) -> list[Mesh]:
     """Hulls of clouds (N, 3), neighbours joined, the pair that fills least first.
 
@@ -50,6 +54,7 @@ def joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: in
     """
     import heapq
 
+    from manifold3d import Manifold
     from scipy.spatial import ConvexHull, QhullError
 
     def solid(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
@@ -61,42 +66,52 @@ def joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: in
 
     parts: dict[int, tuple[NDArray[np.float64], float, float]] = {}
     filled: dict[int, float] = {}
-    boxes: dict[int, NDArray[np.float64]] = {}
+    boxes = np.empty((2 * len(clouds), 2, 3))
     for cloud in clouds:
         made = solid(cloud)
         if made is not None:
             i = len(parts)
-            parts[i], filled[i], boxes[i] = made, made[1], np.stack([made[0].min(axis=0), made[0].max(axis=0)])
+            parts[i], filled[i], boxes[i] = made, made[1], (made[0].min(axis=0), made[0].max(axis=0))
+    # What fills how much at least, its exact value not known before it is the least of all: most pairs never are.
     queue: list[tuple[float, int, int]] = []
     hulls: dict[tuple[int, int], tuple[NDArray[np.float64], float, float]] = {}
+
+    def excess_of(i: int, j: int, volume: float, area: float) -> float:
+        return (volume - filled[i] - filled[j]) / (area / 2)
 
     def offer(i: int, others: list[int]) -> None:
         if not others:
             return
-        box = np.stack([boxes[j] for j in others])
+        box = boxes[others]
         near = np.all((box[:, 0] < boxes[i][1] + 5e-4) & (box[:, 1] > boxes[i][0] - 5e-4), axis=1)
         for j in np.array(others)[near].tolist():
-            made = solid(np.concatenate([parts[i][0], parts[j][0]]))
-            if made is not None:
-                excess = (made[1] - filled[i] - filled[j]) / (made[2] / 2)
-                if excess < limit:
-                    hulls[i, j] = made
-                    heapq.heappush(queue, (excess, i, j))
+            both = Manifold.hull_points(np.concatenate([parts[i][0], parts[j][0]]))
+            area = both.surface_area()
+            least = excess_of(i, j, both.volume(), area) - _QUICK if area > 0 else -np.inf
+            if least < limit:
+                heapq.heappush(queue, (least, i, j))
 
     for i in list(parts):
         offer(i, [j for j in parts if j > i])
     following = len(parts)
     while queue:
         excess, i, j = heapq.heappop(queue)
-        made = hulls.pop((i, j))
         if i not in parts or j not in parts:
+            hulls.pop((i, j), None)
             continue
         if excess > tolerance and len(parts) <= most:
             break
+        if (i, j) not in hulls:
+            found = solid(np.concatenate([parts[i][0], parts[j][0]]))
+            if found is not None and (excess := excess_of(i, j, found[1], found[2])) < limit:
+                hulls[i, j] = found
+                heapq.heappush(queue, (excess, i, j))
+            continue
+        made = hulls.pop((i, j))
         k, following = following, following + 1
-        parts[k], filled[k], boxes[k] = made, filled[i] + filled[j], np.stack([made[0].min(axis=0), made[0].max(axis=0)])
+        parts[k], filled[k], boxes[k] = made, filled[i] + filled[j], (made[0].min(axis=0), made[0].max(axis=0))
         for gone in (i, j):
-            del parts[gone], filled[gone], boxes[gone]
+            del parts[gone], filled[gone]
         offer(k, [m for m in parts if m != k])
     return [mesh for points, _, _ in parts.values() if (mesh := hull_of(points)) is not None]
 

@@ -105,7 +105,10 @@ def _likeliest_circle(
     if not members:
         return None
     # All hypotheses at once.
-    picked = np.stack([sample[members[i][rng.integers(len(members[i]), size=3)], :2] for i in rng.integers(len(members), size=160)])
+    counts = np.array([len(m) for m in members])
+    level = rng.integers(len(members), size=160)
+    drawn = rng.integers(np.repeat(counts[level], 3)).reshape(-1, 3)
+    picked = sample[np.concatenate(members)[(np.cumsum(counts) - counts)[level][:, None] + drawn], :2]
     a = 2 * (picked[:, 1:] - picked[:, :1])
     rhs = np.sum(picked[:, 1:] ** 2, axis=2) - np.sum(picked[:, :1] ** 2, axis=2)
     det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
@@ -158,9 +161,12 @@ def _profile(side: _Side, front: NDArray[np.float64], top: float, band: float) -
     """Radius and z (K, 2) from the table to the top: half the parabola's, half what the points of each level say."""
     levels = np.linspace(0, top, max(4, int(top / 0.008)) + 1)
     radii = side.radius(levels)
+    front = front[np.argsort(front[:, 2])]
     rho = np.linalg.norm(front[:, :2] - side.axis, axis=1)
+    around = np.searchsorted(front[:, 2], [levels - 0.0061, levels + 0.0061])
     for i, level in enumerate(levels):
-        here = rho[(np.abs(front[:, 2] - level) < 0.006) & (np.abs(rho - radii[i]) < 2.5 * band)]
+        near = slice(*around[:, i])
+        here = rho[near][(np.abs(front[near, 2] - level) < 0.006) & (np.abs(rho[near] - radii[i]) < 2.5 * band)]
         if len(here) > 6:
             radii[i] = 0.5 * radii[i] + 0.5 * np.median(here)
     return np.column_stack([radii, levels])

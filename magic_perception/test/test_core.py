@@ -426,6 +426,20 @@ def test_tiles_of_a_slab_become_one_piece_and_an_l_two():
     assert sum(p.to_trimesh().volume for p in pieces) < 2 * 2 / 3 * np.pi * (0.05**3 - 0.047**3)
 
 
+def test_pieces_are_those_of_exact_hulls_of_all_pairs(monkeypatch):
+    """Most pairs are only known to fill too much; with no such bound every pair's hull is asked for."""
+    from magic_perception import solids
+
+    rng = np.random.default_rng(4)
+    clouds = [0.002 * (rng.integers(0, 6, (int(rng.integers(6, 40)), 3)) + 5 * rng.integers(0, 5, 3)) for _ in range(70)]
+    quick = solids.joined(clouds)
+    monkeypatch.setattr(solids, "_QUICK", np.inf)
+    exact = solids.joined(clouds)
+    assert 1 < len(quick) == len(exact) < len(clouds)
+    for one, other in zip(quick, exact, strict=True):
+        assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
+
+
 def test_measures_against_known_truths():
     from magic_perception.evaluate import chamfer, open_holes, shared_volume
 

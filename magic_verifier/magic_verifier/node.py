@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from sensor_msgs.msg import Image
 
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
+from magic_core.content import digest
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, check_solid
 from magic_core.node import OneGoalServer, describe, parameter, robot_parameters, run
@@ -231,30 +231,6 @@ class VerifierNode(Node):
         caption = f"{verdict.code.name}: {verdict.message}"
         strip = film_strip(verdict.recording, tool, target, obstacles, table, frames=self._film_frames, caption=caption, robot=self._robot)
         return convert.image_to_msg(strip, "rgb8")
-
-
-def digest(value: Any) -> bytes:
-    """Equal for equal values: of numbers, text, arrays, and tuples and dataclasses of such.
-
-    Not ``==``: not a number is not itself, and stands for times that there are not.
-    """
-    found = hashlib.sha256()
-
-    def take(item: Any) -> None:
-        if isinstance(item, np.ndarray):
-            found.update(f"{item.dtype}{item.shape}".encode() + np.ascontiguousarray(item).tobytes())
-        elif is_dataclass(item):
-            for part in fields(item):
-                take(getattr(item, part.name))
-        elif isinstance(item, (list, tuple)):
-            found.update(b"%d[" % len(item))
-            for part in item:
-                take(part)
-        else:
-            found.update(repr(item).encode() + b";")
-
-    take(value)
-    return found.digest()
 
 
 def main() -> None:
