@@ -29,9 +29,11 @@ def test_this_process_has_spent_something():
 
 
 def test_the_table_has_medians_and_names_what_did_not_end_well():
-    def run(total, client, code="OK", tried=1, variant="arm"):
-        return Run("hooking", variant, code, tried, dict.fromkeys(STAGES, total), client, {"planner": 0.5, "verifier": 0.25})
+    def run(total, client, code="OK", tried=1, variant="arm", first=False):
+        return Run("hooking", variant, code, tried, dict.fromkeys(STAGES, total), client, {"planner": 0.5, "verifier": 0.25}, first)
 
-    rows = table([run(1.0, 1.5), run(3.0, 1.0), run(2.0, 4.0, "DRIFT", 3), run(0.2, 0.3, variant="fg")]).splitlines()
-    assert rows[2] == "| hooking, arm | 3 | 2.00 | 2.00 | 2.00 | 2.00 | 1.50 | 1.00 | 0.75 | 1/3 DRIFT |"
-    assert rows[3] == "| hooking, fg | 1 | 0.20 | 0.20 | 0.20 | 0.20 | 0.30 | 0.30 | 0.75 | 1 |"
+    first = [run(9.0, 9.5, first=True), run(0.8, 0.9, variant="fg", first=True)]
+    rows = table([*first, run(1.0, 1.5), run(3.0, 1.0), run(2.0, 4.0, "DRIFT", 3), run(0.2, 0.3, variant="fg")]).splitlines()
+    assert {row.count("|") for row in rows} == {13}
+    assert rows[2] == "| hooking, arm | 9.00 | 9.00 | 3 | 2.00 | 2.00 | 2.00 | 2.00 | 1.50 | 1.00 | 0.75 | 1/3 DRIFT |"
+    assert rows[3] == "| hooking, fg | 0.80 | 0.80 | 1 | 0.20 | 0.20 | 0.20 | 0.20 | 0.30 | 0.30 | 0.75 | 1 |"
