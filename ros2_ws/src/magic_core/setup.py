@@ -30,7 +30,7 @@ setup(
         "threadpoolctl",
         "example-robot-data",
     ],
-    extras_require={"networks": ["torch"]},
+    extras_require={"networks": ["torch", "transformers"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",
