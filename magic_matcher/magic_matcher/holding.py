@@ -24,6 +24,13 @@ from magic_matcher.contour import Contour, level_lines, resample
 TOLERANCE = 0.04
 #: At rest the way into the open points up at least so much (cosine).
 LIES = 0.3
+#: By so much (rad) a pull may be off to either side and still has to find the disc held, in steps in which a better pull is looked for, and
+#: the farthest that one is from the contact's own normal.
+ASTRAY, TURN_STEP, TURN_MOST = np.deg2rad(15.0), np.deg2rad(5.0), np.deg2rad(45.0)
+
+
+#: Closed curves (K, 2) of a disc's centres, and their unit normals (K, 2) into the open.
+Curves = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ def room(contour: Contour, radius: float) -> Room:
     return Room(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), (margin - low).astype(float))
 
 
-def centres(around: Room, radius: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def centres(around: Room, radius: float) -> Curves:
     """Closed curves (K, 2) of the centres of touching discs, px, and their unit normals (K, 2) into the open."""
     # Distances are to the nearest pixel of the tool, half a pixel beyond its edge.
     lines = level_lines(around.distance, max(0.97 * radius + 0.5, 0.75))
@@ -198,3 +205,53 @@ def hold(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.floa
         swing[part] = np.sort(depth, axis=1) / radius
         start[part] = np.where(lies, swing[part, 0] - (distance[rest] - distance[at]) / radius, -1.0)
     return Held(gap, drift, press, swing, start)
+
+
+def steadied(
+    contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float64], radius: float, curves: Curves, enough: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """The contact (2,) and normal (2,) by which a disc of ``radius`` px is held, pulled a little astray as well, that was met at a
+    contact; ``None`` where its own normal serves, or no other is better.  curves: those of its :func:`centres`.
+
+    A large disc in a small corner touches both of its arms, the shorter one at its end: pulled along the bisector of the corner it rolls
+    over that end.  Of normals turned about the disc's centre the one that is turned least counts for which the hollow is ``enough``
+    radii deep, pulled along it and :data:`ASTRAY` to either side; where none is so deep, the deepest.  The contact is then where the
+    line through the disc's centre meets the outline.
+    """
+    if not curves:
+        return None
+    across = np.array([-normal[1], normal[0]])
+    relative = np.concatenate([curve for curve, _ in curves]) - point - radius * normal
+    # As in hold(): the disc comes from outside.
+    beyond = relative @ normal
+    nearest = int(np.argmin(np.minimum(beyond, 0.5 * beyond) ** 2 + (relative @ across) ** 2))
+    ends = np.cumsum([len(curve) for curve, _ in curves])
+    which = int(np.searchsorted(ends, nearest, side="right"))
+    curve, free = curves[which]
+    at = nearest - (int(ends[which - 1]) if which else 0)
+    tolerance = max(TOLERANCE * radius, 0.6)
+
+    def pressed(turns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """How deep (T,) in radii the disc is held, pressed along the normal turned by so much, those directions, and where it rests."""
+        directions = np.cos(turns)[:, None] * normal + np.sin(turns)[:, None] * across
+        height = (directions @ (curve - curve[at]).T).astype(np.float32)
+        rest, depth, _ = _settle(curve, free, directions, np.full(len(turns), at), height, tolerance, False)
+        # What rolls farther than its own radius is at another place.
+        here = np.hypot(*(curve[rest] - curve[at]).T) <= radius
+        return np.minimum(np.where(here, depth.min(axis=1) / radius, 0.0), enough), directions, rest
+
+    own = float(pressed(np.array([-ASTRAY, 0.0, ASTRAY]))[0].min())
+    if own >= enough:
+        return None
+    count, side = round(TURN_MOST / TURN_STEP), round(ASTRAY / TURN_STEP)
+    turns = np.arange(-count - side, count + side + 1) * TURN_STEP
+    held, directions, rest = pressed(turns)
+    steady = np.min([held[side + k : len(held) - side + k] for k in (-side, 0, side)], axis=0)
+    best = int(np.lexsort((np.abs(turns[side:-side]), -steady))[0])
+    if steady[best] <= own + TOLERANCE:
+        return None
+    direction, centre = directions[side + best], curve[rest[side + best]]
+    way = np.arange(0.0, 3 * radius, 0.25)
+    ahead = centre - way[:, None] * direction
+    solid = np.flatnonzero(contour.sample(*ahead.T.astype(np.float32)[:, None])[0] > 0.5)
+    return (ahead[solid[0]], direction) if len(solid) else None

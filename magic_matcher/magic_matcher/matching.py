@@ -32,11 +32,11 @@ from magic_core.strategy import Strategy
 from magic_core.surface import Surface
 from magic_core.views import as_it_stands, mirrored, own_views, same_direction, square_view
 from magic_matcher import contour as contours
-from magic_matcher import curvature, enclosing, facing, global_stage, score
+from magic_matcher import curvature, enclosing, facing, global_stage, holding, score
 from magic_matcher.contour import Contour
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
-from magic_matcher.plausible import Demands, Refusal, demands, refusals
+from magic_matcher.plausible import Demands, Refusal, demands, refusals, room_for
 
 #: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
 #: all of these are refused.
@@ -594,6 +594,10 @@ class Matcher:
         pairs = [(p, e) for p, e in zip(proposals, estimates, strict=True) if e is not None]
         if not pairs:
             return [], []
+        around = room_for(task.asked, contour, radius)
+        if around is not None and radius is not None and task.asked.hollow is not None:
+            curves = holding.centres(around, radius)
+            pairs = [(p, _steadied(task.asked, contour, p, e, radius, curves)) for p, e in pairs]
         refused = refusals(
             task.asked,
             contour,
@@ -603,6 +607,7 @@ class Matcher:
             np.array([p.similarity for p, _ in pairs]),
             radius,
             view.metres_per_pixel,
+            around,
         )
         candidates: list[ContactCandidate] = []
         for (proposal, local), refusal in zip(pairs, refused, strict=True):
@@ -653,6 +658,16 @@ class _Seen:
     candidates: list[ContactCandidate]
     refusal: Refusal | None
     heatmap: NDArray[np.float32] | None
+
+
+def _steadied(
+    asked: Demands, contour: Contour, proposal: Proposal, found: curvature.Estimate, radius: float, curves: holding.Curves
+) -> curvature.Estimate:
+    """An estimate whose place and normal are those by which the target is held surely, where a hollow is asked for (:func:`holding.steadied`)."""
+    if asked.hollow is None or found.concave != asked.concave or not proposal.similarity >= asked.floor:
+        return found
+    held = holding.steadied(contour, found.point, found.normal, radius, curves, asked.hollow)
+    return found if held is None else replace(found, point=held[0], normal=held[1])
 
 
 def _told(task: _Task, tool: Tool, seen: _Seen) -> _Seen:

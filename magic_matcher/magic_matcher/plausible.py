@@ -64,6 +64,11 @@ def demands(reference: Reference, floor: float) -> Demands:
     return Demands(concave, floor, max(GAP, GAP_SHARE * gap) if np.isfinite(gap) else None, min(HOLLOW, depth) if depth > 0 else None, loop)
 
 
+def room_for(asked: Demands, contour: Contour, radius: float | None) -> holding.Room | None:
+    """The room for a target of a radius (px) about a tool, ``None`` where it is not asked for."""
+    return None if radius is None or (asked.gap is None and asked.hollow is None) else holding.room(contour, radius)
+
+
 def refusals(
     asked: Demands,
     contour: Contour,
@@ -73,11 +78,13 @@ def refusals(
     similarity: NDArray[np.float64],
     radius: float | None,
     metres_per_pixel: float,
+    around: holding.Room | None = None,
 ) -> list[Refusal | None]:
-    """For each of the places (N, 2) with outward normals why it is refused, ``None`` where it is not; radius of the target, px."""
-    held = around = None
-    if radius is not None and (asked.gap is not None or asked.hollow is not None) and len(points):
-        around = holding.room(contour, radius)
+    """For each of the places (N, 2) with outward normals why it is refused, ``None`` where it is not; radius of the target, px; around:
+    :func:`room_for` it where that is known."""
+    held = None
+    around = room_for(asked, contour, radius) if around is None else around
+    if radius is not None and around is not None and len(points):
         held = holding.hold(contour, points, normals, radius, around)
     result: list[Refusal | None] = []
     for i, likeness in enumerate(similarity):

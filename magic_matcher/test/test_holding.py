@@ -35,6 +35,40 @@ def test_an_inner_corner_holds_as_deep_as_its_arms_rise(corner, radius):
     assert held.press[0, 0] * radius > (170 - radius) / np.sqrt(2) - 5
 
 
+def stepped(shoulder):
+    """A bar with a wide head: at (300, 200) the inner corner whose one arm is the bar, the other a shoulder of so many pixels."""
+    mask = np.zeros((500, 500), bool)
+    mask[200:230, 60:300] = True
+    mask[200 - shoulder : 230, 300:400] = True
+    return contour.extract(mask)
+
+
+@pytest.mark.parametrize("radius", [30.0, 45.0])
+def test_a_large_disc_in_a_small_corner_is_pulled_towards_its_shorter_arm(radius):
+    shape, bisector = stepped(22), np.array([-1.0, -1.0]) / np.sqrt(2)
+    corner = shape.points[shape.nearest((300.0, 200.0))]
+    around = holding.room(shape, radius)
+    point, normal = holding.steadied(shape, corner, bisector, radius, holding.centres(around, radius), 0.2)
+    # It is held between the bar's normal and that of the shoulder's end, and the disc touches both.
+    end = np.degrees(np.arcsin((radius - 22) / radius))
+    angle = np.degrees(np.arctan2(-normal[1], -normal[0]))
+    assert end + 30 < angle < 90 - 5
+    assert point[1] == pytest.approx(200, abs=2) and 300 - 1.5 * radius < point[0] < 300
+    before, after = (holding.hold(shape, p[None], n[None], radius, around).press[0, 0] for p, n in ((corner, bisector), (point, normal)))
+    assert after > 1.5 * before
+
+
+def test_where_a_contact_holds_its_own_normal_stays():
+    deep = stepped(90)
+    curves = holding.centres(holding.room(deep, 30.0), 30.0)
+    bisector = np.array([-1.0, -1.0]) / np.sqrt(2)
+    place = deep.points[deep.nearest((300.0, 200.0))]
+    assert holding.steadied(deep, place, bisector, 30.0, curves, 0.2) is None
+    # On the bar's long side there is no hollow within reach, however it is turned.
+    side = deep.points[deep.nearest((120.0, 200.0))]
+    assert holding.steadied(deep, side, np.array([0.0, -1.0]), 30.0, curves, 0.2) is None
+
+
 def test_sides_tips_and_outer_corners_do_not_hold(corner):
     for pixel, normal in (((59.5, 59.5), (-1, -1)), ((60, 150), (-1, 0)), ((249.5, 70), (1, 0))):
         held = at(corner, pixel, normal, 15.0)

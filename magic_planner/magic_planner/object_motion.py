@@ -39,8 +39,8 @@ from magic_planner.sliding import lowest, slid_contacts
 #: Largest step between two samples: metres, radians.
 STEP_LENGTH = 0.005
 STEP_ANGLE = np.deg2rad(2.0)
-#: Gap kept between tool and table, metres.
-TABLE_CLEARANCE = 0.001
+#: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up.
+TABLE_CLEARANCE, LOW_SHARE = 0.001, 0.2
 #: How quickly the tool takes up and loses its speed between waypoints, m/s^2.
 ACCELERATION = 1.0
 #: How long a waypoint that does not move the tool lasts (the gripper opens), seconds.
@@ -112,9 +112,10 @@ def plan_tool_motion(
     else:
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
     world_from_meeting = world_from_contact @ contacts
-    frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, TABLE_CLEARANCE, gap)
+    clearance = _above_table(target, plane, gap)
+    frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, gap)
     world_from_tool = world_from_meeting @ transforms.inverse(frames)
-    world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool))
+    world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool), clearance)
     start = Body(tool.id, solid_pieces(tool))
     start.move(world_from_tool[0])
     for item in (target, *obstacles):
@@ -132,8 +133,16 @@ def plan_tool_motion(
         ahead = next((n for n, t in marks if t >= times[index] - 1e-6), marks[-1][0])
         return f"waypoint {ahead!r} (at {times[index]:.2f} s of the tool's motion)"
 
-    world_from_tool = give_way(world_from_tool, tool, obstacles, direction, plane, TABLE_CLEARANCE, name, gap)
+    world_from_tool = give_way(world_from_tool, tool, obstacles, direction, plane, clearance, name, gap)
     return ToolMotion(times, world_from_tool, phases, marks)
+
+
+def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float) -> float:
+    """The gap (m) that a tool keeps to the table: as to obstacles, for a tool that has turned a little in the gripper would scrape along it
+    with the far end of a long handle, but so small that a low target is met all the same."""
+    pieces = np.concatenate([piece.vertices for piece in solid_pieces(target)])
+    height = float((transforms.apply(target.world_from_object, pieces) @ plane[:3] + plane[3]).max())
+    return max(TABLE_CLEARANCE, min(gap, LOW_SHARE * height))
 
 
 def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:

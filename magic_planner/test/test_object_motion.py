@@ -132,6 +132,18 @@ def test_the_tool_is_raised_by_the_least_amount_that_clears_the_table(table):
     assert min(gaps) == pytest.approx(TABLE_CLEARANCE, abs=1e-9)
 
 
+@pytest.mark.parametrize(("radius", "above"), [(0.02, 0.004), (0.006, 0.0024), (0.002, TABLE_CLEARANCE)])
+def test_a_tool_in_a_gripper_keeps_off_the_table_as_off_other_things_and_meets_a_low_target_all_the_same(radius, above):
+    strategy, _tool, _, _ = setup()
+    tall, tool_contact = scenes.hook(thickness=0.08)
+    target, target_contact = scenes.standing_cylinder(radius)
+    candidate = scenes.candidate(tall, tool_contact, target_contact)
+    motion = plan_tool_motion(strategy, tall, target, candidate, "keep", TABLE, gap=0.004)
+    vertices = np.concatenate([p.vertices for p in tall.pieces])
+    lowest = min(transforms.apply(pose, vertices)[:, 2].min() for pose in motion.world_from_tool)
+    assert lowest == pytest.approx(above, abs=1e-6)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     x=st.floats(-1, 1),
