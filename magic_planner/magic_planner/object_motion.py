@@ -41,6 +41,8 @@ STEP_LENGTH = 0.005
 STEP_ANGLE = np.deg2rad(2.0)
 #: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up.
 TABLE_CLEARANCE, LOW_SHARE = 0.001, 0.2
+#: By so much (rad) a tool is turned out of the attitude in which its contact was seen, where it would pass over its target in that.
+LEVELLED = np.deg2rad(30.0)
 #: How quickly the tool takes up and loses its speed between waypoints, m/s^2.
 ACCELERATION = 1.0
 #: How long a waypoint that does not move the tool lasts (the gripper opens), seconds.
@@ -101,6 +103,9 @@ def plan_tool_motion(
     target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
     tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
     world_from_contact = world_from_target @ target_from_contact
+    clearance = _above_table(target, plane, gap)
+    if not candidate.companions:
+        tool_from_contact = _not_over(tool, tool_from_contact, target, world_from_contact, plane, clearance)
     pairs = further_pairs(strategy, candidate, reflection, tool_from_contact)
 
     if strategy.mode == "plan":
@@ -112,7 +117,6 @@ def plan_tool_motion(
     else:
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
     world_from_meeting = world_from_contact @ contacts
-    clearance = _above_table(target, plane, gap)
     frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, gap)
     world_from_tool = world_from_meeting @ transforms.inverse(frames)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool), clearance)
@@ -143,6 +147,40 @@ def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float) ->
     pieces = np.concatenate([piece.vertices for piece in solid_pieces(target)])
     height = float((transforms.apply(target.world_from_object, pieces) @ plane[:3] + plane[3]).max())
     return max(TABLE_CLEARANCE, min(gap, LOW_SHARE * height))
+
+
+def _not_over(
+    tool: SceneObject,
+    tool_from_contact: NDArray[np.float64],
+    target: SceneObject,
+    world_from_contact: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    clearance: float,
+) -> NDArray[np.float64]:
+    """The contact frame (4, 4), turned about the contact so that the tool is led as flat as it lies, where it would pass over the target.
+
+    A contact is seen in the view that shows it best, which may be a little askew to a long tool: held so it stands on its one end, and
+    the contact is higher than a low target.
+    """
+    up = plane[:3]
+    pieces = transforms.apply(target.world_from_object, np.concatenate([piece.vertices for piece in solid_pieces(target)]))
+    room = float((pieces @ up).max() - world_from_contact[:3, 3] @ up)
+    points = outer_points(tool)
+
+    def raised(frame: NDArray[np.float64]) -> float:
+        return lift_above(plane, (world_from_contact @ OPPOSED @ transforms.inverse(frame))[None], points, clearance)
+
+    lift = raised(tool_from_contact)
+    lying = tool.world_from_object[:3, :3].T @ up
+    used = (world_from_contact @ OPPOSED @ transforms.inverse(tool_from_contact))[:3, :3].T @ up
+    lying = lying if lying @ used > 0 else -lying  # turned over it lies as flat
+    axis = np.cross(used, lying)
+    sine = float(np.linalg.norm(axis))
+    if lift < room or not 1e-6 < sine <= np.sin(LEVELLED):
+        return tool_from_contact
+    turned = tool_from_contact.copy()
+    turned[:3, :3] = transforms.from_rotvec(axis / sine * np.arcsin(sine))[:3, :3] @ turned[:3, :3]
+    return turned if raised(turned) < min(room, lift) else tool_from_contact
 
 
 def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:

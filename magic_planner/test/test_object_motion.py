@@ -144,6 +144,23 @@ def test_a_tool_in_a_gripper_keeps_off_the_table_as_off_other_things_and_meets_a
     assert lowest == pytest.approx(above, abs=1e-6)
 
 
+@pytest.mark.parametrize(("askew", "height", "flat"), [(20, 0.03, True), (20, 0.3, False), (40, 0.03, False)])
+def test_a_tool_seen_a_little_askew_is_led_flat_where_it_would_pass_over_a_low_target(askew, height, flat):
+    strategy, _tool, _, _ = setup()
+    tool, tool_contact = scenes.hook()
+    tilt = transforms.from_rpy(0, np.deg2rad(askew), 0)  # the far end of the handle down, the contact up
+    frame = tool_contact.object_from_contact.copy()
+    frame[:3, :3] = tilt[:3, :3] @ frame[:3, :3]
+    seen = dataclasses.replace(tool_contact, object_from_contact=frame)
+    _, target_contact = scenes.standing_cylinder(0.015)
+    standing = transforms.make(translation=[0.6, 0.0, height / 2])
+    target = scenes.item("target", [scenes.cylinder(0.015, height)], standing, scenes.DOWN)
+    motion = plan_tool_motion(strategy, tool, target, scenes.candidate(tool, seen, target_contact), "keep", TABLE)
+    met = at(motion, contact_end(motion))
+    assert np.degrees(np.arccos(np.clip(met[2, 2], -1, 1))) == pytest.approx(0 if flat else askew, abs=1e-3)
+    assert ((met @ frame)[2, 3] < height) == (flat or height > 0.1)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     x=st.floats(-1, 1),
