@@ -29,6 +29,7 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
     between two surfaces) the median is taken instead of the mean, so that no surface is made up between two.
     What moves, and what the robot hid before, is taken from the frames alone that show it as the last one does: the mean of a thing's places is
     a thing that is nowhere.  Blind is what is blind in the last frame.
+    So is what is held.
     Raises ``BAD_IMAGE`` for frames of different sizes, ``NO_FRAMES`` for none.
     """
     if not frames:
@@ -72,6 +73,7 @@ def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
     if not np.allclose(frame.world_from_camera, before.world_from_camera, atol=PLACE):
         return False
     blind, veiled = (np.zeros(f.depth.shape, bool) if f.blind is None else f.blind for f in (frame, before))
+    held, was_held = (np.zeros(f.depth.shape, bool) if f.held is None else f.held > 0 for f in (frame, before))
     valid, was = np.isfinite(frame.depth), np.isfinite(before.depth)
     with np.errstate(invalid="ignore"):
         other = (valid != was) | (np.abs(frame.depth - before.depth) > SHIFT * np.maximum(frame.depth, 0.5) ** 2)
@@ -79,6 +81,7 @@ def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
         _opened(_recolored(frame, before, FAINT), BLOB).any()
         or _opened(other & ~blind & ~veiled, DEEP_BLOB).any()
         or _opened(blind != veiled, DEEP_BLOB).any()
+        or _opened(held != was_held, DEEP_BLOB).any()
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.camera import SURELY
 from magic_core.mesh import Mesh
 from magic_perception.segmentation import Looked
 
@@ -21,6 +22,12 @@ COLOR = 40.0
 EMPTY = 0.02
 #: What hangs: its lowest seen part is so high above the table, metres, and for most of it, and under its middle, the space below is seen to be empty.
 CLEAR, MOST = 0.03, 0.5
+#: What is held is where what is held may be, by more than this share of its pixels.
+HELD = 0.6
+#: What is so narrow, pixels, may be the edge of something else; a part of what is held that is so wide, and where that cannot be, is something else.
+EDGE, APART = 5, 11
+#: Pieces of no more than this share of what is surely held belong to it.
+LOOSE = 0.25
 #: What carries a thing out of sight is under its middle, within this, m, and is a part of it: no more than this share of its height, as a ball's or an egg's
 #: underside and a vase's foot are.
 FOOT, UNDERSIDE = 0.01, 0.4
@@ -55,6 +62,68 @@ def veil(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray[n
         positive = image > 0
         image[positive] = number[joined[image[positive]]]
     return labels
+
+
+def parted(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray[np.int32]]:
+    """Labels with what the robot holds apart from what it is held to, under one label of its own.
+
+    A thing that is mostly what is held is it, but for what of it is surely something else.  Of another thing what is surely held is
+    taken away, with the scraps about it.
+    """
+    if all(look.frame.held is None for look in looks):
+        return labels
+    top = max((int(image.max()) for image in labels), default=0)
+    own = top + 1
+    tools = [n for n in range(1, top + 1) if mostly_held(looks, labels, n)]
+    labels = [image.copy() for image in labels]
+    for look, image in zip(looks, labels, strict=True):
+        held = look.frame.held
+        if held is None:
+            continue
+        for label in np.unique(image[(image > 0) & (held > 0)]):
+            mask = image == label
+            if label in tools:
+                outside = mask & (held == 0)
+                image[mask & ~_pieces(outside, _opened(outside, APART))] = own
+            else:
+                # Where the two are told apart already, pixels at the edge are all that is taken for the other.
+                sure = _opened(mask & (held == SURELY), EDGE)
+                if sure.any():
+                    rest = mask & ~sure
+                    count, pieces = cv2.connectedComponents(rest.view(np.uint8), connectivity=4)
+                    size, near = np.bincount(pieces.ravel(), minlength=count), np.bincount(pieces[held > 0], minlength=count)
+                    scraps = (near > HELD * size) & (size < LOOSE * np.count_nonzero(sure))
+                    scraps[0] = False
+                    image[sure | scraps[pieces]] = own
+    present = np.unique(np.concatenate([image[image > 0] for image in labels]))
+    number = np.zeros(own + 1, np.int32)
+    number[present] = np.arange(1, len(present) + 1)
+    for image in labels:
+        image[image > 0] = number[image[image > 0]]
+    return labels
+
+
+def _opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    """What of a mask (H, W) is no narrower than so many pixels."""
+    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)
+
+
+def _pieces(mask: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The pieces of a mask (H, W) in which any of the seeds lies."""
+    count, pieces = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
+    chosen = np.bincount(pieces[seeds], minlength=count) > 0
+    chosen[0] = False
+    return chosen[pieces]
+
+
+def mostly_held(looks: list[Looked], labels: list[NDArray[np.int32]], label: int) -> bool:
+    """Whether a thing is what the robot holds: most of what is seen of it is where that may be, and a part where it surely is."""
+    told = [(look.frame.held, image == label) for look, image in zip(looks, labels, strict=True) if look.frame.held is not None]
+    near, sure, count = (
+        sum(int(np.count_nonzero(f(held, mask))) for held, mask in told)
+        for f in (lambda held, mask: mask & (held > 0), lambda held, mask: mask & (held == SURELY), lambda _, mask: mask)
+    )
+    return near > HELD * count and sure > 0
 
 
 class _End:

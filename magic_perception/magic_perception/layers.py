@@ -33,6 +33,8 @@ def upright_axis(sights: list[Sight], fronts: list[NDArray[np.float64]], start: 
             part = points[(points[:, 2] > 0.15 * height) & (points[:, 2] < 0.85 * height)]
             across = ((part[:, :2] - middle) @ right - (low + high) / 2) / max((high - low) / 2, 1e-3)
             inner = np.abs(across) < 0.92
+            if np.count_nonzero(inner) < 6:  # all that was seen of it is at its top or foot, or at its edges
+                continue
             bulge = np.sqrt(1 - across[inner] ** 2)
             far, depth = np.linalg.lstsq(np.column_stack([np.ones(len(bulge)), -bulge]), (part[inner, :2] - middle) @ away, rcond=None)[0]
             # A flat front does not tell how thick the thing is: then as thick as a third of its width, at most as it is wide.

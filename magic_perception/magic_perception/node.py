@@ -39,7 +39,7 @@ from magic_perception.keyframes import STEADY, STILL, Keyframes
 from magic_perception.parameters import METHODS, WORKSPACE, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
-from magic_perception.robot_in_view import RobotInView
+from magic_perception.robot_in_view import Held, RobotInView
 from magic_perception.segmenters import SEGMENTERS, make_segmenter
 from magic_perception.stream import WAITING, Pair, Stream, next_scene
 from magic_perception.tracking import Tracker
@@ -72,7 +72,7 @@ class Perception(Node):
     mono8), ``camera/NAME/color/camera_info`` and ``camera/NAME/aligned_depth_to_color/image_raw`` (16UC1 mm or 32FC1 m);
     where an image is not published but its ``/compressed`` or ``/compressedDepth`` is, those;
     with ``aligned`` false, ``camera/NAME/depth/image_rect_raw`` and ``camera/NAME/depth/camera_info`` instead, and depth
-    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``obstacles`` (latched): what other
+    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``in_hand`` (latched): what the robot holds; ``obstacles`` (latched): what other
     software knows of; ``joint_states``: the robot
     (parameters ``robot.*``) is cut out of every picture.
     Publishes ``objects`` and ``perception/markers`` (latched), ``/diagnostics`` (1 Hz).
@@ -153,6 +153,7 @@ class Perception(Node):
             self.listen(SceneObjectArray, topic, partial(self.on_known, topic), LATCHED, inputs)
         if self.robot is not None:
             # Not behind the images: who is cut out by a state that is missing is not cut out.
+            self.listen(SceneObjectArray, "in_hand", self.on_held, LATCHED, inputs)
             self.create_subscription(JointState, "joint_states", self.on_joints, STATES, callback_group=MutuallyExclusiveCallbackGroup())
         wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
         wall_timer(self, 0.5, self.on_look, report)
@@ -355,6 +356,18 @@ class Perception(Node):
             self.known_problems[topic] = (Code(code), f"{topic}: {message}")
             self.get_logger().error(self.known_problems[topic][1])
 
+    def on_held(self, msg: SceneObjectArray) -> None:
+        """What the strategy server has made the hand hold, in the frame of a link."""
+        assert self.robot is not None
+        try:
+            link = msg.header.frame_id.lstrip("/")
+            if link not in self.robot.robot.links:
+                raise MagicError(Code.NO_TRANSFORM, "frame of in_hand", link, "a link of the robot")
+            self.robot.held = tuple(Held.of(item, link) for item in (cv.object_from_msg(o, pictures=False) for o in msg.objects))
+            self.again = True
+        except Exception as error:
+            self.get_logger().error(describe(self, error)[1])
+
     def on_joints(self, msg: JointState) -> None:
         """Where the arm's joints are."""
         assert self.robot is not None
@@ -392,7 +405,9 @@ class Perception(Node):
             numbers = [report.numbers.get(item.id, 0) for item in scene.objects]
             scene = self.tracker.update(replace(scene, frame_id=self.frame))
             carried = [n for n, item in zip(numbers, scene.objects, strict=True) if self.tracker.carried(item)]
-            self.keyframes.update(frames, report.labels, report.earlier, still & whole, carried)
+            # What the robot holds is elsewhere in the next picture.
+            there = [_free(frame, image) for frame, image in zip(frames, report.labels, strict=True)]
+            self.keyframes.update([frame.free for frame in frames], there, report.earlier, still & whole, carried)
             self.looked = frames, known, scene
             self.publish(scene)
             seconds = time.monotonic() - now
@@ -644,6 +659,8 @@ class Perception(Node):
         """Look twice a second for images that come compressed only."""
         try:
             self.find_compressed()
+            if self.robot is not None and self.robot.held and not self.count_publishers("in_hand"):
+                self.robot.held, self.again = (), True  # who told it is no more
         except Exception as error:
             self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
 
@@ -733,6 +750,11 @@ def _still(one: Placed, other: Placed) -> bool:
     """Whether a camera was at one place at two times."""
     apart = np.linalg.norm(one.world_from_camera[:3, 3] - other.world_from_camera[:3, 3])
     return bool(apart <= STILL and transforms.rotation_angle(one.world_from_camera, other.world_from_camera) <= STEADY)
+
+
+def _free(frame: RgbdFrame, labels: np.ndarray) -> np.ndarray:
+    """Labels (H, W) without what the robot holds."""
+    return labels if frame.held is None else np.where(frame.held > 0, 0, labels)
 
 
 def _wanted(qos: QoSProfile) -> str:

@@ -20,7 +20,7 @@ from magic_core.views import find_view
 from magic_perception import cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
 from magic_perception.glass import once, unmeasured
-from magic_perception.hidden import ROBOT, hangs, veil
+from magic_perception.hidden import ROBOT, hangs, mostly_held, parted, veil
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.seen import cut_off, witnessed
@@ -76,6 +76,8 @@ def perceive(
     earlier: frames of the same scene from before (:class:`magic_perception.keyframes.Keyframes`), oldest first: they show what the frames do not,
     as far as no newer one contradicts them.  What they alone show is told, and marked ``unseen``.
 
+    What the robot holds (``RgbdFrame.held``) is an object of its own.
+
     Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has depth in the region of interest, ``NO_TABLE``,
     ``CAMERAS_DISAGREE`` where the cameras' poses contradict each other by more than may be corrected.
     An empty table is a scene without objects.
@@ -91,7 +93,7 @@ def perceive(
         raise MagicError(
             Code.NO_DEPTH, "pixels with depth", {f.camera: int(np.isfinite(f.depth).sum()) for f in frames}, "at least 100 in one camera"
         )
-    frames, now = [*(frame for frame, sees in zip(given, seeing, strict=True) if sees), *earlier], sum(seeing)
+    frames, now = [*(frame for frame, sees in zip(given, seeing, strict=True) if sees), *(frame.free for frame in earlier)], sum(seeing)
     with report.stage("table"):
         table, own = find_table(frames, parameters, report.notes)
         world_from_table = _frame_on(table, np.eye(4))
@@ -101,7 +103,7 @@ def perceive(
 
     with report.stage("masks"):
         fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
-        labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
+        labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
         if earlier:
             stale = keyframes.contradicted(looks, labels, now, world_from_table)
             for i, pixels in enumerate(stale, now):
@@ -109,7 +111,7 @@ def perceive(
                     frames[i] = frames[i].blinded(pixels)
                     looks[i] = look(frames[i], own[i], world_from_table, parameters)
             if any(pixels.any() for pixels in stale):
-                labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
+                labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
             report.earlier = list(zip(earlier, frames[now:], strict=True))
 
     with report.stage("cameras"):
@@ -143,7 +145,7 @@ def perceive(
             ]
             moved = cameras.brought_together(looks, worst, world_from_table)
             looks = [after if same else before for before, after, same in zip(looks, moved, here, strict=True)]
-            labels = veil(looks, segmenter.segment(looks, fixtures, parameters))
+            labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
             hanging = _hanging(looks, labels, fixtures)
         found = iter(labels[:now])
         report.labels = [next(found) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(given, seeing, strict=True)]
@@ -198,7 +200,7 @@ def perceive(
 def _hanging(looks: list[Looked], labels: list[NDArray[np.int32]], fixtures: tuple[Mesh, ...]) -> set[int]:
     """The labels of what hangs above the table."""
     top = max((int(image.max()) for image in labels), default=0)
-    return {label for label in range(1, top + 1) if hangs(looks, labels, label, fixtures)}
+    return {label for label in range(1, top + 1) if mostly_held(looks, labels, label) or hangs(looks, labels, label, fixtures)}
 
 
 def _at_rest(labels: NDArray[np.int32], hanging: set[int]) -> NDArray[np.int32]:

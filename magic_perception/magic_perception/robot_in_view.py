@@ -1,18 +1,39 @@
-"""Cuts the arm out of frames, by where its joints were when each was taken.  No ROS here."""
+"""Cuts the arm out of frames, by where its joints were when each was taken, and tells what shows the thing in its hand.  No ROS here."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core.camera import RgbdFrame
+from magic_core.camera import NEARLY, SURELY, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.joint_history import JointHistory
 from magic_core.robot import Description
-from magic_core.self_filter import Margins, SelfFilter
+from magic_core.scene import SceneObject
+from magic_core.self_filter import Body, Margins, SelfFilter, shown
 
 #: Joint states that ended so long before a picture, s, say nothing of it: nobody sends them any more.
 SILENT = 2.0
+#: What a thing in the hand may be off where it is said to be, m: the closing fingers turn it.
+IN_HAND = 0.01
+#: What is drawn of it is it, but for the pixels at its edge, and noise.
+DRAWN = Margins(edge=1, space=0.004)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A thing in the hand: its shape, the link that it is fixed to, and link_from_object (4, 4)."""
+
+    body: Body
+    link: str
+    link_from_object: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, item: SceneObject, link: str) -> Held:
+        """An object whose pose is given in the frame of a link."""
+        return cls(Body(item.mesh), link, item.world_from_object)
 
 
 class RobotInView:
@@ -26,6 +47,7 @@ class RobotInView:
         self.robot, self.age, self.slack = robot, age, slack
         self.history = JointHistory()
         self.filter = SelfFilter(robot, margins)
+        self.held: tuple[Held, ...] = ()
 
     def states(self, stamp: float) -> list[dict[str, float]]:
         """All positions (rad, m, by name) that the joints may have had at a stamp.
@@ -58,12 +80,13 @@ class RobotInView:
         return self.history.newest(self.robot.names) > stamp - SILENT
 
     def cut(self, frame: RgbdFrame, world_from_base: NDArray[np.float64] | None = None) -> RgbdFrame:
-        """The frame, blind where it shows the robot, or may.
+        """The frame, blind where it shows the robot, or may, and told where it shows what the robot holds.
 
         Raises ``STALE_DATA`` or ``NO_FRAMES`` where the joints' positions are not known, and ``ROBOT_NOT_THERE`` where the camera
         looks through the place at which they put the robot.
         """
-        cut = self.filter.cut(frame, self.states(frame.stamp), world_from_base)
+        states = self.states(frame.stamp)
+        cut = self.filter.cut(frame, states, world_from_base)
         if cut.contradicted:
             raise MagicError(
                 Code.ROBOT_NOT_THERE,
@@ -71,4 +94,15 @@ class RobotInView:
                 round(cut.through, 2),
                 "less than a half: joint states, TF, calibration and description of the robot that is there; or self_filter: false where there is none",
             )
-        return frame.blinded(cut.robot) if cut.robot.any() else frame
+        frame = frame.blinded(cut.robot) if cut.robot.any() else frame
+        wide = replace(self.filter.margins, space=max(self.filter.margins.space, IN_HAND))
+        base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
+        poses = [self.robot.poses(dict(state)) for state in states] if self.held else []
+        for held in self.held:
+            places = [base @ pose[held.link] @ held.link_from_object for pose in poses if held.link in pose]
+            near, sure = (shown(frame, held.body, places, margins) for margins in (wide, DRAWN))
+            pixels = np.where(sure, SURELY, np.where(near, NEARLY, 0)).astype(np.uint8)
+            if frame.blind is not None:
+                pixels[frame.blind] = 0
+            frame = replace(frame, held=pixels if frame.held is None else np.maximum(frame.held, pixels))
+        return frame

@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magic_core import conversions as cv
-from magic_core import transforms
+from magic_core import shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene
@@ -782,3 +782,22 @@ def test_the_arm_is_cut_out_where_joint_states_tell_of_it(frames):
 
         bench.until(lambda: seconds[0] >= end and "STALE_DATA" in bench.codes(), "word of what is missing", 30, gap)
         assert not any(item.hanging for message in bench.objects[count:] for item in message.objects)
+
+
+def test_what_the_hand_holds_is_heard_and_forgotten_with_who_told_it():
+    item = shapes.make("l_hook", 1).as_object("object_1", transforms.from_rpy(0, 0, 0.3, [0.0, 0.0, 0.02]))
+    header = cv.header("panda_hand_tcp")
+    with Bench() as bench:
+        out = bench.tester.create_publisher(SceneObjectArray, "in_hand", LATCHED)
+        out.publish(SceneObjectArray(header=header, objects=[cv.object_to_msg(item, header)]))
+        bench.until(lambda: bool(bench.node.robot.held), "what is held", 30)
+        (held,) = bench.node.robot.held
+        assert held.link == "panda_hand_tcp"
+        np.testing.assert_allclose(held.link_from_object, item.world_from_object, atol=1e-9)
+        out.publish(SceneObjectArray(header=cv.header("no_link"), objects=[cv.object_to_msg(item, header)]))
+        out.publish(SceneObjectArray(header=header))
+        bench.until(lambda: not bench.node.robot.held, "nothing held", 30)
+        out.publish(SceneObjectArray(header=header, objects=[cv.object_to_msg(item, header)]))
+        bench.until(lambda: bool(bench.node.robot.held), "what is held again", 30)
+        bench.tester.destroy_publisher(out)
+        bench.until(lambda: not bench.node.robot.held, "forgotten", 30)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from magic_core import transforms
+from magic_core.camera import NEARLY, SURELY, Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.robot import Description
 from magic_core.robot_pictures import RobotPictures
 from magic_core.sensor import D435, capture, looking_at, scene_raycaster
 from magic_core.shapes import make
-from magic_perception.averaging import average
-from magic_perception.hidden import ROBOT
+from magic_perception.averaging import average, unchanged
+from magic_perception.hidden import ROBOT, parted
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
-from magic_perception.robot_in_view import RobotInView
+from magic_perception.robot_in_view import Held, RobotInView
+from magic_perception.segmentation import Looked
 
 CAMERAS = {"left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
 OVER_THE_TABLE = np.array([0.0, 0.35, 0.0, -2.1, 0.0, 2.45, np.pi / 4, 0.04, 0.04])
@@ -191,3 +195,112 @@ def test_joint_states_on_their_way_are_waited_for(panda):
     assert view.waits(10.1) and not view.waits(10.0) and not view.waits(12.0)
     # One that is missing in between is no silence.
     assert view.told(9.0) and view.told(11.9) and not view.told(12.0)
+
+
+def hook_at(robot, away=0.0):
+    """An L hook in the hand of an arm over the table, as it is told of, and its mesh in the world: ``away`` metres from there along its shaft."""
+    world_from_tip = robot.poses(robot.arm_positions(OVER_THE_TABLE))[robot.config.move_group]
+    hook = make("l_hook", 3, length=0.22, tip=0.08, width=0.02, thickness=0.015)
+    # Level, the shaft between the fingers, its bend beyond them.
+    x, y, z = world_from_tip[:3, 3]
+    world_from_hook = transforms.make(translation=[x, y, z])
+    held = replace(hook.as_object("object_1", np.eye(4)), world_from_object=transforms.inverse(world_from_tip) @ world_from_hook)
+    return held, hook.mesh.transformed(transforms.make(translation=[x + away, y, z]))
+
+
+def at_the_hook(hook, out, aside):
+    """A cylinder that stands on the table and reaches above the hook, so far (m) inside of its bend."""
+    target = make("cylinder", 9, radius=0.03, half_height=0.085).mesh
+    bend = hook.bounds[1, 0]
+    return target.transformed(transforms.make(translation=[bend - out, aside, -target.bounds[0, 2]]))
+
+
+def told_what_is_held(robot, held):
+    view = told(robot, OVER_THE_TABLE)
+    view.held = (Held.of(held, robot.config.move_group),)
+    return view
+
+
+def test_pixels_of_what_is_held_are_told(panda):
+    robot, pictures = panda
+    held, hook = hook_at(robot)
+    arm = pictures.at(OVER_THE_TABLE)
+    view = told_what_is_held(robot, held)
+    without = seen(arm, seed=1)
+    for frame, empty in zip(seen([hook, *arm], seed=1), without, strict=True):
+        cut = view.cut(frame)
+        # It is where the picture is nearer for it, as far as the arm does not hide it.
+        with np.errstate(invalid="ignore"):
+            truth = (frame.depth < empty.depth - 0.03) & ~cut.blind
+        inner = cv2.erode(truth.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
+        assert inner.sum() > 300
+        assert (cut.held[inner] == SURELY).mean() > 0.97
+        assert (cut.held[cv2.dilate(truth.view(np.uint8), np.ones((41, 41), np.uint8)) == 0] == SURELY).mean() < 0.002
+        assert not cut.held[cut.blind].any()
+        assert not np.isfinite(cut.free.depth[cut.held > 0]).any()
+
+
+@pytest.mark.parametrize(("out", "aside", "away"), [(0.05, 0.02, 0.0), (0.045, 0.01, 0.0), (0.055, 0.045, 0.0), (0.05, 0.02, 0.006)])
+def test_what_is_held_to_a_thing_and_the_thing_are_two(panda, out, aside, away):
+    robot, pictures = panda
+    held, hook = hook_at(robot, away)
+    target = at_the_hook(hook, out, aside)
+    view = told_what_is_held(robot, held)
+    scene = perceive([view.cut(frame) for frame in seen([target, hook, *pictures.at(OVER_THE_TABLE)])], (), REGION)
+    assert len(scene.objects) == 2
+    (hanging,) = (o for o in scene.objects if o.hanging)
+    (stands,) = (o for o in scene.objects if not o.hanging)
+    np.testing.assert_allclose(stands.box_extents, target.extents, atol=0.004)
+    np.testing.assert_allclose(stands.world_from_box[:3, 3], target.bounds.mean(axis=0), atol=0.004)
+    assert (hanging.world_from_box[:3, 3] > hook.bounds[0] - 0.02).all() and (hanging.world_from_box[:3, 3] < hook.bounds[1] + 0.02).all()
+
+
+def flat_looks(held):
+    """One look of 120 x 160 pixels with so much told of what is held."""
+    shape = held.shape
+    frame = RgbdFrame(
+        np.zeros((*shape, 3), np.uint8), np.ones(shape, np.float32), Intrinsics(shape[1], shape[0], 100, 100, 80, 60), np.eye(4), held=held
+    )
+    zeros = np.zeros(shape, np.float32)
+    return [Looked(frame, zeros, zeros, np.ones(shape, bool), zeros)]
+
+
+def test_one_mask_over_both_is_parted():
+    """A merged mask: of a thing with a part of the tool before it, and of a tool that has taken a part of a thing."""
+    held = np.zeros((120, 160), np.uint8)
+    held[38:64, 18:144] = NEARLY
+    held[40:62, 20:142] = SURELY
+    thing = np.zeros(held.shape, bool)
+    thing[55:115, 60:100] = True
+    both = np.where(thing | (held == SURELY), 1, 0).astype(np.int32)
+    both[0:10, 0:10] = 2
+    (labels,) = parted(flat_looks(held), [both])
+    (tool,) = np.unique(labels[held == SURELY])
+    rest, other = labels[thing & (held == 0)], labels[0:10, 0:10]
+    assert len({tool, *np.unique(rest), *np.unique(other)}) == 3 and sorted(np.unique(labels)) == [0, 1, 2, 3]
+    # Mostly the thing: what is surely held goes, what is in front of it stays whole.
+    large = np.where(thing, 1, 0).astype(np.int32)
+    large[:, 100:140] = 1
+    (labels,) = parted(flat_looks(held), [large])
+    assert (labels[(large > 0) & (held == 0)] == 1).all() and (labels[(large > 0) & (held == SURELY)] == 2).all()
+    # The edge of a thing that is told apart already stays its own.
+    beside = np.zeros(held.shape, np.int32)
+    beside[40:62, 20:142], beside[62:90, 60:100], beside[60:62, 60:100] = 1, 2, 2
+    (labels,) = parted(flat_looks(held), [beside])
+    assert (labels[60:90, 60:100] == 1).all() and (labels[40:60, 20:142] == 2).all()
+    # Nothing held, nothing done.
+    assert parted([replace(flat_looks(held)[0], frame=replace(flat_looks(held)[0].frame, held=None))], [both])[0] is both
+
+
+def test_what_is_held_in_the_last_frame_is_held_in_the_mean_and_a_change_of_it_is_one(panda):
+    robot, pictures = panda
+    held, hook = hook_at(robot)
+    arm = pictures.at(OVER_THE_TABLE)
+    view = told(robot, OVER_THE_TABLE)
+    frames = [view.cut(seen([hook, *arm], seed=k)[0]) for k in range(2)]
+    before = average(frames)
+    assert before.held is None
+    view.held = (Held.of(held, robot.config.move_group),)
+    after = average([frames[0], view.cut(seen([hook, *arm], seed=1)[0])])
+    assert (after.held == SURELY).sum() > 300
+    assert not unchanged(after, before) and unchanged(after, after)

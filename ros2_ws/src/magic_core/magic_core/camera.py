@@ -46,6 +46,10 @@ class Intrinsics:
         return np.stack([self.fx * points[..., 0] / z + self.cx, self.fy * points[..., 1] / z + self.cy], axis=-1)
 
 
+#: In ``RgbdFrame.held``.
+NEARLY, SURELY = 1, 2
+
+
 @dataclass(frozen=True)
 class RgbdFrame:
     """One colour image with depth registered to it.
@@ -54,6 +58,7 @@ class RgbdFrame:
     none; world_from_camera (4, 4) pose of the colour optical frame; stamp in seconds.
     blind (H, W) bool: something that is no part of the scene (the robot) stands before
     it there, so that the pixel tells nothing, neither of things nor of free space.
+    held (H, W) uint8: :data:`SURELY` where what the robot holds is seen, :data:`NEARLY` where it may be, else 0.
     """
 
     color: NDArray[np.uint8]
@@ -63,6 +68,7 @@ class RgbdFrame:
     camera: str = "camera"
     stamp: float = 0.0
     blind: NDArray[np.bool_] | None = None
+    held: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
@@ -72,10 +78,16 @@ class RgbdFrame:
             )
         if self.depth.shape != size:
             raise MagicError(Code.BAD_IMAGE, f"depth image of {self.camera}", self.depth.shape, f"{size}, the size of its colour image")
-        if self.blind is not None and self.blind.shape != size:
-            raise MagicError(Code.BAD_IMAGE, f"blind pixels of {self.camera}", self.blind.shape, f"{size}, the size of its colour image")
+        for name, pixels in (("blind", self.blind), ("held", self.held)):
+            if pixels is not None and pixels.shape != size:
+                raise MagicError(Code.BAD_IMAGE, f"{name} pixels of {self.camera}", pixels.shape, f"{size}, the size of its colour image")
 
     def blinded(self, pixels: NDArray[np.bool_]) -> RgbdFrame:
         """The frame without the depth of these pixels (H, W), which are blind from now on."""
         blind = pixels if self.blind is None else self.blind | pixels
         return replace(self, depth=np.where(pixels, np.float32(np.nan), self.depth), blind=blind)
+
+    @property
+    def free(self) -> RgbdFrame:
+        """The frame without what the robot holds, which is blind."""
+        return self if self.held is None else self.blinded(self.held > 0)

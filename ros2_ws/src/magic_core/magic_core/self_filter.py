@@ -69,12 +69,92 @@ class Cut:
         return self.through > SHARE
 
 
-@dataclass(frozen=True)
-class _Link:
-    """The shapes of one link, in its frame: vertices (V, 3) and Open3D's scene of rays."""
+class Body:
+    """A rigid shape that is drawn: the vertices (V, 3) of its mesh, and Open3D's scene of rays."""
 
-    vertices: NDArray[np.float64]
-    scene: object
+    def __init__(self, mesh: Mesh) -> None:
+        import open3d as o3d
+
+        self.vertices, self._tensor = np.unique(mesh.vertices, axis=0), o3d.core.Tensor
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32)))
+
+    def cast(self, camera_from_body: NDArray[np.float64], k: Intrinsics, margins: Margins) -> _Cast | None:
+        """The window of a picture on which it can fall, and what is seen of it there; ``None``: nothing."""
+        corners = transforms.apply(camera_from_body, self.vertices)
+        nearest, farthest = corners[:, 2].min(), corners[:, 2].max()
+        if farthest <= NEAR:
+            return None
+        height, width = _size(k)
+        nearest = max(float(nearest), NEAR)
+        pad = -(-(margins.edge + int(np.ceil(max(k.fx, k.fy) * margins.space / nearest))) // STEP)
+        if corners[:, 2].min() <= NEAR:
+            c0, c1, r0, r1 = 0, width, 0, height
+        else:
+            low, high = (edge(k.project(corners), axis=0) / STEP for edge in (np.min, np.max))
+            c0, r0 = (max(int(np.floor(x)) - pad - 1, 0) for x in low)
+            c1, r1 = (min(int(np.ceil(x)) + pad + 2, most) for x, most in zip(high, (width, height), strict=True))
+        if c0 >= c1 or r0 >= r1:
+            return None
+        # The middle of each block of pixels; rays are one long in depth, so that their length to the hit is the depth.
+        u, v = ((np.arange(*span, dtype=np.float32) + 0.5) * STEP - 0.5 for span in ((c0, c1), (r0, r1)))
+        across, down = ((u - np.float32(k.cx)) / np.float32(k.fx))[None, :], ((v - np.float32(k.cy)) / np.float32(k.fy))[:, None]
+        body_from_camera = transforms.inverse(camera_from_body).astype(np.float32)
+        rays = np.empty((len(v), len(u), 6), np.float32)
+        for axis in range(3):
+            x, y, one, eye = body_from_camera[axis]
+            np.add(across * x + one, down * y, out=rays[..., 3 + axis])
+            np.add(rays[..., 3 + axis] * np.float32(NEAR), eye, out=rays[..., axis])
+        depth = self._scene.cast_rays(self._tensor(rays))["t_hit"].numpy() + np.float32(NEAR)
+        return _Cast((slice(r0, r1), slice(c0, c1)), depth, pad)
+
+
+@dataclass(frozen=True)
+class _Cast:
+    """What is seen of a body in a window of a drawing: depth (h, w) where it begins, metres, inf where it is not; pad: by how much it is widened."""
+
+    window: tuple[slice, slice]
+    depth: NDArray[np.float32]
+    pad: int
+
+    @property
+    def widened(self) -> NDArray[np.float32]:
+        """(h, w): the least depth about each place."""
+        return cv2.erode(self.depth, self._around, borderType=cv2.BORDER_CONSTANT, borderValue=float("inf"))
+
+    @property
+    def deepest(self) -> NDArray[np.float32]:
+        """(h, w): the greatest depth about each place, -inf where the body is not near."""
+        there = np.where(np.isfinite(self.depth), self.depth, np.float32(-np.inf))
+        return cv2.dilate(there, self._around, borderType=cv2.BORDER_CONSTANT, borderValue=float("-inf"))
+
+    @property
+    def _around(self) -> NDArray[np.uint8]:
+        return np.ones((2 * self.pad + 1,) * 2, np.uint8)
+
+
+def _size(k: Intrinsics) -> tuple[int, int]:
+    """Rows and columns of a drawing."""
+    return -(-k.height // STEP), -(-k.width // STEP)
+
+
+def shown(frame: RgbdFrame, body: Body, places: Sequence[NDArray[np.float64]], margins: Margins) -> NDArray[np.bool_]:
+    """(H, W): where a frame shows a body, or may.
+
+    places: all that world_from_body (4, 4) may be.  Within its outline, widened by the margins, all that has no depth, or a depth that
+    the body has about there: what is seen beyond it or before it is something else.
+    """
+    camera_from_world, k = transforms.inverse(frame.world_from_camera), frame.intrinsics
+    near, far = np.full(_size(k), np.inf, np.float32), np.full(_size(k), -np.inf, np.float32)
+    for place in places:
+        cast = body.cast(camera_from_world @ place, k, margins)
+        if cast is not None:
+            np.minimum(near[cast.window], cast.widened, out=near[cast.window])
+            np.maximum(far[cast.window], cast.deepest, out=far[cast.window])
+    near, far = (_enlarged(x, (k.width, k.height)) for x in (near, far))
+    tolerance = margins.space + 3 * NOISE * np.minimum(near, 5.0) ** 2
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(near) & ~(frame.depth < near - tolerance) & ~(frame.depth > far + tolerance)
 
 
 @dataclass(frozen=True)
@@ -89,21 +169,13 @@ class SelfFilter:
     """Cuts a robot out of the pictures of any camera; the last drawings are kept, so that an arm at rest is drawn once for each camera."""
 
     def __init__(self, robot: Description, margins: Margins | None = None) -> None:
-        import open3d as o3d
-
-        self.robot, self.margins, self._o3d = robot, margins or Margins(), o3d
-        self._links: dict[str, _Link] = {}
+        self.robot, self.margins = robot, margins or Margins()
+        self._links: dict[str, Body] = {}
         for name in robot.links:
             mesh = link_mesh(robot, name, ("collision", "visual"))
             if mesh is not None and len(mesh.faces):
-                self._links[name] = _Link(np.unique(mesh.vertices, axis=0), self._scene(mesh))
+                self._links[name] = Body(mesh)
         self._kept: OrderedDict[tuple, _Drawing] = OrderedDict()
-
-    def _scene(self, mesh: Mesh) -> object:
-        scene = self._o3d.t.geometry.RaycastingScene()
-        tensor = self._o3d.core.Tensor
-        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
-        return scene
 
     def cut(self, frame: RgbdFrame, positions: Sequence[Mapping[str, float]], world_from_base: NDArray[np.float64] | None = None) -> Cut:
         """Where the robot is in a frame.
@@ -133,48 +205,18 @@ class SelfFilter:
         key = (intrinsics, camera_from_base.round(5).tobytes(), states)
         found = self._kept.pop(key, None)
         if found is None:
-            shape = (-(-intrinsics.height // STEP), -(-intrinsics.width // STEP))
-            found = _Drawing(np.full(shape, np.inf, np.float32), np.full(shape, np.inf, np.float32))
+            found = _Drawing(*(np.full(_size(intrinsics), np.inf, np.float32) for _ in range(2)))
             for state in states:
                 poses = self.robot.poses(dict(state))
                 for name, link in self._links.items():
-                    self._draw(link, camera_from_base @ poses[name], intrinsics, found)
+                    cast = link.cast(camera_from_base @ poses[name], intrinsics, self.margins)
+                    if cast is not None:
+                        np.minimum(found.front[cast.window], cast.depth, out=found.front[cast.window])
+                        np.minimum(found.widened[cast.window], cast.widened, out=found.widened[cast.window])
         self._kept[key] = found
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
         return found
-
-    def _draw(self, link: _Link, camera_from_link: NDArray[np.float64], k: Intrinsics, drawing: _Drawing) -> None:
-        """Draw one link into a drawing, in the window on which it can fall."""
-        corners = transforms.apply(camera_from_link, link.vertices)
-        nearest, farthest = corners[:, 2].min(), corners[:, 2].max()
-        if farthest <= NEAR:
-            return
-        height, width = drawing.front.shape
-        nearest = max(float(nearest), NEAR)
-        pad = -(-(self.margins.edge + int(np.ceil(max(k.fx, k.fy) * self.margins.space / nearest))) // STEP)
-        if corners[:, 2].min() <= NEAR:
-            c0, c1, r0, r1 = 0, width, 0, height
-        else:
-            low, high = (edge(k.project(corners), axis=0) / STEP for edge in (np.min, np.max))
-            c0, r0 = (max(int(np.floor(x)) - pad - 1, 0) for x in low)
-            c1, r1 = (min(int(np.ceil(x)) + pad + 2, most) for x, most in zip(high, (width, height), strict=True))
-        if c0 >= c1 or r0 >= r1:
-            return
-        # The middle of each block of pixels; rays are one long in depth, so that their length to the hit is the depth.
-        u, v = ((np.arange(*span, dtype=np.float32) + 0.5) * STEP - 0.5 for span in ((c0, c1), (r0, r1)))
-        across, down = ((u - np.float32(k.cx)) / np.float32(k.fx))[None, :], ((v - np.float32(k.cy)) / np.float32(k.fy))[:, None]
-        link_from_camera = transforms.inverse(camera_from_link).astype(np.float32)
-        rays = np.empty((len(v), len(u), 6), np.float32)
-        for axis in range(3):
-            x, y, one, eye = link_from_camera[axis]
-            np.add(across * x + one, down * y, out=rays[..., 3 + axis])
-            np.add(rays[..., 3 + axis] * np.float32(NEAR), eye, out=rays[..., axis])
-        depth = link.scene.cast_rays(self._o3d.core.Tensor(rays))["t_hit"].numpy() + np.float32(NEAR)  # type: ignore[attr-defined]
-        window = (slice(r0, r1), slice(c0, c1))
-        np.minimum(drawing.front[window], depth, out=drawing.front[window])
-        wide = cv2.erode(depth, np.ones((2 * pad + 1,) * 2, np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=float("inf"))
-        np.minimum(drawing.widened[window], wide, out=drawing.widened[window])
 
 
 def _enlarged(small: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
