@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,23 @@ class Mesh:
         object.__setattr__(self, "faces", faces)
         if self.colors is not None:
             object.__setattr__(self, "colors", np.ascontiguousarray(self.colors, dtype=np.uint8).reshape(-1, 3))
+
+    @cached_property
+    def principal_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """See :func:`magic_core.views.own_axes`; asked for again and again, and computed once."""
+        corners = self.vertices[self.faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
+        centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
+        middles = (corners + np.roll(corners, 1, axis=1)) / 2 - centroid
+        axes = np.linalg.eigh(np.einsum("n,nki,nkj->ij", area, middles, middles))[1].T[::-1].copy()
+        along_axes = middles @ axes.T
+        second, third = (np.einsum("n,nki->i", area, along_axes**n) / (3 * area.sum()) for n in (2, 3))
+        skew = third / np.maximum(second, 1e-30) ** 1.5
+        axes[skew < 0] *= -1
+        if np.linalg.det(axes) < 0:
+            axes[int(np.argmin(np.abs(skew)))] *= -1
+        axes.flags.writeable = centroid.flags.writeable = False
+        return axes, centroid
 
     @property
     def bounds(self) -> NDArray[np.float64]:

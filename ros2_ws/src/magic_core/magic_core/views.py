@@ -254,18 +254,7 @@ def own_axes(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     They turn with the mesh: an axis points to where the surface reaches farther out (its third moment is positive).  Two of them settle
     the third; along an axis across which the surface is symmetric either way is the same.
     """
-    corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) + 1e-15
-    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
-    middles = (corners + np.roll(corners, 1, axis=1)) / 2 - centroid
-    axes = np.linalg.eigh(np.einsum("n,nki,nkj->ij", area, middles, middles))[1].T[::-1].copy()
-    along_axes = middles @ axes.T
-    second, third = (np.einsum("n,nki->i", area, along_axes**n) / (3 * area.sum()) for n in (2, 3))
-    skew = third / np.maximum(second, 1e-30) ** 1.5
-    axes[skew < 0] *= -1
-    if np.linalg.det(axes) < 0:
-        axes[int(np.argmin(np.abs(skew)))] *= -1
-    return axes, centroid
+    return mesh.principal_axes
 
 
 def mirrored(view: CanonicalView) -> CanonicalView:

@@ -16,6 +16,7 @@ Whatever is planned anew is verified anew, and moves only by its own verdict: ea
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -168,17 +169,17 @@ class ClosedLoop:
                 return self._carry_out(job)
             except Off as off:
                 error = MagicError(Code.TOOL_SLIPPED, f"the tool is off in the hand by {off.deviation}")
-                self._follow(error, lambda error=error: self._bounds.elsewhere(error, error.code, time.monotonic()))
+                self._follow(error, lambda error: self._bounds.elsewhere(error, error.code, time.monotonic()))
                 following = self._corrected(job, off.held)
             except Changed as change:
                 error = MagicError(Code.SCENE_CHANGED, change.message)
-                self._follow(error, lambda error=error: self._bounds.elsewhere(error, error.code, time.monotonic()))
+                self._follow(error, lambda error: self._bounds.elsewhere(error, error.code, time.monotonic()))
                 following = self._anew()
             except MagicError as failure:
                 error = failure
                 if error.code not in RETRIED:
                     raise
-                self._follow(error, lambda error=error: self._bounds.fail(error, time.monotonic()))
+                self._follow(error, lambda error: self._bounds.fail(error, time.monotonic()))
                 self._spend(job, error.code)
                 following = self._anew()
             self.tried.append(following.outcome)
@@ -186,10 +187,10 @@ class ClosedLoop:
                 raise MagicError(error.code, f"{error.message}; planned again from there: {following.outcome.message}")
             self.jobs.append(following)
 
-    def _follow(self, error: MagicError, count: Callable[[], None]) -> None:
+    def _follow(self, error: MagicError, count: Callable[[MagicError], None]) -> None:
         """See that the arm stands and that there is another try."""
         self._at_rest(error)
-        count()
+        count(error)
         self._say(f"{error.code.name}: {error.message}; planning again from the state as it is")
         self.notes.append(f"{error.code.name}: {error.message}")
 
@@ -461,7 +462,7 @@ class ClosedLoop:
     def _spend(self, job: Job, code: Code) -> None:
         """Remember what has failed: a grasp, or where the task was not done a contact with all its grasps."""
         trial = job.outcome.reports[-1].trial
-        attempts = trial.attempt + 1 if code == Code.GRASP_FAILED else math.inf
+        attempts = trial.attempt + 1 if code == Code.GRASP_FAILED else sys.maxsize
         candidate = trial.candidate
         self._spent.append((candidate.tool_id, *_places(candidate), attempts))
 
@@ -529,6 +530,7 @@ class ClosedLoop:
         elif after and self._carried is not None and self._carried.held.tool.id not in things:
             # Most of what is seen where the hand let it go, whatever its id.
             place = self._tool_at(stamp)
+            assert place is not None  # as it was carried
             near = [
                 i
                 for i in things.keys() - known.keys()

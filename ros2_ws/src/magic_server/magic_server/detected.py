@@ -80,7 +80,7 @@ def scene_of(
             continue
         try:
             found = meshes.find(kind)
-            if found is not None:
+            if best is not None and found is not None:
                 pose = conversions.pose_from_msg(best.pose.pose)
                 objects.append(placed(name, *found, base_from_frame @ pose, "camera", min(score, 1.0)))
             else:

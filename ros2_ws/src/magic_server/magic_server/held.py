@@ -120,9 +120,9 @@ class HeldStages(Stages):
         if self._kept is None:
             super().perceive(request, timeout)
         else:
-            self.scene, self._seen, self.strategy, self._minds = self._kept.scene, self._kept._seen, request.strategy, self._kept._minds
+            self._scene, self._seen, self.strategy, self._minds = self._kept.scene, self._kept._seen, request.strategy, self._kept._minds
         self._tool = self.held.at(self._server.hand())
-        self.scene = self._without_tool(self.scene)
+        self._scene = self._without_tool(self.scene)
         return request, ""
 
     def _named(self, request: pipeline.Request) -> tuple[pipeline.Request, str]:
@@ -155,8 +155,8 @@ class HeldStages(Stages):
             known = self._kept.matches
             candidates = [c for c in known.candidates if c.tool_id == self.held.tool.id]
             sentence = f"{len(candidates)} candidates for {known.target_id}, the tool is in the hand"
-            self.matches = pipeline.Matches(candidates, known.target_id, known.features, None, sentence, known.doubts)
-            return self.matches
+            self._matches = pipeline.Matches(candidates, known.target_id, known.features, None, sentence, known.doubts)
+            return self._matches
         server = self._server
         message = MatchContact.Request(
             strategy=request.strategy, tool_views=[self.held.tool.view], target_id=request.target_id, top_k=request.top_k
@@ -174,8 +174,8 @@ class HeldStages(Stages):
             )
             candidate.point.x, candidate.point.y, candidate.point.z = map(float, point)
         sentence = f"{len(answer.candidates)} candidates for {request.target_id}, the tool is in the hand, {answer.features} features"
-        self.matches = pipeline.Matches(answer.candidates, request.target_id, answer.features, None, sentence)
-        return self.matches
+        self._matches = pipeline.Matches(answer.candidates, request.target_id, answer.features, None, sentence)
+        return self._matches
 
     def _same_target(self, target_id: str) -> None:
         """The contact on the target is told in its own frame, which the matcher may have from a newer scene than this run's: take that
@@ -187,4 +187,4 @@ class HeldStages(Stages):
         if found is None:
             raise MagicError(Code.STALE_DATA, f"{target_id} has gone while its contact was looked for")
         self._take(newest, time.monotonic())
-        self.scene = self._without_tool(self.scene)
+        self._scene = self._without_tool(self.scene)

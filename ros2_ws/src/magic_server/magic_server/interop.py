@@ -58,8 +58,9 @@ def planning_scene(
     out.is_diff = out.robot_state.is_diff = True
     table = _collision_object(moveit, scene.header, TABLE)
     table.planes, table.plane_poses = [scene.table], [Pose()]
-    attached = list(held.objects) if held is not None else []
-    carried = {item.id for item in attached}
+    # Each with the header of those that are held.
+    attached = [(held.header, item) for item in held.objects] if held is not None else []
+    carried = {item.id for _, item in attached}
     solids = [table, *(_solid(moveit, scene.header, item) for item in scene.objects if item.id not in carried and item.id not in leave)]
     there = {solid.id for solid in solids}
     # What is attached is not in the world any more.
@@ -67,9 +68,9 @@ def planning_scene(
         solid = _collision_object(moveit, scene.header, name)
         solid.operation = moveit.CollisionObject.REMOVE
         solids.append(solid)
-    for item in attached:
+    for header, item in attached:
         it = moveit.AttachedCollisionObject()
-        it.link_name, it.object, it.touch_links = held.header.frame_id, _solid(moveit, held.header, item), list(touching)
+        it.link_name, it.object, it.touch_links = header.frame_id, _solid(moveit, header, item), list(touching)
         out.robot_state.attached_collision_objects = [*out.robot_state.attached_collision_objects, it]
     out.world.collision_objects = solids
     return out

@@ -96,7 +96,9 @@ class _ActionLeaf(_Leaf):
     def initialise(self) -> None:
         """Nothing has been asked yet; the server may be about to come up."""
         super().initialise()
-        self._sending = self._getting = self._handle = None
+        self._sending: Any = None
+        self._getting: Any = None
+        self._handle: Any = None
 
     def update(self) -> Status:
         """Ask, wait, answer; never blocks."""

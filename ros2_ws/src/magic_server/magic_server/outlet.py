@@ -46,6 +46,7 @@ class Outlet:
     def publish(self, claim: Claim, notes: tuple[str, ...]) -> None:
         """The trajectory of a claim's motion, stamped with this moment and in the robot's base frame; then that it is valid."""
         motion, verdict, stamp = claim.motion, claim.verdict, self._now()
+        assert verdict is not None, "a claim without a verdict was allowed"
         plan = motion.plan
         publisher, trajectory = (self._arm, plan.arm_trajectory) if plan.variant == MotionPlan.ARM else (self._tool, plan.tool_trajectory)
         stamped = copy.copy(trajectory)

@@ -160,19 +160,19 @@ def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tupl
     if purpose is Purpose.MOVE and (world.recorded or world.replaying):
         raise MagicError(Code.BAD_REQUEST, f"no arm moves by a recording: {RECORDED}", allowed="objects that are seen now")
     _frames(claim, world, limits)
-    _seen(world, limits)
+    seen = _seen(world, limits)
     # Once the arm is among the objects it hides some of what was seen of them from where the motion began, and so does what it carries.
     among = bool(claim.meant)
     # What was hidden then was planned with as it was remembered; now that it is seen it has not come.
-    shown = {name: there for name, there in claim.scene.remembered.items() if name in world.scene.objects}
+    shown = {name: there for name, there in claim.scene.remembered.items() if name in seen.objects}
     scene_change.check(
         {**shown, **claim.scene.objects},
-        world.scene.objects,
+        seen.objects,
         limits.object_tolerance,
         claim.meant,
-        world.scene.partly(claim.scene, claim.meant) if among else (),
+        seen.partly(claim.scene, claim.meant) if among else (),
         claim.carried,
-        world.scene.remembered if among else (),
+        seen.remembered if among else (),
     )
     notes = _arm(claim, world, limits, purpose)
     return (*notes, *((RECORDED,) if world.recorded or world.replaying else ()))
@@ -249,12 +249,12 @@ def _frames(claim: Claim, world: World, limits: Limits) -> None:
         raise MagicError(Code.BAD_REQUEST, "frame of objects or trajectory", frame, f"{limits.frame}, the robot's base frame")
 
 
-def _seen(world: World, limits: Limits) -> None:
-    """The newest objects were seen just now, by their stamp and by their arrival."""
+def _seen(world: World, limits: Limits) -> Look:
+    """The newest objects, which were seen just now, by their stamp and by their arrival."""
     if world.scene is None:
         raise NotYet(Code.NO_OBJECTS, "no objects have come")
     if world.recorded:
-        return
+        return world.scene
     ages = {} if world.simulated else {"arrival": world.now - world.scene.came}
     if not world.replaying:
         ages["stamp"] = world.clock - world.scene.stamp
@@ -267,6 +267,7 @@ def _seen(world: World, limits: Limits) -> None:
                 round(age, 1),
                 f"at most {limits.objects_age:g}, by stamp and by arrival, and at most {AHEAD:g} ahead{hint}",
             )
+    return world.scene
 
 
 def _arm(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tuple[str, ...]:

@@ -365,7 +365,8 @@ class Run:
         self._tell("plan", trial.index, what)
         planned = self._attempt("plan", trial, lambda left: self._stages.plan(request, matches, trial, left), Planned)
         if planned.code != Code.OK:
-            return self._drop(Report(trial, "plan", planned.code, planned.message)), planned.code
+            self._drop(Report(trial, "plan", planned.code, planned.message))
+            return None, planned.code
         if not self._simulatable:
             code = Code.OK if request.allow_unverified else Code.NOT_VERIFIABLE
             message = f"not verified: simulation cannot judge the strategy {request.strategy!r}; this is the best match's motion"
@@ -381,7 +382,8 @@ class Run:
         self._simulations += max(0, verdict.rollouts - 1)
         report = Report(trial, "verify", verdict.code, verdict.message, planned.plan, verdict)
         if verdict.code != Code.OK:
-            return self._drop(report), verdict.code
+            self._drop(report)
+            return None, verdict.code
         self._reports.append(report)
         self._tell("verify", trial.index, f"verified: {verdict.message}")
         return self._outcome(Code.OK, verdict.message, verdict=verdict, planned=planned, trial=trial), Code.OK

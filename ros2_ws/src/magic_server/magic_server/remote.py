@@ -40,7 +40,7 @@ class Token:
 
     def __init__(self, within: Token | None = None) -> None:
         self._within = within
-        self._condition = threading.Condition() if within is None else within._condition
+        self._condition: threading.Condition = threading.Condition() if within is None else within._condition
         self._canceled = self._ended = False
         self._closing = False
         self._minded: Callable[[], None] = lambda: None

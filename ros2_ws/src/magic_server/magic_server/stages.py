@@ -95,12 +95,29 @@ class Stages:
         self._needs_verifier = needs_verifier
         self.strategy = ""
         self._seen: SceneObjectArray | None = None  # the same objects as they came
-        self.scene: SceneObjectArray | None = None
-        self.matches: pipeline.Matches | None = None
+        self._scene: SceneObjectArray | None = None
+        self._matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
         #: Motions that the verifier was asked for.
         self._tried = 0
         self._last_code = 0
+
+    @property
+    def scene(self) -> SceneObjectArray:
+        """The objects of this run, from :meth:`perceive` on."""
+        assert self._scene is not None, "no objects have been taken yet"
+        return self._scene
+
+    @property
+    def matches(self) -> pipeline.Matches:
+        """The contacts of this run, from :meth:`match` on."""
+        assert self._matches is not None, "nothing has been matched yet"
+        return self._matches
+
+    @property
+    def matched(self) -> bool:
+        """Whether there are objects and contacts."""
+        return self._scene is not None and self._matches is not None
 
     def perceive(self, request: pipeline.Request, timeout: float) -> tuple[pipeline.Request, str]:
         """Take the objects there are, or wait for them; see that every server is there.  Names in words become ids."""
@@ -130,7 +147,7 @@ class Stages:
 
         came = self._token.wait(enough, time.monotonic() + wait, alive=still_there)
         scene = server.scene
-        if not came:
+        if not came or scene is None:
             raise self._no_objects(scene, wait)
         unknown = self._unknown(scene, request)
         if unknown:
@@ -141,7 +158,6 @@ class Stages:
 
     def _named(self, request: pipeline.Request) -> tuple[pipeline.Request, str]:
         """The request with its names read, and how; a name is of the objects as the robot's base sees them."""
-        assert self.scene is not None
         ids = {o.id for o in self.scene.objects}
         given = {what: value for what in ("tool_id", "target_id") if (value := getattr(request, what)) and value not in ids}
         if not given:
@@ -152,7 +168,8 @@ class Stages:
             what: naming.resolve(value, objects) if words is None or naming.is_name(value) else words.resolve(value, objects)
             for what, value in given.items()
         }
-        request = replace(request, **{what: reading.id for what, reading in readings.items()})
+        ids_of = {what: reading.id for what, reading in readings.items()}
+        request = replace(request, tool_id=ids_of.get("tool_id", request.tool_id), target_id=ids_of.get("target_id", request.target_id))
         pipeline.check_different(request)
         return request, "; ".join(reading.sentence for reading in readings.values())
 
@@ -179,7 +196,7 @@ class Stages:
 
         def carried() -> bool:
             try:
-                self.scene, self._seen = self._server.in_base(scene), scene
+                self._scene, self._seen = self._server.in_base(scene), scene
             except MagicError as error:
                 if error.code != Code.NO_TRANSFORM or time.monotonic() >= deadline:
                     raise
@@ -251,8 +268,8 @@ class Stages:
         sentence = f"{len(answer.candidates)} candidates for {target_id} ({scores}), {answer.features} features, {answer.seconds:.2f} s"
         involved = {target_id, *(c.tool_id for c in answer.candidates)}
         doubts = tuple(text for o in self.scene.objects if o.id in involved and (text := doubt(o)))
-        self.matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, sentence, doubts)
-        return self.matches
+        self._matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, sentence, doubts)
+        return self._matches
 
     def _same_objects(self, answer: MatchContact.Response) -> bool:
         """Whether the answer is about this run's objects, or about newer ones, which are this run's from here on.

@@ -584,7 +584,7 @@ class StrategyServer(LifecycleNode):
 
     def _show(self, stages: Stages, outcome: pipeline.Outcome) -> None:
         """Markers of what was tried, and frames of its contacts; where they cannot be drawn, the run has still ended as it has."""
-        if stages.scene is None or stages.matches is None:
+        if not stages.matched:
             return
         plan = outcome.plan or next((r.plan for r in reversed(outcome.reports) if r.plan is not None), None)
         try:

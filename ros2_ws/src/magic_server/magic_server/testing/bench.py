@@ -2,6 +2,8 @@
 
 import threading
 import time
+from functools import partial
+from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -45,26 +47,27 @@ class Bench:
         def init(node, *args, **kwargs):
             original(node, *args, **{**kwargs, "context": context, "cli_args": arguments})
 
-        Node.__init__ = init
+        Node.__init__ = init  # type: ignore[method-assign,assignment]
         try:
             self.server = StrategyServer()
         finally:
-            Node.__init__ = original
+            Node.__init__ = original  # type: ignore[method-assign]
         self.fakes = fakes.FakeServers(services=services, context=context)
         self.node = Node("client", context=context)
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.feedback = []
         self.heard = threading.Condition()
-        self.messages = {"arm": [], "tool": [], "markers": [], "state": [], "frames": []}
+        self.messages: dict[str, list[Any]] = {"arm": [], "tool": [], "markers": [], "state": [], "frames": []}
         self.valid = dict.fromkeys(("arm", "tool"))  # the trajectories that have not been taken back
-        for key, kind, topic in (
+        topics: tuple[tuple[str, Any, str], ...] = (
             ("arm", JointTrajectory, "verified_trajectory"),
             ("tool", MultiDOFJointTrajectory, "verified_tool_trajectory"),
             ("markers", MarkerArray, "strategy/markers"),
             ("state", VerifiedMotion, "verified_motion"),
             ("frames", TFMessage, "/tf_static"),
-        ):
-            self.node.create_subscription(kind, topic, lambda m, k=key: self._hear(k, m), qos.LATCHED)
+        )
+        for key, kind, topic in topics:
+            self.node.create_subscription(kind, topic, partial(self._hear, key), qos.LATCHED)
         self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.executor = ThreadedExecutor(8, context=context)
         for node in (self.server, self.fakes, self.node):

@@ -112,13 +112,15 @@ def plan(variant: str = "fg", release: bool = False, lift: bool = False, start: 
     times = np.array([0.0, 0.5, 1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0])
     rows = np.array([0.0, 0.05, 0.1, 0.1, 0.125, 0.15, 0.175, 0.2, 0.2])
     speeds = np.array([0.0, 0.1, 0.0, 0.0, 0.1, 0.0 if lift else 0.1, 0.1, 0.0, 0.0])
-    phases = (Phase("grasp", 0.0, 1.5), Phase("transfer", 1.5, 2.25), Phase("goal", 2.25, 3.0))
+    phases: tuple[Phase, ...] = (Phase("grasp", 0.0, 1.5), Phase("transfer", 1.5, 2.25), Phase("goal", 2.25, 3.0))
     if held:
         times, rows, speeds = times[2:] - 1.0, rows[2:] - rows[2], speeds[2:]
         phases = tuple(Phase(p.name, max(0.0, p.start - 1.0), p.end - 1.0) for p in phases)
     positions, velocities = (np.outer(column, np.ones(7)) for column in (start + rows, speeds))
     grasp, end = (0.0, 1.5) if held else (1.0, 2.5)
-    arm = ArmMotion(times, JOINTS, positions, velocities, 0 * positions, np.eye(4), 0.03, grasp, end if release else None, phases)
+    arm = ArmMotion(
+        times, JOINTS, positions, velocities, np.zeros_like(positions), np.eye(4), 0.03, grasp, end if release else None, phases
+    )
     return MotionPlan(variant, motion, arm)
 
 
