@@ -255,16 +255,18 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
     if strategy.target_outline != "outer":  # what is met in its hole encloses the tool, whatever its shape
         return ""
     if shape is not None:
-        view = shape.view(strategy.view)
+        views = [shape.view(strategy.view)]
     else:
-        from magic_core.views import find_view
+        from magic_core.views import find_view, own_views
 
-        view = find_view(mesh, pieces, strategy.view)
+        # Of a file nobody has said how it is used: a tool may be turned to be seen, and led, along any direction of its own shape.
+        first = find_view(mesh, pieces, strategy.view)
+        views = [first, *own_views(mesh, pieces, strategy.view, first.direction)]
     if not hangs_on:
         radius = _round_radius(target.mesh)
         if radius is None:
             return ""
-        areas = outlines(mesh, view.direction, -view.object_from_view[:3, 1])
+        areas = (area for view in views for area in outlines(mesh, view.direction, -view.object_from_view[:3, 1]))
         turn = max((pocket(area, radius) for area in areas), default=0.0)
         if turn >= HOOK_TURN:
             return ""
@@ -276,13 +278,15 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
         top = float(transforms.apply(target.world_from_object, meeting.point[None])[0, 2])
     drop = top - max((node.args["height"] for node in asked if node.kind == "above" and node.args["what"] == "tool"), default=-np.inf)
     solid = mesh.to_trimesh()
-    view_from_object = transforms.inverse(view.object_from_view)
-    weight = solid.center_mass if solid.is_volume else solid.centroid
-    weight, middle = transforms.apply(view_from_object, np.stack([weight, mesh.bounds.mean(axis=0)]))[:, :2]
-    # The rod goes through all of it: what is in its way anywhere is.
-    area = silhouette(view)
-    if hangs(area, weight, radius, drop, middle):
-        return ""
-    if hangs(area, weight, radius):
+    weight = np.stack([solid.center_mass if solid.is_volume else solid.centroid, mesh.bounds.mean(axis=0)])
+    lower = False
+    for view in views:
+        centre, middle = transforms.apply(transforms.inverse(view.object_from_view), weight)[:, :2]
+        # The rod goes through all of it: what is in its way anywhere is.
+        area = silhouette(view)
+        if hangs(area, centre, radius, drop, middle):
+            return ""
+        lower = lower or hangs(area, centre, radius)
+    if lower:
         return f"hanging on the rod its middle would be more than {1000 * drop:.0f} mm below it: lower than the goal allows"
     return f"nothing in it holds a rod of {1000 * radius:.0f} mm radius above its centre of mass"

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+import trimesh
 
 from magic_core import shapes
 from magic_core import strategy as strategies
@@ -64,6 +65,15 @@ def test_controls_are_what_geometry_forbids_and_the_sets_are_not(task):
     strategy = strategies.find(task, STRATEGIES)
     own = all_cases(replace(options, set="own"))
     assert not any(feasibility.impossible(strategy, case) for case in (own[0], own[-1]))
+
+
+@pytest.mark.parametrize(("inner", "forbidden"), [(0.02, False), (0.004, True)])
+def test_a_mesh_is_looked_at_along_its_own_directions_before_geometry_forbids_it(tmp_path, inner, forbidden):
+    """A ring that lies flat is edge-on in the side view of how it lies, and hangs by its hole where the rod of 6 mm radius fits in."""
+    trimesh.creation.annulus(r_min=inner, r_max=0.03, height=0.01).export(tmp_path / "ring.obj")
+    (tmp_path / "poses.yaml").write_text("ring.obj: {orientation: [0, 0, 0, 1]}\n")
+    said = feasibility.impossible(strategies.find("hanging", STRATEGIES), Case("ring", (f"{tmp_path}//ring.obj@1.0",), "demonstration"))
+    assert said.startswith("nothing in it holds a rod") if forbidden else said == ""
 
 
 def test_turns_are_cases_of_their_own_and_lie_differently():
