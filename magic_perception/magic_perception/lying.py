@@ -66,8 +66,22 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
     return table[index]
 
 
-def build_lying(sights: list[Sight], noise: float, parameters: Parameters) -> Reconstruction:
-    """A thing that lies: carved where it is flat, else a height field down to the table, or a shell where it is seen to be hollow."""
+@dataclass(frozen=True)
+class Laid:
+    """A lying thing: its height map, the outlines of its parts, and whether it is flat, then ``thickness`` metres thick; else top and bottom
+    (rows, columns) of its relief over the cells of the map, m; ``hollow``: it is seen to be hollow from above."""
+
+    grid: Grid
+    parts: list[Polygon]
+    flat: bool
+    thickness: float
+    hollow: bool
+    top: NDArray[np.float32]
+    bottom: NDArray[np.float32]
+
+
+def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
+    """What a lying thing is like, seen from above.  Raises ``RECONSTRUCTION_FAILED`` where nothing is left of its outline."""
     grid = height_map(surfaces(sights, 2)[0], parameters.resolution)
     occupied = np.isfinite(grid.top)
     inner = cv2.erode(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
@@ -108,14 +122,15 @@ def build_lying(sights: list[Sight], noise: float, parameters: Parameters) -> Re
         raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
     parts = [p for p in parts if p.area > 0.08 * parts[0].area]
     if flat:
-        return extruded(parts, thickness, "flat")
+        return Laid(grid, parts, True, thickness, False, grid.top, grid.top)
     # Smooth over 3 mm, over the thing's own cells only.
     weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
     smooth = cv2.GaussianBlur(np.where(occupied, grid.top, 0).astype(np.float32), (0, 0), 2.0) / np.maximum(weight, 1e-6)
     top = nearest(smooth.astype(np.float32), occupied)
     depression = _filled(np.where(occupied, top, 0)) - top
     hollow = (depression > max(0.004, 3 * noise)) & inner
-    if hollow.sum() * grid.cell**2 > 1.5e-4:
+    deep = bool(hollow.sum() * grid.cell**2 > 1.5e-4)
+    if deep:
         spread = int(np.ceil(parameters.wall / grid.cell / 2))
         # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
         reach = 2 * int(0.012 / grid.cell) + 1
@@ -123,15 +138,20 @@ def build_lying(sights: list[Sight], noise: float, parameters: Parameters) -> Re
         thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
         bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
         bottom = np.clip(bottom, 0, top - 0.001)
-        shape = "shell"
     else:
         bottom = np.zeros_like(top)
-        shape = "height field"
+    return Laid(grid, parts, False, thickness, deep, top, bottom)
+
+
+def build_lying(laid: Laid) -> Reconstruction:
+    """A thing that lies: carved where it is flat, else a height field down to the table, or a shell where it is seen to be hollow."""
+    if laid.flat:
+        return extruded(laid.parts, laid.thickness, "flat")
     meshes, pieces = [], []
-    for part in parts:
-        meshes.append(relief(part, grid, top, bottom))
-        pieces += relief_pieces(part, grid, top, bottom)
-    return Reconstruction(concatenate(meshes), tuple(pieces), shape)
+    for part in laid.parts:
+        meshes.append(relief(part, laid.grid, laid.top, laid.bottom))
+        pieces += relief_pieces(part, laid.grid, laid.top, laid.bottom)
+    return Reconstruction(concatenate(meshes), tuple(pieces), "shell" if laid.hollow else "height field")
 
 
 def _filled(top: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -33,8 +33,9 @@ from magic_perception.boxes import recognise_box
 from magic_perception.carved import build_carved
 from magic_perception.lain import build_lain
 from magic_perception.layers import build_layers
-from magic_perception.lying import build_lying
+from magic_perception.lying import build_lying, lay
 from magic_perception.parameters import Parameters
+from magic_perception.scoops import build_scoop
 from magic_perception.sight import Agreement, Sight, agreement, surfaces
 from magic_perception.solids import Reconstruction, extruded
 from magic_perception.turned import build_round
@@ -84,7 +85,15 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         return max(agreeing, key=lambda pair: pair[0] + (_CLEARLY if pair[1].mesh is standing else 0.0))[1]
     if stands and height > 0.65 * length:  # a ladle's stem rises, but it lies
         return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
-    return _freest([lambda: build_lying(sights, noise, parameters)], sights, noise)
+    try:
+        laid = lay(sights, noise, parameters)
+    except MagicError:
+        return _freest([], sights, noise)
+    scoop = build_scoop(laid, sights, noise, parameters)
+    for score, solid in _agreeing(scoop, sights, 0.0):
+        if score > _WELL:
+            return solid
+    return _freest([lambda: scoop, lambda: build_lying(laid)], sights, noise)
 
 
 #: Largest share of rays that may pass through a solid: noise and a pixel of the edge.

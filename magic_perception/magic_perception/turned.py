@@ -218,7 +218,7 @@ def fit_to_silhouettes(body: Body, sights: list[Sight], reach: float = 0.008) ->
     return body
 
 
-def _crossing(values: NDArray[np.float32], steps: NDArray[np.float64]) -> NDArray[np.float64]:
+def crossing(values: NDArray[np.float32], steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """The offset (N,) at which rows of mask values (N, S) fall below a half once and for all; NaN where they do not."""
     below = values < 0.5
     index = below.argmax(axis=1)
@@ -269,7 +269,7 @@ def _side_edges(
         sine = np.clip(rho / distance, 0, 0.9)
         tangent = body.axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * across)
         inside, blind, _, _ = sight.sample(np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2))
-        edge = _crossing(inside, steps)
+        edge = crossing(inside, steps)
         edge[blind.any(axis=1) | ~inner] = np.nan
         found.append(edge)
     middle = np.nanmedian(np.concatenate(found)) if np.isfinite(np.concatenate(found)).any() else 0.0
@@ -289,7 +289,7 @@ def _rim_edges(body: Body, sight: Sight, steps: NDArray[np.float64]) -> list[flo
         [np.repeat(rim[:, None], len(steps), axis=1), np.broadcast_to(heights[None, :, None], (len(rim), len(steps), 1))], axis=2
     )
     inside, blind, _, _ = sight.sample(spots)
-    edge = _crossing(inside, steps)
+    edge = crossing(inside, steps)
     edge[blind.any(axis=1)] = np.nan
     return edge[np.isfinite(edge)].tolist()
 

@@ -247,9 +247,9 @@ def test_bowl_of_a_ladle_stays_hollow():
     section = find_view(item.mesh, item.pieces, "section")
     # Seen in the cut, a column of the picture through the bowl's floor has no material at the rim's height.
     assert section.mask.sum() < 0.5 * cv2_hull_area(section.mask)
-    # The pieces leave the bowl empty too, and are few.
+    # The pieces leave the bowl empty too, and are few: three rings of sixteen, the floor and the handle.
     assert sum(p.to_trimesh().volume for p in item.pieces) < 1.6 * solid.volume
-    assert len(item.pieces) <= 40
+    assert len(item.pieces) <= 60
 
 
 def cv2_hull_area(mask):

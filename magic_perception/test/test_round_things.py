@@ -150,3 +150,34 @@ def test_a_handle_partly_behind_its_body_stays_open(seed, yaw, names):
     assert shape == "round with handle"
     assert holes_of(find_view(item.mesh, item.pieces, "side").mask).sum() > 40
     assert item.mesh.to_trimesh().euler_number == 0  # one handle, one loop, nothing apart
+
+
+def laid_down(mesh: Mesh) -> Mesh:
+    """A scoop on its bowl and the end of its handle, which goes to -x."""
+    low, high = -0.6, 0.6
+    for _ in range(30):
+        pitch = (low + high) / 2
+        turned = mesh.transformed(transforms.from_rpy(0, pitch, 0))
+        handle = turned.vertices[:, 0] < turned.bounds[0, 0] + 0.3 * turned.extents[0]
+        low, high = (pitch, high) if turned.vertices[handle, 2].min() < turned.vertices[~handle, 2].min() else (low, pitch)
+    return turned
+
+
+@pytest.mark.parametrize(
+    ("family", "seed", "yaw", "least"), [("spoon", 7101, 0.4, 0.002), ("ladle", 7102, 2.2, 0.002), ("measuring_cup", 7103, 4.0, 0.003)]
+)
+def test_a_scoop_is_hollow_also_where_its_near_wall_hides_it(family, seed, yaw, least):
+    import open3d as o3d
+
+    truth = scenes.placed(laid_down(shapes.make(family, seed).mesh), 0.5, 0.0, yaw).painted((70, 140, 90))
+    item, shape = seen(truth, ("left", "right"), poses=sensor.STATION)
+    assert shape == "scoop"
+    found = item.mesh.transformed(item.world_from_object)
+    assert found.to_trimesh().is_watertight
+    off = []
+    for here, there in ((truth, found), (found, truth)):
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.core.Tensor(there.vertices.astype(np.float32)), o3d.core.Tensor(there.faces.astype(np.uint32)))
+        sample = trimesh.sample.sample_surface(here.to_trimesh(), 1500, seed=0)[0].astype(np.float32)
+        off.append(scene.compute_distance(o3d.core.Tensor(sample)).numpy() ** 2)
+    assert np.sqrt(np.mean(off)) < least, np.sqrt(np.mean(off))
