@@ -7,8 +7,8 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 * flat things are carved: a cell of the table is part of the thing if the whole upright column above it, up to the
   measured thickness, falls into the thing's mask in every camera.  For a prism this is its visual hull; it takes its
   sharpness from the colour image, not from depth, and a hole through which the table is seen stays open;
-* things that lie become a height field on the table, or, where they are seen to be hollow from above (a spoon's
-  bowl), a shell;
+* a bowl with a handle that lies on its back (a spoon, a ladle) becomes a wall about a hollow, whose rim and profile are fitted;
+* other things that lie become a height field on the table, or, where they are seen to be hollow from above, a shell;
 * things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where cameras
   look into it, with the handle carved in its own upright plane in the same way as a flat thing;
 * bowls and dishes become a body of revolution as well, from their rim, their inside and what shows of their outside;
