@@ -37,6 +37,8 @@ REACH, ASIDE = 0.010, 0.3
 CARRIED = 0.008
 #: Four fifths of the points seen inside are this near to the fitted hollow, m, or 2.5 times the noise of heights.
 NEAR = 0.003
+#: What sticks out of a handle's side is a part of it where it is wider than this share of the handle's mean width.
+WHISKER = 0.6
 _SECTORS, _PIECES = 48, 16
 
 
@@ -107,9 +109,19 @@ def _handles(laid: Laid, bowl: Bowl) -> list[Polygon]:
         for beyond in parts_of(part.difference(outside)):
             if beyond.area < 1e-4:
                 continue
+            beyond = _without_whiskers(beyond)
             neck = part.intersection(beyond.buffer(0.009, join_style="mitre")).difference(hollow)
             found += parts_of(shapely.union_all([beyond, neck]))[:1]
     return found
+
+
+def _without_whiskers(handle: Polygon) -> Polygon:
+    """A handle without what sticks out of its sides and is much narrower than it: smear that has the thing's colour."""
+    ring = np.asarray(handle.minimum_rotated_rectangle.exterior.coords)
+    length = float(np.linalg.norm(np.diff(ring[:3], axis=0), axis=1).max())
+    narrow = WHISKER * handle.area / max(length, 1e-6) / 2
+    left = parts_of(handle.buffer(-narrow).buffer(narrow))
+    return left[0] if left and left[0].area > 0.8 * handle.area else handle
 
 
 def fit_bowl(laid: Laid, sights: list[Sight], noise: float, parameters: Parameters) -> Bowl | None:
@@ -157,7 +169,8 @@ def fit_bowl(laid: Laid, sights: list[Sight], noise: float, parameters: Paramete
                 rows.append(share * (np.hypot(met[:, 0] / outer[0], met[:, 1] / outer[1]) - 1) * outer.mean())
             rows.append(np.sqrt(len(chosen) / len(ring)) * bowl.local(ring)[:, 2])
             slopes = np.diff(bowl.depths) / np.diff(RINGS)
-            rows.append(3.0 * np.maximum(slopes, 0))  # it becomes no deeper towards the rim
+            rows.append(3.0 * np.maximum(slopes, 0))  # it becomes no deeper towards the rim...
+            rows.append(0.5 * np.maximum(np.diff(slopes), 0))  # ...and seldom less steep
             rows.append(np.sqrt(len(chosen)) * 0.1 * np.array([bowl.half[0] - bowl.half[1]]))
             return np.concatenate(rows)
 
