@@ -37,8 +37,8 @@ from magic_verifier.floating import (
 from magic_verifier.grip import SOFTNESS, Grip, Patch, patch_of
 from magic_verifier.simulation import DYNAMIC
 
-#: Tracking, torque, contacts and grasp are looked at every so many steps.
-WATCH_EVERY = 6
+#: Tracking, torque, contacts and grasp are looked at every so many seconds.
+WATCH_EVERY = 0.025
 #: Where a run begins with the tool in the hand the fingers are farther apart by this (m), for a tool thicker than thought.
 WIDER = 0.004
 #: The fingers have come to a stop when they are no nearer than so many metres to where they were so many seconds before; a stiff
@@ -109,13 +109,15 @@ class ArmRun:
         clock = times[0] + np.arange(int(np.ceil(self.duration * frequency)) + 1) / frequency
         self._q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
         self._qd = np.gradient(self._q, 1.0 / frequency, axis=0) if len(self._q) > 1 else np.zeros_like(self._q)
-        self._positions, self._velocities = self._q.tolist(), self._qd.tolist()
+        self._positions = self._q.tolist()
+        self._led = (self._q + self._arm.lead * self._qd).tolist()
         self._index = self._first = 0
         self._hold = 0.0
         self._widths: list[float] = []  # between the closing fingers, step by step
         self._quiet = 0.0
-        self._closed = self._open_again = self._standing = self._asleep = False
+        self._closed = self._open_again = self._asleep = False
         self._after = round(ASLEEP * frequency)
+        self._every = max(1, round(WATCH_EVERY * frequency))
         self._grip: Grip | None = None
         self._patch: Patch | None = None
         self._friction = (self.options.finger_friction + setup.physics.friction) / 2  # of a pair, as the engine has it
@@ -185,17 +187,13 @@ class ArmRun:
         row = min(max(self._index - self._lag, self._first), len(self._q) - 1)
         waiting = self._gripper()
         still = waiting or self._index >= len(self._q)
-        if not still:
-            self._arm.command(self._positions[row], self._velocities[row])
-        else:
-            self._arm.command(self._positions[row], None if self._standing else [0.0] * self._q.shape[1])
-        self._standing = still
+        self._arm.drive(self._positions[row] if still else self._led[row])
         self.world.step()
         if not waiting:
             self._index += 1
         if self._let_go_at is not None and self._index == len(self._q) + self._lag + self._after:
             self._asleep = self._arm.sleeps()
-        if self.world.steps % WATCH_EVERY == 0:
+        if self.world.steps % self._every == 0:
             self._watch(self._positions[row])
 
     def _gripper(self) -> bool:
@@ -293,7 +291,7 @@ class ArmRun:
 
     def _watch_torque(self) -> None:
         # Averaged over about 0.1 s: a real arm stops when the limit is exceeded for longer.
-        share = WATCH_EVERY * self.world.timestep / 0.1
+        share = self._every * self.world.timestep / 0.1
         self._torque += min(share, 1.0) * (self._arm.transmitted() - self._torque)
         ratio = np.abs(self._torque) / self._arm.effort
         worst = int(ratio.argmax())

@@ -133,7 +133,9 @@ class Articulation:
         #: Of the hand, in which the tool is.
         self._gripper = [link for link in body.links if link.name in robot.finger_links] + [self.hand]
         self._targets = [joint.set_drive_target for joint in self._arm_joints]
-        self._speeds = [joint.set_drive_velocity_target for joint in self._arm_joints]
+        #: (J,): s, damping over stiffness.  A drive that leads its position by so much of a velocity gives the torque of one that is
+        #: told the velocity as well, by half as many calls of the engine.
+        self.lead = np.array([damping / stiffness for stiffness, damping in gains])
         self._finger_targets = [joint.set_drive_target for joint in self._finger_joints]
         strokes = np.abs(robot.opened - robot.closed)
         self._closed, self._opened = robot.closed.astype(np.float32), robot.opened.astype(np.float32)
@@ -204,14 +206,14 @@ class Articulation:
 
     # ------------------------------------------------------------ drives
 
-    def command(self, q: list[float], speed: list[float] | None) -> None:
-        """Set the drives of the arm to positions (J,) and velocities (J,) (``None``: as before), and feed gravity and Coriolis torques
-        forward."""
-        for target, position in zip(self._targets, q, strict=True):
+    def command(self, q: NDArray[np.float64], speed: NDArray[np.float64]) -> None:
+        """Drive the arm to positions (J,) at velocities (J,)."""
+        self.drive((q + self.lead * speed).tolist())
+
+    def drive(self, targets: list[float]) -> None:
+        """Set the drives of the arm to positions that lead by :attr:`lead` (J,), and feed gravity and Coriolis torques forward."""
+        for target, position in zip(self._targets, targets, strict=True):
             target(position)
-        if speed is not None:
-            for target, velocity in zip(self._speeds, speed, strict=True):
-                target(velocity)
         self.body.set_qf(self.body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
 
     def open_fingers(self, width: float | None = None) -> None:

@@ -27,8 +27,8 @@ TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class Timing:
-    """One case: seconds by the clock of the rollout of the scene as given and of all of them, seconds of this process's processor; how
-    many passed."""
+    """One case: seconds by the clock of the rollout of the scene as given, alone, and of all of them; seconds of this process's processor
+    meanwhile; how many passed."""
 
     name: str
     first: float
@@ -40,14 +40,15 @@ class Timing:
 
 def measured(task: verification.Task, name: str, count: int, pool: Workers) -> Timing | None:
     """The rollouts of one task, timed; ``None`` where the scene as given fails, after which there are none."""
-    started, busy = time.perf_counter(), time.process_time()
+    started = time.perf_counter()
     first = verification.rollout(task, 0)
-    so_far = time.perf_counter() - started
+    alone = time.perf_counter() - started
     if first.judgement.code != Code.OK:
         return None
-    outcomes = verification.rollouts(task, first, count, None, pool.executor, pool.count)
+    started, busy = time.perf_counter(), time.process_time()
+    outcomes = verification.rollouts(task, count, None, pool.executor, pool.count)
     passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
-    return Timing(name, so_far, time.perf_counter() - started, time.process_time() - busy, passed, count)
+    return Timing(name, alone, time.perf_counter() - started, time.process_time() - busy, passed, count)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -103,7 +104,7 @@ def main(arguments: list[str] | None = None) -> None:
                         continue
                     rows[variant].append(found)
                     print(
-                        f"{label} {found.everything:.2f} s for {found.count} rollouts, of it {found.first:.2f} s for the first ({found.busy:.2f} s of this process); "
+                        f"{label} {found.everything:.2f} s for {found.count} rollouts ({found.busy:.2f} s of this process), {found.first:.2f} s for the first alone; "
                         f"{found.passed} passed",
                         flush=True,
                     )
@@ -112,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
                     seconds = np.array([row.everything for row in timings])
                     print(
                         f"{task:9} {variant:3} {len(timings)} cases: {options.rollouts} rollouts take {seconds.mean():.2f} s in the mean, "
-                        f"median {np.median(seconds):.2f} s, longest {seconds.max():.2f} s; the first of them "
+                        f"median {np.median(seconds):.2f} s, longest {seconds.max():.2f} s; the first alone "
                         f"{np.mean([row.first for row in timings]):.2f} s; this process is busy for {np.mean([row.busy for row in timings]):.2f} s"
                     )
     finally:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.motion import MotionPlan, Phase
+from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.scene import SceneObject
 from magic_core.strategy import Physics
 from magic_verifier.simulation import (
@@ -70,6 +70,12 @@ class Body:
     def corners(self) -> NDArray[np.float64]:
         """(N, 3): all hull corners in the object's frame."""
         return np.concatenate(self.hulls)
+
+    @cached_property
+    def outermost(self) -> NDArray[np.float64]:
+        """(M, 3): the corners beyond which no other one reaches, in the object's frame."""
+        corners = self.corners
+        return corners[ConvexHull(corners).vertices]
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -188,6 +194,20 @@ def phase_at(phases: tuple[Phase, ...], time: float) -> str:
     return "settle" if not phases or time >= phases[-1].end else ""
 
 
+def speed(motion: ToolMotion, tool: Body, start: float = 0.0) -> float:
+    """How fast the fastest corner of the tool's box ever is from a moment of its motion (s) on, m/s."""
+    times = motion.times - motion.times[0]
+    used = slice(max(int(np.searchsorted(times, start, "right")) - 1, 0), None)
+    times, poses = times[used], motion.world_from_tool[used]
+    if len(times) < 2:
+        return 0.0
+    low, high = tool.corners.min(axis=0), tool.corners.max(axis=0)
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    steps = np.diff(poses, axis=0)
+    ways = np.linalg.norm(corners @ steps[:, :3, :3].transpose(0, 2, 1) + steps[:, None, :3, 3], axis=2).max(axis=1)
+    return float((ways / np.diff(times)).max())
+
+
 @dataclass(frozen=True)
 class Intrusion:
     """Where a planned motion goes through something: body, depth in metres, time, whether before the contact phase."""
@@ -304,8 +324,7 @@ class FloatingRun:
             if depth > 0 and ((known := worst.get((name, early))) is None or depth > known.depth):
                 worst[(name, early)] = Intrusion(name, depth, time, early)
 
-        corners = setup.tool.corners
-        corners = corners[ConvexHull(corners).vertices]  # the others reach nowhere that these do not
+        corners = setup.tool.outermost
         heights = (setup.table[:3] @ poses[:, :3, :3]) @ corners.T  # (T, N): along the table's normal
         below = -(heights.min(axis=1) + poses[:, :3, 3] @ setup.table[:3] + setup.table[3])
         for time, depth in zip(times, below, strict=True):
@@ -334,7 +353,7 @@ def _clear_of_table(setup: Setup, poses: NDArray[np.float64], tool_from_held: ND
     def lowest(at: NDArray[np.float64], corners: NDArray[np.float64]) -> float:
         return float(((normal @ at[:, :3, :3]) @ corners.T + (at[:, :3, 3] @ normal)[:, None]).min() + setup.table[3])
 
-    depth = min(0.0, lowest(poses, thought.corners)) - lowest(held, setup.tool.corners)
+    depth = min(0.0, lowest(poses, thought.outermost)) - lowest(held, setup.tool.outermost)
     if depth > 0:
         held[:, :3, 3] += depth * normal
     return held
@@ -348,9 +367,8 @@ def nears(
     others = (setup.target, *setup.obstacles) if others is None else others
     boxes = [transforms.apply(body.world_from_object, hull) for body in others for hull in body.hulls]
     low, high = np.array([b.min(axis=0) for b in boxes]) - within, np.array([b.max(axis=0) for b in boxes]) + within
-    corners = setup.tool.corners
     whole = {"": ([np.array([low.min(axis=0), high.max(axis=0)])], np.eye(4))}
-    for index in np.flatnonzero(_near(corners[ConvexHull(corners).vertices], poses, whole)):
+    for index in np.flatnonzero(_near(setup.tool.outermost, poses, whole)):
         moved = [hull @ poses[index, :3, :3].T + poses[index, :3, 3] for hull in setup.tool.hulls]
         mine_low, mine_high = np.array([m.min(axis=0) for m in moved]), np.array([m.max(axis=0) for m in moved])
         if np.any(np.all((mine_low[:, None] <= high) & (mine_high[:, None] >= low), axis=2)):

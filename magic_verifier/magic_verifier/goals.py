@@ -26,8 +26,8 @@ from magic_verifier.simulation import DYNAMIC
 
 __all__ = ["TOUCH", "Judgement", "Watch", "around", "goal_test", "require"]
 
-#: What is watched over time is looked at every so many steps.
-OBSERVE_EVERY = 6
+#: What is watched over time is looked at every so many seconds.
+OBSERVE_EVERY = 0.025
 #: What swings comes to rest within seconds under this damping (1/s), as it does by itself within a minute; damping holds nothing up.
 CALM = 3.0
 #: How long a thing gets to come to rest after a push (s), and how long after it (s) it may still slide, swing or begin to fall: from a
@@ -116,6 +116,7 @@ class Watch:
         self._late: list[tuple[float, Node]] = []
         self._windows: list[tuple[Node, float, float, float]] = []  # leaf, whole window from and to, what counts of it from
         self._looks: dict[int, list[tuple[float, bool | None]]] = {}
+        self._every = max(1, round(OBSERVE_EVERY * run.setup.settings.frequency))
         self._pressed = [node for node in self.tree.nodes() if node.kind == "pressed"]
         self._plan()
         self._kick, self._slowing = self._disturbances()
@@ -225,7 +226,7 @@ class Watch:
         time = self.run.time
         if self._pressed:
             note_presses(self.asked, self._pressed)
-        if self.run.world.steps % OBSERVE_EVERY == 0:
+        if self._windows and self.run.world.steps % self._every == 0:
             for node, first, last, _ in self._windows:
                 if first <= time <= last:
                     self._looks[id(node)].append((time, told(self.asked, node).truth))

@@ -35,6 +35,8 @@ MIN_VOLUME = 1e-12
 MAX_PIECES = 1024
 #: PhysX convex meshes hold at most 255 vertices; the rest is left out in :func:`reduced`.
 MAX_VERTICES = 200
+#: Steps per simulated second at least.
+LEAST_FREQUENCY = 30.0
 #: Above this number only the outermost points of a piece are looked at.
 MANY_POINTS = 20_000
 
@@ -71,8 +73,8 @@ class Settings:
     gravity: float = 9.81
 
     def __post_init__(self) -> None:
-        if not 30.0 <= self.frequency <= 5000.0:
-            raise MagicError(Code.BAD_REQUEST, "simulation frequency", self.frequency, "30 to 5000 Hz")
+        if not LEAST_FREQUENCY <= self.frequency <= 5000.0:
+            raise MagicError(Code.BAD_REQUEST, "simulation frequency", self.frequency, f"{LEAST_FREQUENCY:g} to 5000 Hz")
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,10 @@ class World:
         self._bodies: dict[str, Any] = {}
         self._sorted: dict[tuple[str, str], list[Any]] = {}
         self._sorted_at = -1
-        self._names: dict[int, str] = {}  # by the component's address: contacts name their bodies by component
+        # Contacts name their bodies by component.  The binding gives the same object for the same one as long as somebody has it; by its
+        # address, which takes longer to ask for, a component is found whatever the binding does.
+        self._names: dict[Any, str] = {}
+        self._named_at: dict[int, str] = {}
 
     @property
     def timestep(self) -> float:
@@ -239,7 +244,7 @@ class World:
 
     def name_component(self, component: Any, name: str) -> None:
         """Let contacts of a component (a robot's link) be found under a name; several may share one."""
-        self._names[component._physx_pointer] = name
+        self._names[component] = self._named_at[component._physx_pointer] = name
 
     def add_table(self, plane: NDArray[np.float64], friction: float, name: str = "table") -> None:
         """The half space below the plane (4,) a x + b y + c z + d = 0, unit normal up."""
@@ -453,12 +458,19 @@ class World:
         """The last step's contacts by the names of their bodies, sorted once a step."""
         if self._sorted_at != self.steps:
             self._sorted_at = self.steps
-            self._sorted = {}
-            names = self._names
+            self._sorted = found = {}
+            names, named_at = self._names, self._named_at
             for contact in self._system.get_contacts():
                 a, b = contact.bodies
-                pair = (names.get(a._physx_pointer, ""), names.get(b._physx_pointer, ""))
-                self._sorted.setdefault(pair, []).append(contact)
+                first, second = names.get(a), names.get(b)
+                if first is None:
+                    first = named_at.get(a._physx_pointer, "")
+                if second is None:
+                    second = named_at.get(b._physx_pointer, "")
+                if (first, second) in found:
+                    found[first, second].append(contact)
+                else:
+                    found[first, second] = [contact]
         return self._sorted
 
 

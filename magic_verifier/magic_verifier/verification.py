@@ -34,13 +34,15 @@ from magic_core.robot import Description
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals, motion_check, uncertainty
-from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, FloatingRun, Setup, make_setup, nears, phase_start
+from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, FloatingRun, Setup, make_setup, nears, phase_start, speed
 from magic_verifier.goals import Judgement
-from magic_verifier.simulation import DYNAMIC, STATIC, Settings
+from magic_verifier.simulation import DYNAMIC, LEAST_FREQUENCY, STATIC, Settings
 from magic_verifier.uncertainty import Draw, Eyes, Uncertainty
 
 #: Deadline and cancel request are looked at, and the state checked, every so many steps.
 CHECK_EVERY = 12
+#: Whether the tool touches anything too early is looked at every so many seconds.
+TOUCH_EVERY = 0.025
 #: Solver settings of the variants: a grip needs more iterations than a floating tool.
 DEFAULTS = {"fg": Settings(), "arm": Settings(position_iterations=8, velocity_iterations=1, contact_offset=0.002)}
 #: Poses are recorded at this rate (Hz).
@@ -50,6 +52,8 @@ ROLLOUTS = 24
 #: A drawn rollout begins so many seconds before the box of one of the tool's pieces comes within so many metres of one of anything but
 #: the table, with a floating gripper of the target: more than what is drawn may displace them.
 LEAD, NEAR = 0.1, 0.03
+#: A drawn rollout takes steps so many times as long as the scene as given: the longest for which the tool is slow enough (:func:`_longer`).
+LONGER = {"fg": (4.0, 2.0), "arm": (2.0,)}
 #: How an arm's hand yields (N/m): a usual stiffness of Cartesian impedance control.
 STIFFNESS = 2000.0
 #: Two-sided 95 % of the normal distribution.
@@ -310,7 +314,8 @@ class Task:
     """Everything that a rollout is a function of, beside its number: it may be sent to another process.
 
     ``eyes``: how well tool and target are known, and by how much these widths are to be multiplied; ``start``: the moment of the
-    motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment.
+    motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``longer``: how many times as long their
+    steps are.
     """
 
     strategy: Strategy
@@ -324,10 +329,21 @@ class Task:
     robot: Description | None = None
     start: float = 0.0
     held: Any = None
+    longer: float = 1.0
 
     def drawn(self, index: int) -> Draw | None:
         """The draw of a rollout; ``None`` for the first one."""
         return None if index == 0 else uncertainty.draw(self.uncertainty, *self.eyes, self.seed, index)
+
+    def under(self, drawn: Draw) -> Setup:
+        """The scene of a drawn rollout."""
+        setup = uncertainty.applied(drawn, self.setup)
+        settings = replace(setup.settings, frequency=setup.settings.frequency / self.longer)
+        if self.plan.variant == "arm":
+            # The engine solves a step in as many parts as there are iterations.  Pads hardly give: at longer parts the load on a grip
+            # comes out half as large again, and tools slip that do not.
+            settings = replace(settings, position_iterations=round(self.longer * settings.position_iterations))
+        return replace(setup, settings=settings)
 
 
 @dataclass(frozen=True)
@@ -348,8 +364,16 @@ class _Never:
         return
 
 
-def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, float], None] | None = None, record: bool = True) -> Outcome:
-    """One rollout, a function of ``task`` and ``index`` alone.  Raises for cancel and deadline only."""
+def rollout(
+    task: Task,
+    index: int,
+    stop: Any = None,
+    progress: Callable[[str, float], None] | None = None,
+    record: bool = True,
+    taken: Callable[[Any], None] | None = None,
+) -> Outcome:
+    """One rollout, a function of ``task`` and ``index`` alone.  ``taken`` hears of the first one, as soon as it is known, how the arm has
+    the tool in its hand at the task's start.  Raises for cancel and deadline only."""
     stop = stop or _Never()
     strategy, plan, limits = task.strategy, task.plan, task.limits
     drawn = task.drawn(index)
@@ -362,7 +386,7 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
 
     try:
         stop.check(0.0)
-        setup = task.setup if drawn is None else uncertainty.applied(drawn, task.setup)
+        setup = task.setup if drawn is None else task.under(drawn)
         limits = limits if drawn is None else limits.yielding()
         if plan.variant == "arm":
             run = _arm_run(task, setup, drawn)
@@ -380,6 +404,7 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
         watched = [TARGET] if setup.target_kind == DYNAMIC or plan.variant == "arm" else []
         watched += [o.id for o in setup.obstacles] if plan.variant == "arm" else []
         names = (TOOL, TARGET) if setup.target_kind == DYNAMIC else (TOOL,)
+        touch_every = max(1, round(TOUCH_EVERY * setup.settings.frequency))
         # A thing that was seen to stand may roll off where its centre of mass or its shape was drawn otherwise.
         untouched = _Untouched(run, limits) if drawn is None else None
 
@@ -404,7 +429,9 @@ def rollout(task: Task, index: int, stop: Any = None, progress: Callable[[str, f
             goal.observe()
             if held is None and drawn is None and plan.variant == "arm" and run.time >= task.start:
                 held = run.held()
-            if step % 6 == 0 and run.time < run.contact_time:
+                if held is not None and taken is not None:
+                    taken(held)
+            if step % touch_every == 0 and run.time < run.contact_time:
                 _refuse_early_touch(run, watched, limits)
         run.world.check(names)
 
@@ -465,6 +492,17 @@ def _start(strategy: Strategy, setup: Setup, plan: MotionPlan) -> float:
     return float(np.clip((contact if near is None else near) - LEAD, first, contact))
 
 
+def _longer(setup: Setup, plan: MotionPlan, start: float) -> float:
+    """How many times as long the steps of drawn rollouts are: by so much that the tool never goes further in one of them than contacts
+    are solved ahead of a touch, a blow for one does."""
+    frequency, reach = setup.settings.frequency, 2 * setup.settings.contact_offset
+    fastest = speed(plan.tool_motion, setup.tool, start)
+    for longer in LONGER[plan.variant]:
+        if frequency / longer >= LEAST_FREQUENCY and fastest <= reach * frequency / longer:
+            return longer
+    return 1.0
+
+
 @dataclass(frozen=True)
 class _Packed:
     """A task as it is sent to other processes, once packed and, there, once unpacked."""
@@ -489,9 +527,9 @@ def _elsewhere(packed: _Packed, index: int) -> Outcome:
     return rollout(_unpacked(packed), index, record=False)
 
 
-def from_held(task: Task, first: Outcome) -> Task:
-    """The task of the drawn rollouts: where the arm has the tool in its hand, as it had it in the first one."""
-    return task if first.held is None else replace(task, held=first.held, start=first.held.time)
+def from_held(task: Task, held: Any) -> Task:
+    """The task of the drawn rollouts: where the arm has the tool in its hand (``held``), as it had it in the first one."""
+    return task if held is None else replace(task, held=held, start=held.time)
 
 
 def _least_more(passed: int, count: int, most: int, required: float, z: float) -> int:
@@ -502,9 +540,56 @@ def _least_more(passed: int, count: int, most: int, required: float, z: float) -
     return most - count
 
 
+class _Elsewhere:
+    """Rollouts that a pool's processes compute; none where there is no pool, or where one of its processes was killed."""
+
+    def __init__(self, pool: Executor | None, workers: int) -> None:
+        self._pool, self._workers = pool, workers
+        self._packed: _Packed | None = None
+        self._waiting: dict[int, Future[Outcome]] = {}
+        #: The lowest number that nobody computes yet.
+        self.following = 1
+
+    def begin(self, task: Task, end: int) -> None:
+        """Have rollouts of a task computed, those below ``end`` at most."""
+        if self._pool is not None:
+            self._packed = _Packed.of(task)
+            self.fill(end)
+
+    def fill(self, end: int) -> None:
+        """Give out what can be: one more than there are processes, so that none waits for this one to look round."""
+        while self._pool is not None and self.following < end and len(self._waiting) <= self._workers:
+            try:
+                self._waiting[self.following] = self._pool.submit(_elsewhere, self._packed, self.following)
+            except RuntimeError:  # a process was killed, or the pool is closed: this one does it all
+                self._pool = None
+                return
+            self.following += 1
+
+    def done(self) -> dict[int, Outcome | None]:
+        """What has been computed since this was last asked; ``None`` for what was lost with its process."""
+        found: dict[int, Outcome | None] = {}
+        for index in [i for i, future in self._waiting.items() if future.done()]:
+            future = self._waiting.pop(index)
+            if isinstance(future.exception(), BrokenExecutor):
+                self._pool = None
+                found[index] = None
+            else:
+                found[index] = future.result()
+        return found
+
+    def wait(self, index: int) -> None:
+        """Wait for one of them, a moment at most."""
+        wait([self._waiting[index]], timeout=0.01)
+
+    def end(self) -> None:
+        """What has not been begun is not."""
+        for future in self._waiting.values():
+            future.cancel()
+
+
 def rollouts(
     task: Task,
-    first: Outcome,
     most: int,
     required: float | None,
     pool: Executor | None = None,
@@ -513,53 +598,48 @@ def rollouts(
     progress: Callable[[str, float], None] | None = None,
     z: float = Z95,
 ) -> list[Outcome]:
-    """The outcomes of the rollouts in the order of their numbers, the ``first`` among them, until it is decided whether the required
-    rate is reached (``None``: all of them).  z: of the interval, in standard deviations.
+    """The outcomes of the rollouts in the order of their numbers, until it is decided whether the required rate is reached (``None``: all
+    of them); of one that fails in the scene as given that one alone.  z: of the interval, in standard deviations.
 
-    With a pool others compute some of them meanwhile, to the same outcomes, none beyond those that are needed at least: which
-    ones are computed where depends on who is ready first, what comes of them does not.
+    With a pool others compute some of them meanwhile, to the same outcomes, none beyond those that are needed at least if the scene as
+    given passes: which ones are computed where depends on who is ready first, what comes of them does not.  They begin beside the scene
+    as given, the arm's as soon as it is known how it has the tool in its hand.
     """
     stop = stop or _Never()
-    task = from_held(task, first)
-    outcomes, passed = [first], int(first.judgement.code == Code.OK)
-    found: dict[int, Outcome] = {}
-    waiting: dict[int, Future[Outcome]] = {}
-    packed = None if pool is None else _Packed.of(task)
-    following = 1
+    elsewhere = _Elsewhere(pool, workers)
+    found: dict[int, Outcome | None] = {}
+
+    def needed(passed: int, count: int) -> int:
+        return most if required is None else count + _least_more(passed, count, most, required, z)
+
     try:
+        if task.plan.variant != "arm":
+            elsewhere.begin(task, needed(1, 1))
+        first = rollout(task, 0, stop, progress, taken=lambda held: elsewhere.begin(from_held(task, held), needed(1, 1)))
+        outcomes, passed = [first], int(first.judgement.code == Code.OK)
+        if not passed:
+            return outcomes
+        task = from_held(task, first.held)
         while len(outcomes) < most:
-            end = most
-            if required is not None:
-                if len(outcomes) > 1 and decided(passed, len(outcomes), most, required, z):
-                    break
-                end = len(outcomes) + _least_more(passed, len(outcomes), most, required, z)
-            for index in [i for i, future in waiting.items() if future.done()]:
-                future = waiting.pop(index)
-                if isinstance(future.exception(), BrokenExecutor):
-                    pool = None
-                    found[index] = rollout(task, index, stop, progress, record=False)
-                else:
-                    found[index] = future.result()
-            # One more than there are processes, so that none waits for this one to look round.
-            while pool is not None and following < end and len(waiting) <= workers:
-                try:
-                    waiting[following] = pool.submit(_elsewhere, packed, following)
-                except RuntimeError:  # a process was killed, or the pool is closed: this one does it all
-                    pool = None
-                    break
-                following += 1
-            if (index := len(outcomes)) in found:
-                outcomes.append(found.pop(index))
+            if required is not None and len(outcomes) > 1 and decided(passed, len(outcomes), most, required, z):
+                break
+            end = needed(passed, len(outcomes))
+            found.update(elsewhere.done())
+            elsewhere.fill(end)
+            index = len(outcomes)
+            if found.get(index) is not None:
+                outcomes.append(found.pop(index))  # type: ignore[arg-type]
                 passed += outcomes[-1].judgement.code == Code.OK
-            elif following < end:
-                following += 1
-                found[following - 1] = rollout(task, following - 1, stop, progress, record=False)
+            elif index in found:
+                found[index] = rollout(task, index, stop, progress, record=False)
+            elif elsewhere.following < end:
+                elsewhere.following += 1
+                found[elsewhere.following - 1] = rollout(task, elsewhere.following - 1, stop, progress, record=False)
             else:
                 stop.check(0.0)
-                wait([waiting[index]], timeout=0.01)
+                elsewhere.wait(index)
     finally:
-        for future in waiting.values():
-            future.cancel()
+        elsewhere.end()
     return outcomes
 
 
@@ -589,7 +669,9 @@ def make_task(
     setup = make_setup(tool, target, obstacles, table, strategy.physics, settings or DEFAULTS[plan.variant])
     spreads = spreads or uncertainty.read()
     eyes = spreads.eyes(tool), spreads.eyes(target)
-    return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, _start(strategy, setup, plan))
+    start = _start(strategy, setup, plan)
+    longer = _longer(setup, plan, start)
+    return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, start, longer=longer)
 
 
 def verify(
@@ -644,13 +726,11 @@ def verify(
     try:
         stop.check(0.0)
         task = make_task(strategy, tool, target, tuple(obstacles), table, plan, seed, settings, spreads, limits, arm_options, robot)
-        outcomes.append(rollout(task, 0, stop, progress))
-        if outcomes[0].judgement.code == Code.OK and most > 1:
-            outcomes = rollouts(task, outcomes[0], most, limits.required_rate, pool, workers, stop, progress, _z(tried))
-            passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
-            shown = _shown(outcomes, passed, most, limits.required_rate, _z(tried))
-            if shown > 0:  # recording costs, and of the drawn rollouts one is looked at: the same again, recorded
-                outcomes[shown] = rollout(from_held(task, outcomes[0]), shown, stop)
+        outcomes = rollouts(task, most, limits.required_rate, pool, workers, stop, progress, _z(tried))
+        passed = sum(outcome.judgement.code == Code.OK for outcome in outcomes)
+        shown = _shown(outcomes, passed, most, limits.required_rate, _z(tried))
+        if shown > 0:  # recording costs, and of the drawn rollouts one is looked at: the same again, recorded
+            outcomes[shown] = rollout(from_held(task, outcomes[0].held), shown, stop)
     except MagicError as error:
         runs = tuple(outcome.judgement for outcome in outcomes)
         return Verdict(False, error.code, error.message, 0.0, {}, simulated(), elapsed(), None, runs)

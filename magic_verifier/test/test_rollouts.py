@@ -13,6 +13,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_verifier import uncertainty, verification
 from magic_verifier.floating import TABLE, Body, FloatingRun, make_setup
+from magic_verifier.floating import speed as fastest
 from magic_verifier.goals import Judgement
 from magic_verifier.uncertainty import ShapeError, Spread
 from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, passes, verify, wilson
@@ -48,6 +49,32 @@ def test_a_motion_that_fails_as_given_is_not_rolled_out():
     verdict = verdict_of(scenes.hooking("bar"))
     assert not verdict.success and len(verdict.runs) == 1
     assert verdict.failures == ("1 of 1: the tool lost the target",)
+
+
+def test_others_begin_beside_the_scene_as_given_and_end_with_it():
+    pool = Backwards()
+    verdict = verdict_of(scenes.hooking("bar"), pool=pool, workers=2)
+    assert verdict.failures == ("1 of 1: the tool lost the target",)
+    # One more than there are processes was given out, and taken back: none of it is done.
+    assert len(pool.given) == 3 and all(future.cancelled() for future, _ in pool.given)
+
+
+def test_steps_are_longer_where_the_tool_is_slow():
+    for speed, longer in ((0.1, 4.0), (0.2, 2.0), (0.3, 1.0)):
+        strategy, tool, target, _ = scenes.hooking("L")
+        poses = [(transforms.make(translation=[-0.1 - 0.28 * k, 0, 0]), "goal", 0.28 / speed) for k in range(2)]
+        plan = scenes.plan(poses)
+        assert fastest(plan.tool_motion, Body("a", (np.eye(4, 3),), np.eye(4))) == pytest.approx(speed, rel=1e-6)
+        task = verification.make_task(strategy, tool, target, (), scenes.TABLE, plan)
+        assert task.longer == longer
+        assert task.under(task.drawn(1)).settings.frequency == pytest.approx(240 / longer)
+    # About the middle of the box a corner at 0.1 m goes by 0.1 m for each radian, in steps by their chords.
+    turn = [transforms.from_rotvec([0, 0, angle]) for angle in (0.0, 1.0, 1.5)]
+    plan = scenes.plan([(turn[0], "goal", 1.0), (turn[1], "goal", 2.0), (turn[2], "goal", 0.5)])
+    rod = Body("rod", (np.array([[-0.1, 0, 0], [0.1, 0, 0]]),), np.eye(4))
+    assert fastest(plan.tool_motion, rod) == pytest.approx(0.1, rel=1e-3)
+    assert fastest(plan.tool_motion, rod, 2.01) == pytest.approx(0.1, rel=1e-3)
+    assert fastest(plan.tool_motion, rod, 0.5) == fastest(plan.tool_motion, rod)
 
 
 def test_too_few_rollouts_are_not_enough_and_one_is_judged_as_given():

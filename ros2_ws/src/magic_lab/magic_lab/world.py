@@ -17,7 +17,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_core.scene import SceneObject
-from magic_verifier.arm_simulation import LOOK_BACK, STOPPED, WATCH_EVERY
+from magic_verifier.arm_simulation import LOOK_BACK, STOPPED
 from magic_verifier.articulation import FINGERS, ArmOptions, Articulation
 from magic_verifier.floating import TABLE, lifted_onto_table
 from magic_verifier.floating import Body as Hulls
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 #: The engine's settings, as the verifier has them for arms; three steps make one of the joint states' hundredths of a second.
 SETTINGS = Settings(frequency=300.0, position_iterations=8, contact_offset=0.002)
+#: What the hand holds is looked at every so many steps.
+WATCH_EVERY = 6
 #: The plane of the table top.
 PLANE = np.array([0.0, 0.0, 1.0, 0.0])
 #: What has slipped by this (m) or turned by this (rad) since it was gripped is no more between the pads.
@@ -82,7 +84,7 @@ class LabWorld:
         home = np.asarray(robot.config.home, dtype=float)
         self.arm.place(home)
         self.arm.open_fingers()
-        self.arm.command(home.tolist(), np.zeros(len(home)).tolist())
+        self.arm.command(home, np.zeros(len(home)))
 
     # ------------------------------------------------------------ state
 
@@ -165,7 +167,7 @@ class LabWorld:
 
     def step(self, q: Array, qd: Array) -> None:
         """One step with the arm's drives at these positions and velocities (J,)."""
-        self.arm.command(q.tolist(), qd.tolist())
+        self.arm.command(q, qd)
         if self._force > 0 and self._grip is None:
             self._close()
         self.engine.step()
