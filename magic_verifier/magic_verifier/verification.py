@@ -31,7 +31,7 @@ from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.robot import Description
-from magic_core.scene import SceneObject
+from magic_core.scene import CanonicalView, SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals, motion_check, uncertainty
 from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, FloatingRun, Setup, make_setup, nears, phase_start, speed
@@ -511,8 +511,18 @@ class _Packed:
 
     @classmethod
     def of(cls, task: Task) -> _Packed:
-        """The arm goes by what it was read from, so that a process reads it once for all tasks."""
-        return cls(pickle.dumps((replace(task, robot=None), None if task.robot is None else task.robot.config), pickle.HIGHEST_PROTOCOL))
+        """The arm goes by what it was read from, so that a process reads it once for all tasks; pictures stay here: nine tenths of it, that
+        no rollout looks at."""
+        views = {name: _unpictured(getattr(task.strategy, name)) for name in ("tool_view", "target_view")}
+        task, config = (
+            replace(task, strategy=replace(task.strategy, **views), robot=None),
+            None if task.robot is None else task.robot.config,
+        )
+        return cls(pickle.dumps((task, config), pickle.HIGHEST_PROTOCOL))
+
+
+def _unpictured(view: CanonicalView) -> CanonicalView:
+    return replace(view, image=view.image[:1, :1].copy(), mask=view.mask[:1, :1].copy(), depth=None)
 
 
 @lru_cache(maxsize=2)
@@ -552,13 +562,13 @@ class _Elsewhere:
 
     def begin(self, task: Task, end: int) -> None:
         """Have rollouts of a task computed, those below ``end`` at most."""
-        if self._pool is not None:
+        if self._pool is not None and self.following < end:
             self._packed = _Packed.of(task)
             self.fill(end)
 
     def fill(self, end: int) -> None:
         """Give out what can be: one more than there are processes, so that none waits for this one to look round."""
-        while self._pool is not None and self.following < end and len(self._waiting) <= self._workers:
+        while self._pool is not None and self._packed is not None and self.following < end and len(self._waiting) <= self._workers:
             try:
                 self._waiting[self.following] = self._pool.submit(_elsewhere, self._packed, self.following)
             except RuntimeError:  # a process was killed, or the pool is closed: this one does it all

@@ -1,7 +1,7 @@
 """A verdict is a set of rollouts, each a function of its draw; how many are needed; what is said of those that fail."""
 
 import pickle
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import replace
 
 import numpy as np
@@ -121,6 +121,20 @@ class Backwards(Executor):
 
         self.given.append((future, call))
         return future
+
+
+class Killed(Executor):
+    """Whose process is killed with the first that it is given."""
+
+    def submit(self, work, /, *args, **options):
+        future = Future()
+        future.set_exception(BrokenExecutor())
+        return future
+
+
+def test_what_was_lost_with_a_process_is_computed_by_this_one():
+    scene = scenes.hooking("L", noise=0.5)
+    assert verdict_of(scene, repetitions=4, pool=Killed(), workers=1).runs == verdict_of(scene, repetitions=4).runs
 
 
 def probability(rate, most, required, z=verification.Z95):
