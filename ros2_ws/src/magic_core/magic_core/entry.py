@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 
-from magic_core import environment
+from magic_core import environment, viewerless
 from magic_core.errors import MagicError
 
 
@@ -42,6 +42,7 @@ def program(module: str, function: str = "main") -> Callable[[], object]:
         except MagicError as error:
             print(f"{package}: {error}", file=sys.stderr)
             return 1
+        viewerless.prepare()
         main = getattr(importlib.import_module(module), function)
         signal.signal(signal.SIGINT, before)
         return main()
