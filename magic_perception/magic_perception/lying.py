@@ -69,7 +69,8 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
 @dataclass(frozen=True)
 class Laid:
     """A lying thing: its height map, the outlines of its parts, and whether it is flat, then ``thickness`` metres thick; else top and bottom
-    (rows, columns) of its relief over the cells of the map, m; ``hollow``: it is seen to be hollow from above."""
+    (rows, columns) of its relief over the cells of the map, m, the bottom that of a thin thing; ``hollow``: it is seen to be hollow from above, and
+    does not go down to the table everywhere."""
 
     grid: Grid
     parts: list[Polygon]
@@ -129,28 +130,24 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
     top = nearest(smooth.astype(np.float32), occupied)
     depression = _filled(np.where(occupied, top, 0)) - top
     hollow = (depression > max(0.004, 3 * noise)) & inner
-    deep = bool(hollow.sum() * grid.cell**2 > 1.5e-4)
-    if deep:
-        spread = int(np.ceil(parameters.wall / grid.cell / 2))
-        # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
-        reach = 2 * int(0.012 / grid.cell) + 1
-        width = 2 * grid.cell * cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
-        thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
-        bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
-        bottom = np.clip(bottom, 0, top - 0.001)
-    else:
-        bottom = np.zeros_like(top)
-    return Laid(grid, parts, False, thickness, deep, top, bottom)
+    spread = int(np.ceil(parameters.wall / grid.cell / 2))
+    # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
+    reach = 2 * int(0.012 / grid.cell) + 1
+    width = 2 * grid.cell * cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
+    bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
+    return Laid(grid, parts, False, thickness, bool(hollow.sum() * grid.cell**2 > 1.5e-4), top, np.clip(bottom, 0, top - 0.001))
 
 
 def build_lying(laid: Laid) -> Reconstruction:
     """A thing that lies: carved where it is flat, else a height field down to the table, or a shell where it is seen to be hollow."""
     if laid.flat:
         return extruded(laid.parts, laid.thickness, "flat")
+    bottom = laid.bottom if laid.hollow else np.zeros_like(laid.top)
     meshes, pieces = [], []
     for part in laid.parts:
-        meshes.append(relief(part, laid.grid, laid.top, laid.bottom))
-        pieces += relief_pieces(part, laid.grid, laid.top, laid.bottom)
+        meshes.append(relief(part, laid.grid, laid.top, bottom))
+        pieces += relief_pieces(part, laid.grid, laid.top, bottom)
     return Reconstruction(concatenate(meshes), tuple(pieces), "shell" if laid.hollow else "height field")
 
 
