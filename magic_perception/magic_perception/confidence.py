@@ -19,10 +19,10 @@ from magic_perception.seen import Witnessed
 from magic_perception.sight import Agreement
 
 #: Shapes that are fitted or carved whole from what masks tell; and those with a body of revolution.
-EXACT, ROUND = ("sphere", "cylinder", "box", "flat"), ("round", "round with handle")
+EXACT, ROUND = ("sphere", "cylinder", "box", "rounded box", "flat"), ("round", "round with handle")
 #: The numbers that speak for or against a solid, and what they are.
 NUMBERS = {
-    "exact": "1 for a ball, cylinder, box or flat thing",
+    "exact": "1 for a ball, cylinder, box with sharp or rounded edges, or flat thing",
     "overlap": "of its silhouette with the masks",
     "through": "share of rays that pass through it, up to 0.3",
     "seen": "share of its surface that was seen",

@@ -164,6 +164,12 @@ def insides(
     return _outsides(points, normal, labels, heights)
 
 
+#: Of an inside such a share lies near one circle, to a wall's thickness at its best, m, and faces its middle: the rest may be a pen that stands in it.  Of an
+#: outside such a share faces away from there, and lies within the rim: the rest may be a handle.  Its highest points lie at such a share of the rim's radius:
+#: depth rounds the near rim off, and the far one outwards.
+WALL, MOST, INWARD, OUTWARD, WITHIN, BESIDE_RIM = 0.004, 0.6, 0.8, 0.75, 0.7, 0.75
+
+
 def _outsides(
     points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]
 ) -> NDArray[np.int64]:
@@ -172,33 +178,36 @@ def _outsides(
 
     The inside's upright surfaces look to its own axis; the outside's look away from that, lie within its rim, as high, and end beside it.
     """
-    from magic_perception.primitives import fit_circle
+    from magic_perception.primitives import fit_circle, likeliest_circle
 
     upright = np.isfinite(normal[:, 0]) & (np.abs(normal[:, 2]) < 0.8)
     members = [np.nonzero((labels == i) & upright)[0] for i in np.unique(labels[labels >= 0])]
     members = [m[:: max(1, len(m) // 1500)] for m in members if len(m) > 200]
     for mine in members:
-        centre, radius = fit_circle(points[mine, :2].astype(float))
-        away = points[mine, :2] - centre
-        distance = np.linalg.norm(away, axis=1)
-        if (
-            not 0.02 < radius < 0.2
-            or np.mean(np.sum(normal[mine, :2] * away, axis=1) < 0) < 0.8
-            or np.percentile(np.abs(distance - radius), 80) > 0.3 * radius
-        ):
-            continue
-        rim, top = float(np.percentile(distance, 97)), float(np.percentile(heights[mine], 97))
-        for other in members:
-            if labels[other[0]] == labels[mine[0]]:
+        top = float(np.percentile(heights[mine], 97))
+        place = np.column_stack([points[mine, :2], heights[mine]]).astype(float)
+        # Of all points alike, and of most of them.
+        for circle in (fit_circle(place[:, :2]), likeliest_circle(place, top, WALL, np.random.default_rng(0))):
+            if circle is None:
                 continue
-            away = points[other, :2] - centre
-            far = np.linalg.norm(away, axis=1)
-            high = heights[other] >= np.percentile(heights[other], 80)
-            if (
-                np.mean(np.sum(normal[other, :2] * away, axis=1) > 0) > 0.8
-                and np.mean(far < 1.15 * rim + 0.005) > 0.85
-                and np.median(far[high]) > 0.85 * rim
-                and abs(float(np.percentile(heights[other], 97)) - top) < 0.02
-            ):
-                labels[labels == labels[other[0]]] = labels[mine[0]]
+            centre, radius = circle
+            away = points[mine, :2] - centre
+            distance = np.linalg.norm(away, axis=1)
+            near = np.abs(distance - radius) < 0.3 * radius
+            if not 0.02 < radius < 0.2 or near.mean() < MOST or np.mean(np.sum(normal[mine, :2] * away, axis=1) < 0) < INWARD:
+                continue
+            rim = float(np.percentile(distance[near], 97))
+            for other in members:
+                if labels[other[0]] == labels[mine[0]]:
+                    continue
+                away = points[other, :2] - centre
+                far = np.linalg.norm(away, axis=1)
+                high = heights[other] >= np.percentile(heights[other], 80)
+                if (
+                    np.mean(np.sum(normal[other, :2] * away, axis=1) > 0) > OUTWARD
+                    and np.mean(far < 1.15 * rim + 0.005) > WITHIN
+                    and np.median(far[high]) > BESIDE_RIM * rim
+                    and abs(float(np.percentile(heights[other], 97)) - top) < 0.02
+                ):
+                    labels[labels == labels[other[0]]] = labels[mine[0]]
     return labels

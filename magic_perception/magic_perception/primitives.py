@@ -45,6 +45,39 @@ def fit_circle(points: NDArray[np.float64], rounds: int = 4, band: float | None 
     return centre, radius
 
 
+def likeliest_circle(
+    sample: NDArray[np.float64], height: float, band: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], float] | None:
+    """Centre and radius of the circle through three points of one level, seen from above, near which most points lie."""
+    slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
+    members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
+    members = [m for m in members if len(m) > 8]
+    if not members:
+        return None
+    # All hypotheses at once.
+    counts = np.array([len(m) for m in members])
+    level = rng.integers(len(members), size=160)
+    drawn = rng.integers(np.repeat(counts[level], 3)).reshape(-1, 3)
+    picked = sample[np.concatenate(members)[(np.cumsum(counts) - counts)[level][:, None] + drawn], :2]
+    a = 2 * (picked[:, 1:] - picked[:, :1])
+    rhs = np.sum(picked[:, 1:] ** 2, axis=2) - np.sum(picked[:, :1] ** 2, axis=2)
+    det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    sound = np.abs(det) > 1e-7
+    a, rhs, det, first = a[sound], rhs[sound], det[sound], picked[sound, 0]
+    centres = (
+        np.column_stack([rhs[:, 0] * a[:, 1, 1] - rhs[:, 1] * a[:, 0, 1], a[:, 0, 0] * rhs[:, 1] - a[:, 1, 0] * rhs[:, 0]]) / det[:, None]
+    )
+    radii = np.hypot(*(first - centres).T)
+    sound = (radii > 0.01) & (radii < 0.12)
+    centres, radii = centres[sound], radii[sound]
+    if len(radii) == 0:
+        return None
+    few = sample[:1200]
+    rho = np.hypot(few[:, 0] - centres[:, :1], few[:, 1] - centres[:, 1:])
+    i = int(np.argmax(np.count_nonzero(np.abs(rho - radii[:, None]) < band * 1.5, axis=1)))
+    return centres[i], float(radii[i])
+
+
 def fit_sphere(points: NDArray[np.float64]) -> Sphere | None:
     """The sphere through points (N, 3), by least squares, refitted to the nearest 85 %; ``None`` for fewer than 30 points."""
     if len(points) < 30:

@@ -58,10 +58,10 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         fit = agreement(found.mesh, sights)
         if fit.overlap > 0.75 and fit.through < _FREE:
             return replace(found, fit=fit)
-    found = recognise_box(points, sights, height, noise)
+    found = recognise_box(sights, height, noise)
     if found is not None:
         fit = agreement(found.mesh, sights)
-        if fit.overlap > 0.9 and fit.through < _FREE:
+        if fit.overlap > _LEAST[found.shape] and fit.through < _FREE:
             return replace(found, fit=fit)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
@@ -98,6 +98,8 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
 
 #: Largest share of rays that may pass through a solid: noise and a pixel of the edge.
 _FREE = 0.15
+#: Least overlap of what is fitted to depth and outlines together with the masks.
+_LEAST = {"box": 0.9, "rounded box": 0.9, "cylinder": 0.8}
 #: From this score on a solid agrees so well with what was seen that no other is looked for.
 _WELL = 0.86
 #: A solid is clearly better than another by so much of the score.
@@ -108,7 +110,7 @@ def _agreeing(solid: Reconstruction | None, sights: list[Sight], least: float) -
     """The solid with its score where its overlap is above ``least`` and few rays pass through it."""
     if solid is None:
         return []
-    fit = agreement(solid.mesh, sights)
+    fit = solid.fit or agreement(solid.mesh, sights)
     return [(fit.score, replace(solid, fit=fit))] if fit.overlap > least and fit.through < _FREE else []
 
 
@@ -125,7 +127,7 @@ def _freest(builds: list[Callable[[], Reconstruction | None]], sights: list[Sigh
             continue
         if found.shape == "flat":  # carved already
             return found
-        fit = agreement(found.mesh, sights)
+        fit = found.fit or agreement(found.mesh, sights)
         if best is None or fit.score > value.score:
             best, value = found, fit
     if best is None or value.through > _FREE:

@@ -603,7 +603,7 @@ def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.in
     return convexity.insides(found.cloud, seen.normal, instance, seen.heights)
 
 
-#: Least share of a thing's pixels that has depth in one camera at least.
+#: Least share of a thing's pixels that has depth of its own in one camera at least.
 MEASURED = 0.2
 
 
@@ -612,7 +612,10 @@ def _with_depth(labels: list[NDArray[np.int32]], looks: list[Looked], parameters
     top = max((int(image.max()) for image in labels), default=0)
     share = np.zeros(top + 1)
     for look, image in zip(looks, labels, strict=True):
-        count, seen = (np.bincount(image[where], minlength=top + 1) for where in (image > 0, (image > 0) & np.isfinite(look.frame.depth)))
+        own = image > 0
+        # Depth of the table behind a thing is none of its own: a shadow of stereo at the table's edge has a few pixels that are.
+        depth = own & np.isfinite(look.frame.depth) & ~smear.behind(own, look.heights)
+        count, seen = (np.bincount(image[where], minlength=top + 1) for where in (own, depth))
         share = np.maximum(share, seen / np.maximum(count, 1))
     if np.all(share[1:] >= MEASURED):
         return labels

@@ -125,6 +125,16 @@ def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
     return (rays if near.all() else rays[near]) + sight.eye
 
 
+def measured(sight: Sight) -> NDArray[np.float64]:
+    """Points (N, 3) of the thing where depth was measured, a pixel within the mask's edge, above the table."""
+    inner = cv2.erode(sight.mask.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    rows, columns = np.nonzero(inner & np.isfinite(sight.depth))
+    z, k = sight.depth[rows, columns].astype(float), sight.intrinsics
+    local = np.column_stack([(columns - k.cx) / k.fx * z, (rows - k.cy) / k.fy * z, z])
+    points = transforms.apply(sight.table_from_camera, local)
+    return points[points[:, 2] > 0]
+
+
 def surfaces(sights: list[Sight], upsample: int = 1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The surface points (N, 3) of all cameras, none below the table, and for each the camera (N, 3) that saw it."""
     clouds = [surface(sight, upsample) for sight in sights]

@@ -29,6 +29,8 @@ HOLLOW, SAME = 0.004, 4.0
 STEP, BESIDE = 0.005, 3
 #: Least pixels of a hole, and of either kind for its histogram to tell anything.
 LEAST, SAMPLE = 12, 150
+#: Past such a share of the outlines nearest to a patch's inner pixels depth goes on where it is a face that stands on the table.
+STANDS = 0.6
 #: Widths of the histograms' bins in lightness and in the two colour axes, of 256.
 BINS = (12, 5, 5)
 
@@ -124,11 +126,13 @@ class _Near:
 @dataclass(frozen=True)
 class _Told:
     """Of one region in its window: log of how much likelier each pixel's colour is around the thing than on it; its distance from the outside, pixels;
-    and for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind them."""
+    for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind them; and whether past each
+    pixel's nearest outline depth goes on."""
 
     field: NDArray[np.float32]
     within: NDArray[np.float32]
     widths: NDArray[np.float32]
+    goes_on: NDArray[np.bool_]
 
 
 def _told(near: _Near, most: int, deep: int) -> _Told | None:
@@ -138,7 +142,12 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
         return None
     index = _index(near.lab)
     ground = _shaded(near.lab[near.around])
-    within = cv2.distanceTransform(np.pad(mine, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    padded = np.pad(mine, 1)
+    within = cv2.distanceTransform(padded.view(np.uint8), cv2.DIST_L2, 3)
+    nearest = cv2.distanceTransformWithLabels(padded.view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    firm = np.zeros(int(nearest.max()) + 1, bool)
+    firm[nearest[padded & (within < 1.5) & ~np.pad(near.jump, 1)]] = True
+    within, goes_on = within[1:-1, 1:-1], firm[nearest[1:-1, 1:-1]]
 
     def field(own: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log of how much likelier each pixel's colour is around the thing than on it, of which ``own`` is a sample."""
@@ -154,7 +163,7 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
     told = field(sure)
     edge = near.jump & mine & (within < 1.5) & (cv2.dilate((~mine & (told > TABLE)).view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     own = cv2.distanceTransform((~(mine & (told < -THING))).view(np.uint8), cv2.DIST_L2, 3)
-    return _Told(told, within, own[edge])
+    return _Told(told, within, own[edge], goes_on)
 
 
 def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float) -> NDArray[np.bool_]:
@@ -213,7 +222,11 @@ def _smeared(near: _Near, told: _Told, reach: int, deep: int) -> NDArray[np.bool
             continue
         cut = (slice(max(y - 4, 0), y + h + 4), slice(max(x - 4, 0), x + w + 4))
         part = parts[cut] == i
-        if float(within[cut][part].max()) < deep and _hole(near, part, empty[cut], told.field[cut][part], cut):
+        if (
+            float(within[cut][part].max()) < deep
+            and _hole(near, part, empty[cut], told.field[cut][part], cut)
+            and not _stands(told, part, cut, reach)
+        ):
             removed[cut] |= part
     # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
     own = _around(empty & ~removed & (within > reach + 1), reach + 1)
@@ -234,6 +247,13 @@ def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: 
         if back > HOLLOW and _behind_plane(near.depth[cut], inside, rim) > HOLLOW:
             return True
     return float(np.median(near.unlike[cut][part])) < SAME
+
+
+def _stands(told: _Told, part: NDArray[np.bool_], cut: tuple[slice, slice], reach: int) -> bool:
+    """Whether a patch of the table's colour reaches farther in than smear does from outlines past most of which depth goes on: a face that meets the table
+    towards the camera.  Past a bar, and beside the hole that it encloses, depth falls back."""
+    deep = part & (told.within[cut] > reach + 1)
+    return np.count_nonzero(deep) >= LEAST and float(told.goes_on[cut][deep].mean()) > STANDS
 
 
 def _behind_plane(depth: NDArray[np.float32], inside: NDArray[np.bool_], rim: NDArray[np.bool_]) -> float:

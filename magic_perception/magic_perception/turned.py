@@ -47,7 +47,7 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     index = index[rng.permutation(len(index))[:5000]]
     sample, eye = points[index], eyes[index]
     band = max(0.003, 2 * noise)
-    circle = _likeliest_circle(sample, height, band, rng)
+    circle = primitives.likeliest_circle(sample, height, band, rng)
     if circle is None:
         return None
     # The inside of an open wall is seen beyond the axis: there the outward normal points away from the camera.
@@ -59,21 +59,42 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     fit = _fit(front, inner, circle, height, wall, band)
     if fit is None:
         return None
-    side, near = fit
+    side, near, opposite = fit
     radius = side.radius(front[:, 2])
     seen = front[:, :2] - side.axis
     widest = max(float(np.ptp(seen @ np.array([np.cos(t), np.sin(t)]))) for t in np.linspace(0, np.pi, 12, endpoint=False))
     if 2 * float(np.median(radius)) > 1.12 * widest:
         return None  # a broad face bent a little, not a round body
-    angles = np.arctan2(*(front[near, :2] - side.axis).T[::-1])
-    coverage = np.unique(np.floor((angles + np.pi) / (2 * np.pi) * 36)).size / 36
-    # What reaches beyond the body must be little: a box's corner reaches 0.4 r beyond its inscribed circle.
-    if float(near.mean()) < 0.5 or coverage < 0.28 or float(np.mean(cosine < 0)) > 0.7:
+    # What reaches beyond the body must be little, as seen from its axis: a handle before the body has many points in few directions, a box's corner
+    # reaches 0.4 r beyond its inscribed circle.
+    told, lies = (
+        sum(np.bincount(_sector(p[k], side.axis), minlength=SECTORS) for p, k in zip((front, inner), which, strict=True))
+        for which in ((slice(None), slice(None)), (near, opposite))
+    )
+    agree = lies >= 0.5 * np.maximum(told, 1)
+    if agree.sum() < max(0.28 * SECTORS, 0.5 * np.count_nonzero(told)) or float(np.mean(cosine < 0)) > 0.7:
         return None
     top = float(np.percentile(front[near, 2], 99))
     around = points[np.abs(np.linalg.norm(points[:, :2] - side.axis, axis=1) - float(np.median(radius))) < 0.012]
     top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 8 else top)
+    # A rim is level: what rises far above it in a few directions is a pen that leans on it.
+    sector = _sector(around, side.axis)
+    highest = [float(np.percentile(around[sector == k, 2], 97)) for k in range(SECTORS) if np.count_nonzero(sector == k) > 8]
+    level = float(np.percentile(highest, 75)) if highest else top
+    top = level if top > level + STICKS > 0.8 * top else top
     return Body(side.axis, _profile(side, front, top, band))
+
+
+#: What rises so far above a rim, m, is no part of it.
+STICKS = 0.012
+#: Directions from an axis in which it is asked whether points lie on a body about it.
+SECTORS = 36
+
+
+def _sector(points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.int64]:
+    """In which of the :data:`SECTORS` about an axis (2,) points (N, 3) lie."""
+    away = points[:, :2] - axis
+    return np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi)) * SECTORS).astype(int) % SECTORS
 
 
 @dataclass(frozen=True)
@@ -95,39 +116,6 @@ class _Side:
         return np.sqrt(np.maximum(self.q[0] + self.q[1] * z + self.q[2] * z**2 + self.shift @ self.shift, 1e-6))
 
 
-def _likeliest_circle(
-    sample: NDArray[np.float64], height: float, band: float, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], float] | None:
-    """Centre and radius of the circle through three points of one level, seen from above, near which most points lie."""
-    slices = np.digitize(sample[:, 2], np.linspace(0, height, 9))
-    members = [np.nonzero(slices == i)[0] for i in np.unique(slices)]
-    members = [m for m in members if len(m) > 8]
-    if not members:
-        return None
-    # All hypotheses at once.
-    counts = np.array([len(m) for m in members])
-    level = rng.integers(len(members), size=160)
-    drawn = rng.integers(np.repeat(counts[level], 3)).reshape(-1, 3)
-    picked = sample[np.concatenate(members)[(np.cumsum(counts) - counts)[level][:, None] + drawn], :2]
-    a = 2 * (picked[:, 1:] - picked[:, :1])
-    rhs = np.sum(picked[:, 1:] ** 2, axis=2) - np.sum(picked[:, :1] ** 2, axis=2)
-    det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
-    sound = np.abs(det) > 1e-7
-    a, rhs, det, first = a[sound], rhs[sound], det[sound], picked[sound, 0]
-    centres = (
-        np.column_stack([rhs[:, 0] * a[:, 1, 1] - rhs[:, 1] * a[:, 0, 1], a[:, 0, 0] * rhs[:, 1] - a[:, 1, 0] * rhs[:, 0]]) / det[:, None]
-    )
-    radii = np.hypot(*(first - centres).T)
-    sound = (radii > 0.01) & (radii < 0.12)
-    centres, radii = centres[sound], radii[sound]
-    if len(radii) == 0:
-        return None
-    few = sample[:1200]
-    rho = np.hypot(few[:, 0] - centres[:, :1], few[:, 1] - centres[:, 1:])
-    i = int(np.argmax(np.count_nonzero(np.abs(rho - radii[:, None]) < band * 1.5, axis=1)))
-    return centres[i], float(radii[i])
-
-
 def _fit(
     front: NDArray[np.float64],
     inner: NDArray[np.float64],
@@ -135,26 +123,27 @@ def _fit(
     height: float,
     wall: float,
     band: float,
-) -> tuple[_Side, NDArray[np.bool_]] | None:
-    """The side through the front's points (N, 3), and which of them lie on it; ``inner``: points on the inside of the far wall."""
+) -> tuple[_Side, NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """The side through the front's points (N, 3), and which of them lie on it; ``inner`` (M, 3): points on the inside of the far wall, and which of them do."""
     origin, first = circle
-    near = np.abs(np.linalg.norm(front[:, :2] - origin, axis=1) - first) < max(0.008, 0.15 * first)
-    side, opposite = None, np.zeros((0, 3))
+    start = max(0.008, 0.15 * first)
+    near = np.abs(np.linalg.norm(front[:, :2] - origin, axis=1) - first) < start
+    # From the start on: a front alone, with a handle before it, tells little of where the axis is.
+    on = np.abs(first - wall - np.linalg.norm(inner[:, :2] - origin, axis=1)) < start
+    side = _Side(origin, np.zeros(2), np.array([first**2, 0.0, 0.0]), height)
     for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
         if np.count_nonzero(near) < 25:
             return None
-        p = np.concatenate([front[near], opposite])
-        local, z = p[:, :2] - origin, p[:, 2] / height
-        matrix = np.column_stack([2 * local, np.ones(len(p)), z, z**2])
+        away = inner[on, :2] - side.axis
+        opposite = inner[on, :2] + away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6) * wall
+        local = np.concatenate([front[near, :2], opposite]) - origin
+        z = np.concatenate([front[near, 2], inner[on, 2]]) / height
+        matrix = np.column_stack([2 * local, np.ones(len(z)), z, z**2])
         model = np.linalg.lstsq(matrix, np.sum(local**2, axis=1), rcond=None)[0]
         side = _Side(origin, model[:2], model[2:], height)
         near = np.abs(np.linalg.norm(front[:, :2] - side.axis, axis=1) - side.radius(front[:, 2])) < width
-        if len(inner):
-            away = inner[:, :2] - side.axis
-            reach = np.linalg.norm(away, axis=1, keepdims=True)
-            beyond = side.radius(inner[:, 2:]) - wall - reach
-            opposite = np.column_stack([inner[:, :2] + away / np.maximum(reach, 1e-6) * wall, inner[:, 2]])[np.abs(beyond[:, 0]) < width]
-    return side, near
+        on = np.abs(side.radius(inner[:, 2]) - wall - np.linalg.norm(inner[:, :2] - side.axis, axis=1)) < width
+    return side, near, on
 
 
 def _profile(side: _Side, front: NDArray[np.float64], top: float, band: float) -> NDArray[np.float64]:
@@ -304,9 +293,10 @@ def build_round(
     body = round_body(points, eyes, height, noise, parameters.wall, parameters.seed)
     if body is None:
         return None
-    if height > body.profile[-1, 1] + 0.012:
-        return None
     lid = not seen_into(sights, body, noise)
+    # Out of an open one something may stick.
+    if lid and height > body.profile[-1, 1] + STICKS:
+        return None
     fitted = fit_to_silhouettes(body, sights)
     if lid or not seen_into(sights, fitted, noise):
         # A lid that depth shows is where it is: the masks' edges tell the sides alone.
@@ -327,7 +317,7 @@ def build_round(
     rho = np.linalg.norm(away, axis=1)
     beyond = rho - body.radius(points[:, 2])
     out = points[beyond > max(0.005, 2.5 * noise)]
-    over = points[(points[:, 2] > top + 0.012) & (beyond < 0)]
+    over = points[(points[:, 2] > top + STICKS) & (beyond < 0)]
     if len(over) > 0.08 * len(points):
         return None  # more than a body of revolution with a flat end, a bottle's neck say
     handle = None
@@ -342,9 +332,14 @@ def build_round(
             return None
     wall = max(parameters.wall, 0.0035)
     mesh, pieces = turned_body(body, wall)
+    alone = Reconstruction(mesh, tuple(pieces), "round")
     if handle is None:
-        return Reconstruction(mesh, tuple(pieces), "round")
-    bars, handle_pieces = handle
+        return alone
+    bars, handle_pieces, hole = handle
+    # A mouth tells of a cup, and a bar on it of a handle. Beside what is closed, or closed as far as is seen, it takes the hole between: what stands
+    # close to a tin is no handle.
+    if not body.open and hole < HOLE:
+        return alone
     try:
         import trimesh
 
@@ -397,10 +392,17 @@ def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[
 
 #: Pixels around a round body within which a mask may be the body's own.
 EDGE = 3
+#: The largest width of a handle's bar, or of bar and hole where no camera sees through that, m: what is wider is a part of another form.
+BAR = 0.04
+#: The least hole between a handle and its body, m^2.
+HOLE = 6e-5
 
 
-def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, parameters: Parameters) -> tuple[list[Mesh], list[Mesh]] | None:
-    """A handle as bars in the upright plane through the body's axis: meshes and convex pieces, or ``None`` if nothing is left after carving."""
+def handle_of(
+    sights: list[Sight], out: NDArray[np.float64], body: Body, parameters: Parameters
+) -> tuple[list[Mesh], list[Mesh], float] | None:
+    """A handle as bars in the upright plane through the body's axis: meshes, convex pieces and the largest hole that it encloses with the body, m^2;
+    ``None`` if nothing is left after carving."""
     local = out[:, :2] - body.axis
     along, thickness = _handle_plane(local)
     e_s, e_z = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -454,6 +456,8 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
     else:
         field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
     solid = _bars(field > 0.5, near, covered, grid_s, grid_z, body)
+    if 2 * cell * float(cv2.distanceTransform(solid, cv2.DIST_L2, 5).max()) > BAR:
+        return None
     parts = [
         p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5
     ]
@@ -468,7 +472,10 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body, paramet
         for p in parts
         for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)
     ]
-    return bars, pieces
+    filled = (solid > 0) | ((grid_s < body.radius(grid_z)) & (grid_z < body.profile[-1, 1]))
+    _, holes, stats, _ = cv2.connectedComponentsWithStats(np.pad(~filled, 1, constant_values=True).view(np.uint8), connectivity=4)
+    enclosed = np.delete(stats[:, cv2.CC_STAT_AREA], [0, holes[0, 0]])
+    return bars, pieces, float(enclosed.max(initial=0)) * cell**2
 
 
 def _standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces
+from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces, _with_depth
 
 RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
 POSE = scenes.pose([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
@@ -161,3 +161,18 @@ def test_a_thin_bar_before_another_thing_keeps_its_width():
     frame = RgbdFrame(np.zeros((200, 200, 3), np.uint8), depth, Intrinsics(200, 200, 600.0, 600.0, 100.0, 100.0), np.eye(4), "camera")
     look = Looked(frame, depth, depth, np.ones_like(labels, bool), np.full_like(depth, 0.0015))
     assert np.array_equal(_on_surfaces(labels, look), labels)
+
+
+def test_what_has_hardly_any_depth_of_its_own_is_no_thing():
+    # A shadow of stereo at the table's edge: the floor's colour, the table's depth, and a few stray pixels.
+    shape = (120, 160)
+    labels, heights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
+    labels[20:60, 20:60], heights[20:60, 20:60] = 1, 0.05
+    labels[20:32, 100:114] = 2
+    heights[20:32, 100:114] = np.where(np.arange(14) % 2 == 0, 0.0, np.nan)
+    heights[24:28, 105:109] = 0.05
+    depth = np.where(np.isfinite(heights), 0.8, np.nan).astype(np.float32)
+    frame = RgbdFrame(np.zeros((*shape, 3), np.uint8), depth, Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0), np.eye(4), "camera")
+    look = Looked(frame, heights, heights, np.ones(shape, bool), np.full(shape, 0.001, np.float32))
+    (kept,) = _with_depth([labels], [look], Parameters())
+    assert kept[40, 40] == 1 and kept.max() == 1

@@ -120,3 +120,19 @@ def test_a_bar_whose_middle_a_thing_of_another_colour_hides_is_one() -> None:
     sizes = sorted(float(item.box_extents.max()) for item in scene.objects)
     assert len(sizes) == 2
     assert sizes == pytest.approx([0.06, 0.26], abs=0.01)
+
+
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_foot_of_the_tables_colour_is_no_hole_where_depth_goes_on_past_it(stands: bool) -> None:
+    # The lower part of a thing that tapers to its foot has the table's colour, and falls back from its upper part as the bottom of a hollow does.
+    mask, foot = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
+    mask[60:140, 60:140] = True
+    foot[118:140, 60:140] = True
+    rows = np.mgrid[0:200, 0:200][0]
+    depth = (0.6 + np.where(foot, 0.002 * (rows - 110), 0)).astype(np.float32)
+    table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
+    unlike = np.where(mask & ~foot, 100, 1).astype(np.float32)
+    jump = mask & ~(stands & (rows > 130) & (np.mgrid[0:200, 0:200][1] > 62) & (np.mgrid[0:200, 0:200][1] < 137))
+    found = smear.cleared(mask, picture(mask & ~foot), depth, table, unlike, np.ones(mask.shape, bool), jump, 615.0)
+    assert found[60:116, 66:134].mean() > 0.98
+    assert (found[122:134, 80:120].mean() > 0.95) == stands
