@@ -27,7 +27,13 @@ SEEN = {
         (304, 246): ("round with handle", True, 122),
         (233, 372): ("round", False, 155),
         (422, 375): ("round", False, 155),
+        # A dark mug whose handle is behind it, a tin with rounded edges (YCB's of 102 mm), a can.
+        (205, 200): ("round", False, 112),
+        (70, 290): ("rounded box", False, 102),
+        (545, 365): ("cylinder", False, 101),
     },
+    # With a pen in it, its foot of the table's colour, its handle towards the camera.
+    "mugs/cluttered_6": {(364, 300): ("round with handle", False, 110)},
 }
 
 
