@@ -659,8 +659,6 @@ class Perception(Node):
         """Look twice a second for images that come compressed only."""
         try:
             self.find_compressed()
-            if self.robot is not None and self.robot.held and not self.count_publishers("in_hand"):
-                self.robot.held, self.again = (), True  # who told it is no more
         except Exception as error:
             self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
 

@@ -255,7 +255,7 @@ class Stages:
             with self._minding(server.planner, *self._verifier()):
                 answer = server.matcher.call(message, max(0.0, deadline - time.monotonic()), self._token, server.settings.presence)
             # The ids were found in the objects that came here; the matcher may just be about to read the same message.
-            if answer.code not in (Code.UNKNOWN_OBJECT, Code.NO_OBJECTS) and self._same_objects(answer):
+            if not self._behind(answer) and self._same_objects(answer):
                 break
             if time.monotonic() > patience:
                 raise self._other_objects(answer)
@@ -270,6 +270,12 @@ class Stages:
         doubts = tuple(text for o in self.scene.objects if o.id in involved and (text := doubt(o)))
         self._matches = pipeline.Matches(answer.candidates, target_id, answer.features, heatmap, sentence, doubts)
         return self._matches
+
+    def _behind(self, answer: MatchContact.Response) -> bool:
+        """Whether the matcher has refused for what this run's objects do not show: it may not have read them yet."""
+        if answer.code == Code.SOMETHING_HANGS:
+            return not any(o.hanging for o in self.scene.objects)
+        return answer.code in (Code.UNKNOWN_OBJECT, Code.NO_OBJECTS)
 
     def _same_objects(self, answer: MatchContact.Response) -> bool:
         """Whether the answer is about this run's objects, or about newer ones, which are this run's from here on.

@@ -618,8 +618,10 @@ def test_an_answer_that_is_lost_is_asked_for_again(bench, monkeypatch):
     assert result.verified and lost == ["match", "plan"], result.message
 
 
-def test_objects_may_reach_the_matcher_later(bench):
-    answers = [MatchContact.Response(code=int(Code.UNKNOWN_OBJECT), message="none received yet")] * 3
+@pytest.mark.parametrize("code", [Code.UNKNOWN_OBJECT, Code.SOMETHING_HANGS])
+def test_objects_may_reach_the_matcher_later(bench, code):
+    """It has none yet, or those from before, when something hung there."""
+    answers = [MatchContact.Response(code=int(code), message="from before")] * 3
 
     def late(request):
         return answers.pop() if answers else fakes.FakeServers.match(request)
