@@ -51,6 +51,8 @@ FEATURES = 8
 LEAST_ACROSS = 0.03
 #: Bytes of the pictures of targets that are kept: some fifteen.
 DRAWN = 16 * 2**20
+#: A place whose outward normal points so far below the level, rad, faces what a tool lies on.
+DOWN = np.deg2rad(20.0)
 #: By so much a match in another view must be better for the tool to be turned for it.
 WORTH_TURNING = 0.05
 
@@ -77,7 +79,8 @@ class Tool:
 
     askew: the view is not square to the tool, and stands back behind the others.  seen_share: how much of its surface was seen;
     unseen_side: the level direction (2,), in the world, that the rest of it faces, where that is known.  told_in: the view in which what is
-    found in ``view`` is told, where that is another.  mesh: on whose surface contacts are put, ``None`` where there are pictures alone.
+    found in ``view`` is told, where that is another.  up (3,): the vertical, in the object's frame, of what cameras saw as it lies, and in a
+    cut shows sides that none of them saw; ``None``: all sides are known.  mesh: on whose surface contacts are put, ``None`` where there are pictures alone.
     """
 
     id: str
@@ -88,6 +91,11 @@ class Tool:
     unseen_side: Callable[[], NDArray[np.float64] | None] = lambda: None
     told_in: CanonicalView | None = None
     mesh: Mesh | None = None
+    up: NDArray[np.float64] | None = None
+
+    def hides(self, view: CanonicalView, normal: NDArray[np.float64]) -> bool:
+        """Whether a place of a cut, with that outward normal (2,) in the picture, faces what the tool lies on: its shape there is a guess."""
+        return self.up is not None and view.kind == "section" and float(view.directions(normal) @ self.up) < -np.sin(DOWN)
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,8 @@ def tool_of(item: SceneObject, kind: str) -> Tool:
         return own_views(item.mesh, item.pieces, kind, apart_from)
 
     known: dict[str, Any] = {"seen_share": item.seen_share, "unseen_side": lambda: enclosing.unseen_side(item), "mesh": item.mesh}
+    if item.source == "camera":
+        known["up"] = item.world_from_object[2, :3].copy()
     try:
         stands = as_it_stands(item, kind)
     except MagicError as error:
@@ -447,7 +457,7 @@ class Matcher:
         shown = strategy.target_contact
         reference = global_stage.make_reference(strategy.target_view, shown.pixel, shown.normal)
         task = self._task(reference, shown, None, None, FEATURES)
-        seen = self._in_view(task, "the target", view)
+        seen = self._in_view(task, Tool("the target", view), view)
         looking = [c for c in seen.candidates if float(c.tool.normal @ direction) > np.cos(facing.FACING)]
         if not looking:
             if not seen.candidates:
@@ -499,7 +509,7 @@ class Matcher:
         def look(view: CanonicalView) -> _Seen | None:
             looked.append(view)
             try:
-                seen = self._in_view(task, tool.id, view)
+                seen = self._in_view(task, tool, view)
             except MagicError as error:
                 failures.append((-1.0, error))
                 return None
@@ -523,7 +533,7 @@ class Matcher:
             raise _not_seen(task, tool, looked, error) or error
         return _told(task, tool, best)
 
-    def _in_view(self, task: _Task, tool_id: str, view: CanonicalView) -> _Seen:
+    def _in_view(self, task: _Task, tool: Tool, view: CanonicalView) -> _Seen:
         """The best different places of one view that can stand in for the contact."""
         contour = contours.extract(view.mask)
         radius = None if task.disc is None else task.disc / view.metres_per_pixel
@@ -532,12 +542,12 @@ class Matcher:
         first = len(proposals.proposals) if task.further else OVERSAMPLING * task.top_k
         refused: list[Refusal] = []
         for some in (proposals.proposals[:first], proposals.proposals[first:]):
-            candidates, why = self._refine(task, tool_id, view, contour, radius, some)
+            candidates, why = self._refine(task, tool, view, contour, radius, some)
             refused += why
             if candidates:
                 break
         if task.further and candidates:
-            candidates, why = self._joined(task, tool_id, view, contour, candidates)
+            candidates, why = self._joined(task, tool, view, contour, candidates)
             refused += why
         points = np.array([c.tool.pixel for c in candidates]).reshape(-1, 2)
         order = global_stage.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, task.top_k)
@@ -545,7 +555,7 @@ class Matcher:
         return _Seen(view, [candidates[i] for i in order], worst, proposals.heatmap)
 
     def _joined(
-        self, task: _Task, tool_id: str, view: CanonicalView, contour: Contour, candidates: list[ContactCandidate]
+        self, task: _Task, tool: Tool, view: CanonicalView, contour: Contour, candidates: list[ContactCandidate]
     ) -> tuple[list[ContactCandidate], list[Refusal]]:
         """Each candidate with the further contacts that suit it best as one rigid tool, its score that of all together; and why there are none.
 
@@ -559,7 +569,7 @@ class Matcher:
         for name, one in task.further:
             radius = None if one.disc is None else one.disc / view.metres_per_pixel
             proposals = self.backend.propose(one.prepared, view, contour, radius, RESERVE * task.top_k)
-            found, why = self._refine(one, tool_id, view, contour, radius, proposals.proposals)
+            found, why = self._refine(one, tool, view, contour, radius, proposals.proposals)
             if not found:
                 return [], [replace(refusal, what=f"{name}: {refusal.what}") for refusal in why]
             points = np.array([c.tool.pixel for c in found])
@@ -584,7 +594,7 @@ class Matcher:
         return joined, []
 
     def _refine(
-        self, task: _Task, tool_id: str, view: CanonicalView, contour: Contour, radius: float | None, proposals: Sequence[Proposal]
+        self, task: _Task, tool: Tool, view: CanonicalView, contour: Contour, radius: float | None, proposals: Sequence[Proposal]
     ) -> tuple[list[ContactCandidate], list[Refusal]]:
         """The local stage on proposals and the score of those that can stand in for the contact; why the others cannot."""
         reference, target = task.reference, task.target
@@ -609,6 +619,9 @@ class Matcher:
             view.metres_per_pixel,
             around,
         )
+        for i, (proposal, local) in enumerate(pairs):
+            if refused[i] is None and tool.hides(view, local.normal):
+                refused[i] = Refusal("side of the tool", "the one it lies on", "one that a camera can have seen", proposal.similarity)
         candidates: list[ContactCandidate] = []
         for (proposal, local), refusal in zip(pairs, refused, strict=True):
             if refusal is not None:
@@ -618,7 +631,7 @@ class Matcher:
             frame = turned_over(contact.object_from_contact) if proposal.flipped else contact.object_from_contact
             candidates.append(
                 ContactCandidate(
-                    tool_id=tool_id,
+                    tool_id=tool.id,
                     tool=contact,
                     target=target.contact if target is not None else None,
                     rotation=global_stage.rotation_between(reference.normal, contact.normal, proposal.flipped),

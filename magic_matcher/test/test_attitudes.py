@@ -64,3 +64,34 @@ def test_what_most_agree_on():
     found = attitudes.Followed(points, points)
     assert found.most in (1, 2) and found.share == 0.5
     assert shapes.make("l_hook", 5).mesh.extents == pytest.approx(attitudes.load("l_hook:5", "side").extents)
+
+
+def test_the_side_that_a_seen_tool_lies_on_is_no_place():
+    """No camera has seen the hollow of a spoon that lies on its face, nor the underside of a handle: what is reconstructed there is a guess."""
+    found = strategies.find("scooping", STRATEGIES)
+    backend = features.load("embedded")
+
+    def lying(rotation, source):
+        mesh = attitudes.load("spoon:4", "").transformed(rotation)
+        return SceneObject("tool", mesh, (), np.eye(4), find_view(mesh, None, found.view), source=source)
+
+    def outward(item):
+        candidates = matching.Matcher(backend).match(found, [item], found.target_view, 3).candidates
+        return [c.tool.object_from_contact[:3, 0] for c in candidates]
+
+    back, face = transforms.from_rpy(0, 0, 0.4), transforms.from_rpy(np.pi, 0, 0.4)
+    assert outward(lying(back, "camera"))[0][2] > 0.9
+    # A given mesh is known all around, and its hollow is found whichever way it faces.
+    assert outward(lying(face, "known"))[0][2] < -0.9
+    assert all(normal[2] > -np.sin(matching.DOWN) for normal in outward(lying(face, "camera")))
+
+
+def test_what_faces_the_table_in_a_cut_alone_is_hidden():
+    view = find_view(attitudes.load("spoon:4", ""), None, "section")
+    up = np.array([0.0, 0.0, 1.0])
+    down = -(view.object_from_view[:3, :2].T @ up)
+    tool = matching.Tool("tool", view, up=up)
+    assert tool.hides(view, down) and not tool.hides(view, -down)
+    assert not matching.Tool("tool", view).hides(view, down)
+    side = find_view(attitudes.load("mug:8", ""), None, "side")
+    assert not matching.Tool("tool", side, up=up).hides(side, down)

@@ -37,6 +37,8 @@ REACH, ASIDE = 0.010, 0.3
 CARRIED = 0.008
 #: Four fifths of the points seen inside are this near to the fitted hollow, m, or 2.5 times the noise of heights.
 NEAR = 0.003
+#: And all but a twentieth within so many times that; of what is seen within this share of the rim no more than that share stands above it.
+FAR, WITHIN, STANDING = 2.5, 0.85, 0.05
 #: What sticks out of a handle's side is a part of it where it is wider than this share of the handle's mean width.
 WHISKER = 0.6
 _SECTORS, _PIECES = 48, 16
@@ -186,11 +188,23 @@ def fit_bowl(laid: Laid, sights: list[Sight], noise: float, parameters: Paramete
         bowl = replace(bowl, depths=np.maximum.accumulate(bowl.depths[::-1])[::-1])
         lowest = float(bowl.surface(RINGS[:-1], 24, 0.0)[..., 2].min())
         bowl = replace(bowl, wall=float(np.clip(lowest, *WALLS)))
-    inside = _seen_inside(bowl, points, eyes)
-    if np.count_nonzero(inside) < 60 or bowl.depths[0] < SHALLOW or bowl.half.max() > LONG * bowl.half.min():
+    if bowl.depths[0] < SHALLOW or bowl.half.max() > LONG * bowl.half.min():
         return None
+    return bowl if explains(bowl, points, eyes, noise) else None
+
+
+def explains(bowl: Bowl, points: NDArray[np.float64], eyes: NDArray[np.float64], noise: float) -> bool:
+    """Whether a hollow is what was seen through its opening: points (N, 3) by their cameras (N, 3); noise of heights, m."""
+    inside, near = _seen_inside(bowl, points, eyes), max(NEAR, 2.5 * noise)
+    if np.count_nonzero(inside) < 60:
+        return False
     off = np.abs(_off_hollow(bowl, points[inside]))
-    return bowl if float(np.percentile(off, 80)) < max(NEAR, 2.5 * noise) else None
+    if float(np.percentile(off, 80)) >= near or float(np.percentile(off, 95)) >= FAR * near:
+        return False
+    # What stands in the opening is no part of a bowl, nor is the hollow there that is fitted to the rest.
+    x, y, z = bowl.local(points).T
+    standing = (np.hypot(x / bowl.half[0], y / bowl.half[1]) < WITHIN) & (z > near)
+    return bool(np.count_nonzero(standing) <= STANDING * np.count_nonzero(inside))
 
 
 def _off_hollow(bowl: Bowl, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import trimesh
 from magic_core import sensor, shapes, transforms
 from magic_core.mesh import Mesh
 from magic_core.views import find_view, holes_of
+from magic_perception import scoops
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 
@@ -181,3 +182,21 @@ def test_a_scoop_is_hollow_also_where_its_near_wall_hides_it(family, seed, yaw, 
         sample = trimesh.sample.sample_surface(here.to_trimesh(), 1500, seed=0)[0].astype(np.float32)
         off.append(scene.compute_distance(o3d.core.Tensor(sample)).numpy() ** 2)
     assert np.sqrt(np.mean(off)) < least, np.sqrt(np.mean(off))
+
+
+def test_a_hollow_is_held_against_all_that_is_seen_in_it():
+    """A lump in a bowl, below its rim or above it, is no hollow, though most of what is seen fits one."""
+    depths = 0.02 * np.sqrt(np.maximum(1 - scoops.RINGS**2, 0))
+    bowl = scoops.Bowl(transforms.from_rpy(0.1, -0.05, 0.7, [0.5, 0.1, 0.024]), np.array([0.035, 0.028]), depths, 0.002)
+    hollow = bowl.surface(np.linspace(0.05, 0.95, 24), 48, 0.0).reshape(-1, 3)
+    hollow = hollow + np.random.default_rng(0).normal(scale=0.0008, size=hollow.shape)
+
+    def holds(points):
+        return scoops.explains(bowl, points, np.broadcast_to(bowl.table_from_bowl[:3, 3] + [0, 0, 0.8], points.shape), 0.001)
+
+    assert holds(hollow)
+    for top in (-0.006, 0.012):  # of the lump, above the rim's plane
+        x, y, z = bowl.local(hollow).T
+        lump = np.where(np.hypot(x, y) < 0.014, top - 30 * (x**2 + y**2), z)
+        full = transforms.apply(bowl.table_from_bowl, np.column_stack([x, y, np.maximum(z, lump)]))
+        assert not holds(full), top
