@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import threading
+import time
 import traceback
 
 from rclpy.context import Context
@@ -12,8 +13,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.logging import get_logger
 from rclpy.task import Task
 
-#: A wait that fails this many times in a row does not fail for what is just being destroyed.
-FAILED_WAITS = 100
+#: Waits that fail for so many seconds in a row do not fail for what is just being destroyed; between two of them the thread that destroys
+#: it is given time, s.
+FAILING, PAUSE = 5.0, 0.001
 
 
 class ThreadedExecutor(Executor):
@@ -32,7 +34,7 @@ class ThreadedExecutor(Executor):
         self._handed: dict[concurrent.futures.Future[None], Task] = {}  # over to the threads, and not done yet
         self._taking = threading.Lock()  # held while callbacks are waited for: what is waited on must not be destroyed meanwhile
         self._closed = False
-        self._failed_waits = 0  # in a row
+        self._failing: float | None = None  # since when, by the clock, waits have failed in a row
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for one callback, and until a thread has begun it; each at most ``timeout_sec``, s."""
@@ -43,16 +45,18 @@ class ThreadedExecutor(Executor):
             try:
                 callback, _, _ = self.wait_for_ready_callbacks(timeout_sec=timeout_sec, condition=self._is_closed)
             except (TimeoutException, ConditionReachedException, ShutdownException, ExternalShutdownException):
-                self._failed_waits = 0
+                self._failing = None
                 return
             except _rclpy.RCLError:
                 # An action server or client that another thread destroys between being listed and being waited for: rclpy leaves
                 # the dead handle in its list.  The next wait lists anew.
-                self._failed_waits += 1
-                if self._failed_waits == FAILED_WAITS:
+                now = time.monotonic()
+                self._failing = now if self._failing is None else self._failing
+                if now - self._failing > FAILING:
                     raise
+                time.sleep(PAUSE)
                 return
-            self._failed_waits = 0
+            self._failing = None
             future = self._pool.submit(self._work, callback, begun)
             self._handed[future] = callback
         future.add_done_callback(self._handed.pop)
