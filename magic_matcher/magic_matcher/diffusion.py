@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from magic_core import devices
 from magic_core.errors import Code, MagicError
+from magic_core.weights import loading
 from magic_matcher import global_matching
 from magic_matcher.dinov2 import Dinov2Features
 
@@ -52,7 +53,8 @@ class UNet:
             raise MagicError(
                 Code.FEATURE_WEIGHTS, "diffusion features", str(error), "pip install -r ros2_ws/requirements-diffusion.txt"
             ) from error
-        try:
+        allowed = f"a hub name that can be reached, or a folder of a Stable Diffusion pipeline with {', '.join(PARTS)}"
+        with loading(weights, device, allowed):
             self._torch = torch
             self._device = torch.device(devices.chosen(device))
             half = "float32" if self._device.type == "cpu" else "float16"
@@ -68,16 +70,6 @@ class UNet:
             ids = tokenizer("", padding="max_length", max_length=words.config.max_position_embeddings, truncation=True, return_tensors="pt")
             with torch.inference_mode():
                 self._prompt = words(ids.input_ids.to(self._device))[0]
-        except (
-            Exception
-        ) as error:  # whatever the libraries make of files that are not what they should be, or of a device that is not there
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise MagicError(
-                Code.FEATURE_WEIGHTS,
-                f"weights {weights} on {device}: {reason}",
-                None,
-                f"a hub name that can be reached, or a folder of a Stable Diffusion pipeline with {', '.join(PARTS)}",
-            ) from error
         highest = len(self._unet.up_blocks) - 1
         if max(blocks) > highest:
             raise MagicError(Code.FEATURE_WEIGHTS, f"up block of {weights}", max(blocks), f"up to {highest}: the U-Net has no more")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magic_core import devices
 from magic_core.errors import Code, MagicError
+from magic_core.weights import config_of, loading
 from magic_matcher import global_matching
 
 MODELS = ("dinov2", "dinov2_with_registers", "dinov3_vit")
@@ -45,32 +46,19 @@ class Dinov2Features(global_matching.NetworkFeatures):
             raise MagicError(Code.BAD_REQUEST, "precision", precision, PRECISIONS)
         try:
             import torch
-            from transformers import AutoConfig, AutoModel
+            from transformers import AutoModel
             from transformers.utils import logging
         except ImportError as error:
             raise MagicError(Code.FEATURE_WEIGHTS, "dinov2 features", str(error), "an environment with torch and transformers") from error
         logging.disable_progress_bar()  # a log is no place for it, and an error is one line
-        try:
-            config = AutoConfig.from_pretrained(weights)
-            if config.model_type not in MODELS:
-                raise MagicError(Code.FEATURE_WEIGHTS, f"model type of {weights}", config.model_type, MODELS)
+        allowed = "a hub name that can be reached, or a folder with config.json and model.safetensors; a torch device of this machine"
+        with loading(weights, device, allowed):
+            config = config_of(weights, MODELS)
             self._torch = torch
             self._device = torch.device(devices.chosen(device))
             half = "float32" if self._device.type == "cpu" else "float16"
             self._dtype = getattr(torch, half if precision == "auto" else precision)
             self._model = AutoModel.from_pretrained(weights, dtype=self._dtype).to(self._device).eval()
-        except MagicError:
-            raise
-        except (
-            Exception
-        ) as error:  # whatever the libraries make of files that are not what they should be, or of a device that is not there
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise MagicError(
-                Code.FEATURE_WEIGHTS,
-                f"weights {weights} on {device}: {reason}",
-                None,
-                "a hub name that can be reached, or a folder with config.json and model.safetensors; a torch device of this machine",
-            ) from error
         self._weights = str(weights)
         self._patch = int(config.patch_size)
         self._extra = 1 + int(getattr(config, "num_register_tokens", 0) or 0)

@@ -80,8 +80,8 @@ def refusals(
     metres_per_pixel: float,
     around: holding.Room | None = None,
 ) -> list[Refusal | None]:
-    """For each of the places (N, 2) with outward normals why it is refused, ``None`` where it is not; radius of the target, px; around:
-    :func:`room_for` it where that is known."""
+    """For each of the places (N, 2) with outward normals why it is refused, ``None`` where it is not; radius of the target, px; around: what
+    :func:`room_for` gives, where that is known."""
     held = None
     around = room_for(asked, contour, radius) if around is None else around
     if radius is not None and around is not None and len(points):

@@ -118,11 +118,11 @@ def _pieces(mask: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.boo
 
 def mostly_held(looks: list[Looked], labels: list[NDArray[np.int32]], label: int) -> bool:
     """Whether a thing is what the robot holds: most of what is seen of it is where that may be, and a part where it surely is."""
-    told = [(look.frame.held, image == label) for look, image in zip(looks, labels, strict=True) if look.frame.held is not None]
-    near, sure, count = (
-        sum(int(np.count_nonzero(f(held, mask))) for held, mask in told)
-        for f in (lambda held, mask: mask & (held > 0), lambda held, mask: mask & (held == SURELY), lambda _, mask: mask)
-    )
+    near = sure = count = 0
+    for look, image in zip(looks, labels, strict=True):
+        if look.frame.held is not None:
+            held = look.frame.held[image == label]
+            count, near, sure = count + held.size, near + np.count_nonzero(held), sure + np.count_nonzero(held == SURELY)
     return near > HELD * count and sure > 0
 
 

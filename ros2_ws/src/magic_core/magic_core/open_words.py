@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from magic_core import devices, naming
 from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
+from magic_core.weights import config_of, loading
 
 MODELS = ("clip", "siglip", "siglip2")
 #: How captions of the pictures that such networks were trained with begin.
@@ -52,32 +53,21 @@ class OpenWords:
     def __init__(self, weights: str, device: str = devices.AUTO) -> None:
         try:
             import torch
-            from transformers import AutoConfig, AutoImageProcessor, AutoModel, AutoTokenizer
+            from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
             from transformers.utils import logging
         except ImportError as error:
             raise MagicError(
                 Code.FEATURE_WEIGHTS, "names in open words", str(error), "an environment with torch and transformers"
             ) from error
         logging.disable_progress_bar()  # a log is no place for it
-        try:
-            config = AutoConfig.from_pretrained(weights)
-            if config.model_type not in MODELS:
-                raise MagicError(Code.FEATURE_WEIGHTS, f"model type of {weights}", config.model_type, MODELS)
+        allowed = "a hub name that can be reached, or a folder with model, image processor and tokenizer; a torch device of this machine"
+        with loading(weights, device, allowed):
+            config = config_of(weights, MODELS)
             self._torch = torch
             self._device = torch.device(devices.chosen(device))
             self._model = AutoModel.from_pretrained(weights).to(self._device).eval()
             self._images = AutoImageProcessor.from_pretrained(weights)
             self._tokens = AutoTokenizer.from_pretrained(weights)
-        except MagicError:
-            raise
-        except (
-            Exception
-        ) as error:  # whatever the libraries make of files that are not what they should be, or of a device that is not there
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            allowed = (
-                "a hub name that can be reached, or a folder with model, image processor and tokenizer; a torch device of this machine"
-            )
-            raise MagicError(Code.FEATURE_WEIGHTS, f"weights {weights} on {device}: {reason}", None, allowed) from error
         # SigLIP was trained with texts filled up to their full length, and reads shorter ones wrongly.
         self._padding = True if config.model_type == "clip" else "max_length"
         self._lock = threading.Lock()
