@@ -2,11 +2,12 @@
 
 A thing is right where its masks and its solid overlap the truth (intersection over union, seen by each camera and by volume) by more
 than 0.8.  The chance of that is a logistic function of a few numbers.  ``confidence.json`` holds its weights, fitted with a
-ridge penalty to 257 things of procedural scenes; ``ros2 run magic_perception learn_confidence`` fits them anew. README.md says how it does on others.
+ridge penalty to 260 things of procedural scenes; ``ros2 run magic_perception learn_confidence`` fits them anew. README.md says how it does on others.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,27 +15,32 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core.scene import PICTURE, REGION, UNSEEN
 from magic_perception import logistic
 from magic_perception.seen import Witnessed
 from magic_perception.sight import Agreement
 
-#: Shapes that are fitted or carved whole from what masks tell; and those with a body of revolution.
-EXACT, ROUND = ("sphere", "cylinder", "box", "rounded box", "flat"), ("round", "round with handle")
-#: The numbers that speak for or against a solid, and what they are.
+#: Shapes that have a few numbers, all of which are fitted; those with a body of revolution; what ends a thing out of sight at nobody knows what length.
+TURNED, ROUND, ENDED = ("sphere", "cylinder", "rounded box"), ("round", "round with handle"), (PICTURE, REGION, UNSEEN)
+#: The numbers that speak for or against a solid: what they are, and their :data:`SIGNS`.
 NUMBERS = {
-    "exact": "1 for a ball, cylinder, box with sharp or rounded edges, or flat thing",
-    "overlap": "of its silhouette with the masks",
-    "through": "share of rays that pass through it, up to 0.3",
-    "seen": "share of its surface that was seen",
-    "residual_mm": "median distance between measured and drawn depth, up to 8",
-    "far": "share of the measured points farther than 6 mm from it",
-    "flat": "1 for a flat thing",
-    "round": "1 for a body of revolution",
-    "thin": "log of its smallest size over 20 mm",
-    "cut": "1 where it is cut off",
-    "several": "1 where several cameras saw it",
-    "apart_mm": "how far they disagree, up to 12",
+    "overlap": ("of its silhouette with the masks", 1),
+    "seen": ("share of its surface that was seen", 1),
+    "residual_mm": ("median distance between measured and drawn depth, up to 8", -1),
+    "far": ("share of the measured points farther than 6 mm from it", -1),
+    "box": ("1 for a box with sharp edges", 0),
+    "turned": ("1 for a ball, a cylinder or a box with rounded edges", 0),
+    "flat": ("1 for a flat thing", 0),
+    "round": ("1 for a body of revolution with a profile", 0),
+    "layers": ("1 for what is stacked from layers", 0),
+    "thin": ("log of its smallest size over 20 mm", 0),
+    "border": ("1 where the picture or the region cuts it off", -1),
+    "joined": ("share of its outline along which another thing goes on at its depth, up to 0.3: they may be one", -1),
+    "several": ("1 where several cameras saw it", 0),
+    "apart": ("how far they disagree, over its smallest size, up to 0.5", -1),
 }
+#: 1 or -1 for a number that speaks for or against, whatever chance makes of it in the scenes that teach.
+SIGNS = np.array([sign for _, sign in NUMBERS.values()])
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,7 @@ class Evidence:
 
     shape: how it came about (:class:`magic_perception.solids.Reconstruction`); fit: with masks and free space; witnessed: with the measured
     depth; extents (3,): its sizes, m; cameras: how many saw it; apart: how far they disagree, m, 0 where that was not measured;
-    cut: whether it is cut off.
+    cut: what cuts it off, names and labels; joined: as :func:`magic_perception.seen.joined` has it.
     """
 
     shape: str
@@ -52,23 +58,26 @@ class Evidence:
     extents: NDArray[np.float64]
     cameras: int
     apart: float
-    cut: bool
+    cut: Sequence[int | str]
+    joined: float
 
     def row(self) -> NDArray[np.float64]:
         """The :data:`NUMBERS`, each within the range of what the chance was fitted to."""
         told = {
-            "exact": float(self.shape in EXACT),
             "overlap": min(self.fit.overlap, 1.0),
-            "through": min(self.fit.through, 0.3),
             "seen": self.witnessed.seen,
             "residual_mm": min(1000 * self.witnessed.residual, 8.0),
             "far": self.witnessed.far,
+            "box": float(self.shape == "box"),
+            "turned": float(self.shape in TURNED),
             "flat": float(self.shape == "flat"),
             "round": float(self.shape in ROUND),
+            "layers": float(self.shape == "layers"),
             "thin": float(np.clip(np.log(max(float(self.extents.min()), 1e-6) / 0.02), -2, 2)),
-            "cut": float(self.cut),
+            "border": float(any(by in ENDED for by in self.cut)),
+            "joined": min(self.joined, 0.3),
             "several": float(self.cameras > 1),
-            "apart_mm": min(1000 * self.apart, 12.0),
+            "apart": min(self.apart / max(float(self.extents.min()), 1e-3), 0.5),
         }
         return np.array([told[name] for name in NUMBERS])
 

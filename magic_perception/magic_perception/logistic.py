@@ -38,11 +38,31 @@ def load(path: Path, names: Mapping[str, object] | list[str]) -> Logistic:
     return Logistic(float(told["constant"]), np.array([float(told["weights"][name]) for name in names]))
 
 
-def fit(rows: NDArray[np.float64], truth: NDArray[np.bool_], weight: NDArray[np.float64] | None = None, ridge: float = 1.0) -> Logistic:
-    """Logistic regression with a ridge penalty on the standardised numbers: rows (N, C), truth (N,), weight (N,) of each."""
-    from sklearn.linear_model import LogisticRegression
+def fit(
+    rows: NDArray[np.float64],
+    truth: NDArray[np.bool_],
+    weight: NDArray[np.float64] | None = None,
+    ridge: float = 1.0,
+    signs: NDArray[np.int64] | None = None,
+) -> Logistic:
+    """Logistic regression with a ridge penalty on the standardised numbers: rows (N, C), truth (N,), weight (N,) of each; signs (C,): 1 or -1 where a
+    number is known to speak for or against, and its weight may not say otherwise."""
+    from scipy.optimize import minimize
 
     mean, scale = rows.mean(axis=0), np.maximum(rows.std(axis=0), 1e-6)
-    model = LogisticRegression(C=1 / ridge, max_iter=1000).fit((rows - mean) / scale, truth, weight)
-    weights = model.coef_[0] / scale
-    return Logistic(float(model.intercept_[0] - weights @ mean), weights)
+    columns = np.column_stack([np.ones(len(rows)), (rows - mean) / scale])
+    side, count = np.where(truth, 1.0, -1.0), np.ones(len(rows)) if weight is None else weight
+    penalty = np.append(0.0, np.full(rows.shape[1], ridge))
+
+    def loss(x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        margin = side * (columns @ x)
+        value = count @ np.logaddexp(0, -margin) + 0.5 * penalty @ x**2
+        return float(value), -(count * side * np.exp(-np.logaddexp(0, margin))) @ columns + penalty * x
+
+    bounds = [
+        (None, None),
+        *((0 if s > 0 else None, 0 if s < 0 else None) for s in (signs if signs is not None else np.zeros(rows.shape[1]))),
+    ]
+    x = minimize(loss, np.zeros(columns.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": 1000}).x
+    weights = x[1:] / scale
+    return Logistic(float(x[0] - weights @ mean), weights)

@@ -23,7 +23,7 @@ from magic_perception.glass import once, unmeasured
 from magic_perception.hidden import ROBOT, hangs, mostly_held, parted, veil
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
-from magic_perception.seen import cut_off, witnessed
+from magic_perception.seen import cut_off, joined, witnessed
 from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
 from magic_perception.sight import agreement
 from magic_perception.smear import behind
@@ -285,7 +285,8 @@ def _build(
         solid.mesh.extents,
         _places(sights),
         apart,
-        bool(cut),
+        cut,
+        joined(looks, labels, label),
     )
     best = int(np.argmax(counts[:now] if max(counts[:now]) else counts))
     mask, frame = labels[best] == label, looks[best].frame

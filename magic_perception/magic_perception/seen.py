@@ -22,6 +22,8 @@ LEAST = 0.010
 NEARER = 0.012
 #: Pixels around a cut within which the outline tells nothing.
 AROUND = 8
+#: Depth beside an edge is compared so many pixels across it.
+ACROSS = 4
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,29 @@ def _sees(other: Looked, mask: NDArray[np.bool_], cuts_there: list[Cut], look: L
         blind[cut.pixels[:, 0], cut.pixels[:, 1]] = 1
         wide &= cv2.dilate(blind, np.ones((2 * AROUND + 1,) * 2, np.uint8)) == 0
     return float(np.mean(inside & wide[np.clip(v, 0, k.height - 1), np.clip(u, 0, k.width - 1)])) > 0.7
+
+
+def joined(looks: list[Looked], labels: list[NDArray[np.int32]], label: int) -> float:
+    """The share, 0..1, of a thing's outline along which another thing goes on at its depth, in the camera where that is largest: there they touch, and
+    may be one thing that a seam has parted."""
+    largest = 0.0
+    for look, image in zip(looks, labels, strict=True):
+        x, y, w, h = cv2.boundingRect((image == label).view(np.uint8))
+        if w == 0:
+            continue
+        cut = (slice(max(y - ACROSS, 0), y + h + ACROSS), slice(max(x - ACROSS, 0), x + w + ACROSS))
+        part, depth = image[cut], look.frame.depth[cut]
+        mine = part == label
+        outline = mine & (cv2.erode(mine.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) == 0)
+        touching = 0
+        for axis in range(2):
+            turned, z = np.moveaxis(part, axis, 0), np.moveaxis(depth, axis, 0)
+            one, two = turned[:-ACROSS], turned[ACROSS:]
+            meets = ((one == label) & (two > 0) & (two != label)) | ((two == label) & (one > 0) & (one != label))
+            with np.errstate(invalid="ignore"):
+                touching += int(np.count_nonzero(meets & (np.abs(z[ACROSS:] - z[:-ACROSS]) < NEARER)))
+        largest = max(largest, touching / ACROSS / max(int(np.count_nonzero(outline)), 1))
+    return min(largest, 1.0)
 
 
 @dataclass(frozen=True)

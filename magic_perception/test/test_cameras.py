@@ -7,11 +7,13 @@ import pytest
 import scenes
 
 from magic_core import sensor, shapes, transforms
-from magic_core.camera import Intrinsics
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
+from magic_perception.seen import joined
+from magic_perception.segmentation import Looked
 from magic_perception.table import camera_over_table, table_in_view
 
 REGION = Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5))
@@ -196,6 +198,17 @@ def test_what_hangs_beside_a_thing_of_its_colour_is_its_part(color, count):
     assert len(scene.objects) == count
     if count == 1:
         assert scene.objects[0].box_extents.max() > 0.1
+
+
+@pytest.mark.parametrize(("step", "share"), [(0.0, 40 / 156), (0.005, 40 / 156), (0.03, 0.0)])
+def test_what_goes_on_at_its_depth_beside_a_thing_is_joined_to_it(step, share):
+    labels, depth = np.zeros((120, 160), np.int32), np.full((120, 160), 0.8, np.float32)
+    labels[40:80, 40:80], labels[40:80, 80:120] = 1, 2
+    depth[40:80, 80:120] -= step
+    frame = RgbdFrame(np.zeros((120, 160, 3), np.uint8), depth, Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0), np.eye(4), "camera")
+    look = Looked(frame, depth, depth, np.ones((120, 160), bool), depth)
+    assert joined([look], [labels], 1) == pytest.approx(share)
+    assert joined([look], [np.minimum(labels, 1)], 1) == 0
 
 
 def test_confidence_falls_with_what_was_seen(pair):
