@@ -362,8 +362,12 @@ class World:
 
     def place(self, name: str, pose: NDArray[np.float64]) -> None:
         """Put a body somewhere, at rest where it is free."""
+        self.put(name, to_pose(pose))
+
+    def put(self, name: str, pose: Any) -> None:
+        """The same at a sapien.Pose."""
         component = self._bodies[name]
-        component.entity_pose = to_pose(pose)
+        component.entity_pose = pose
         if not component.kinematic:
             component.linear_velocity = component.angular_velocity = np.zeros(3, np.float32)
 

@@ -170,36 +170,61 @@ def degrade(
     there is none.
     """
     model = model or DepthModel()
-    height, width = depth.shape
-    noise = noise or Noise.draw((height, width), seed, model)
-    smooth, lottery, loss, shift = noise.smooth, noise.lottery, noise.loss, noise.shift
-
+    noise = noise or Noise.draw(depth.shape, seed, model)
     if model.window or model.filled:
         depth = smeared(depth, intrinsics, seed, model)
-    valid = np.isfinite(depth)
-    true = np.where(valid, depth, 0.0).astype(np.float32)
-    window = np.ones((2 * model.edge_width + 1,) * 2, np.uint8)
-    farthest = cv2.dilate(np.where(valid, depth, model.far).astype(np.float32), window)
-    nearest = cv2.erode(np.where(valid, depth, model.far).astype(np.float32), window)
-    # A slope changes depth too: only what exceeds the slope of a steep plane counts as a jump.
-    footprint = 2 * model.edge_width * true / intrinsics.fx
-    jump = (farthest - nearest) > model.edge + 2.0 * footprint
-    # Near a jump a pixel takes the depth of one of its neighbours.
-    v, u = np.mgrid[0:height, 0:width]
-    strayed = depth[np.clip(v + shift[0] * jump, 0, height - 1), np.clip(u + shift[1] * jump, 0, width - 1)]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        disparity = model.disparity(strayed) + model.noise * smooth
-        disparity = np.round(disparity / model.subpixel) * model.subpixel
-        measured = model.focal * model.baseline / disparity
-    lost = ~np.isfinite(strayed) | ~valid
-    lost |= jump & (loss < model.edge_loss)
-    lost |= cosine < model.grazing * (0.7 + 0.6 * lottery)
-    lost |= loss < model.dropout
-    lost |= _shadow(depth, intrinsics, model)
-    measured = np.round(measured * 1000) / 1000
-    lost |= ~(measured >= model.near) | ~(measured <= model.far)
-    measured[lost] = np.nan
-    return measured.astype(np.float32)
+    return Sight.of(depth, cosine, intrinsics, model).measured(noise)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """True depth with what of it chance does not change, so that a camera at rest before things at rest need not work it out for each frame.
+
+    depth (H, W) metres, NaN where nothing is; disparity (H, W) pixels; jump (2, N): rows and columns of pixels beside a jump of the depth; lost (H, W) bool:
+    where nothing is, or the second imager sees nothing; cosine (H, W).
+    """
+
+    depth: NDArray[np.float32]
+    disparity: NDArray[np.float32]
+    jump: NDArray[np.int64]
+    lost: NDArray[np.bool_]
+    cosine: NDArray[np.float32]
+    model: DepthModel
+
+    @classmethod
+    def of(cls, depth: NDArray[np.float32], cosine: NDArray[np.float32], intrinsics: Intrinsics, model: DepthModel) -> Sight:
+        """Of true depth, smeared where the model does."""
+        valid = np.isfinite(depth)
+        true = np.where(valid, depth, 0.0).astype(np.float32)
+        window = np.ones((2 * model.edge_width + 1,) * 2, np.uint8)
+        known = np.where(valid, depth, model.far).astype(np.float32)
+        # A slope changes depth too: only what exceeds the slope of a steep plane counts as a jump.
+        footprint = 2 * model.edge_width * true / intrinsics.fx
+        jump = (cv2.dilate(known, window) - cv2.erode(known, window)) > model.edge + 2.0 * footprint
+        with np.errstate(divide="ignore", invalid="ignore"):
+            disparity = model.disparity(depth)
+        return cls(depth, disparity, np.stack(np.nonzero(jump)), ~valid | _shadow(depth, intrinsics, model), cosine, model)
+
+    def measured(self, noise: Noise) -> NDArray[np.float32]:
+        """(H, W): what the sensor makes of it, metres in whole millimetres, NaN where there is none."""
+        model, (rows, columns) = self.model, self.jump
+        height, width = self.depth.shape
+        # Near a jump a pixel takes the depth of one of its neighbours.
+        down, right = noise.shift[:, rows, columns]
+        strayed = self.depth[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
+        disparity, lost = self.disparity.copy(), self.lost.copy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            disparity[rows, columns] = model.disparity(strayed)
+            disparity = disparity + model.noise * noise.smooth
+            disparity = np.round(disparity / model.subpixel) * model.subpixel
+            measured = model.focal * model.baseline / disparity
+        lost[rows, columns] |= ~np.isfinite(strayed) | (noise.loss[rows, columns] < model.edge_loss)
+        lost |= self.cosine < model.grazing * (0.7 + 0.6 * noise.lottery)
+        lost |= noise.loss < model.dropout
+        measured = np.round(measured * 1000) / 1000
+        lost |= ~(measured >= model.near) | ~(measured <= model.far)
+        measured[lost] = np.nan
+        return measured.astype(np.float32)
 
 
 def smeared(depth: NDArray[np.float32], intrinsics: Intrinsics, seed: int | Sequence[int], model: DepthModel) -> NDArray[np.float32]:
@@ -299,10 +324,18 @@ def expose(
     of the angle between ray and surface normal."""
     noise = noise or Noise.draw(depth.shape, seed, model)
     measured = degrade(depth, cosine, intrinsics, [*np.atleast_1d(seed), 0], model, noise)
-    image = cv2.GaussianBlur(image, (0, 0), 0.6)
-    image += noise.color
-    color = np.clip(image, 0, 255).astype(np.uint8)
+    color = colored(sharp(image), noise)
     return RgbdFrame(color, measured, intrinsics, np.asarray(world_from_camera, dtype=float), camera, stamp)
+
+
+def sharp(image: NDArray[np.floating]) -> NDArray[np.floating]:
+    """A lit image (H, W, 3) as sharp as the lens makes it."""
+    return cv2.GaussianBlur(image, (0, 0), 0.6)
+
+
+def colored(image: NDArray[np.floating], noise: Noise) -> NDArray[np.uint8]:
+    """The colour picture (H, W, 3) of what the lens makes of a lit image."""
+    return np.clip(image + noise.color, 0, 255).astype(np.uint8)
 
 
 def scene_raycaster(meshes: Sequence[Mesh], table: Mesh | None = None) -> Raycaster:

@@ -65,7 +65,7 @@ class Camera:
         self._layers: dict[str, _Layer] = {}
         self._table = self._cast_table()
         self._noise = _draws(name, (intrinsics.height, intrinsics.width))
-        self._all: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]] | None = None
+        self._all: tuple[NDArray[np.float32], sensor.Sight] | None = None
 
     def _cast_table(self) -> _Layer:
         caster = Raycaster([sensor.table_mesh()])
@@ -88,12 +88,13 @@ class Camera:
         for name in changed:
             self._layers[name] = self._cast(name, np.array(poses[name], dtype=float))
         if self._all is None or changed or gone:
-            self._all = self._compose()
-        depth, cosine, image = self._all
+            depth, cosine, image = self._compose()
+            self._all = sensor.sharp(image), sensor.Sight.of(depth, cosine, self.intrinsics, sensor.DepthModel())
+        image, sight = self._all
         chance = np.random.default_rng(seed)
-        noise = self._noise[chance.integers(DRAWS)].rolled(*chance.integers(0, depth.shape))
-        pose = self.world_from_camera
-        return sensor.expose(image, depth, cosine, self.intrinsics, pose, seed, camera=self.name, stamp=stamp, noise=noise)
+        noise = self._noise[chance.integers(DRAWS)].rolled(*chance.integers(0, image.shape[:2]))
+        color, measured = sensor.colored(image, noise), sight.measured(noise)
+        return RgbdFrame(color, measured, self.intrinsics, self.world_from_camera, self.name, stamp)
 
     def _same(self, name: str, pose: Array) -> bool:
         layer = self._layers.get(name)

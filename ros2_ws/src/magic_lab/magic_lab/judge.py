@@ -20,7 +20,7 @@ from magic_lab.scenarios import Scene
 from magic_lab.world import PLANE, SETTINGS, Thing
 from magic_verifier.floating import TARGET, TOOL, Body, Setup, fill_world
 from magic_verifier.goals import Judgement, goal_test
-from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, usable_pieces
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, to_poses, usable_pieces
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,8 @@ class Replay:
         self._steps, self._told = 0, round(self.duration * SETTINGS.frequency)
         at = track.times[0] + np.arange(self._told + 1) / SETTINGS.frequency
         moving = ((TOOL, tool), (TARGET, scene.target)) if true.kind != STATIC else ((TOOL, tool),)
-        self._ways = {name: transforms.interpolate(track.times, track.poses[thing], at) for name, thing in moving}
+        ways = {name: transforms.interpolate(track.times, track.poses[thing], at) for name, thing in moving}
+        self._ways = {name: (to_poses(way), np.diff(way[:, :3, 3], axis=0) * SETTINGS.frequency) for name, way in ways.items()}
         self.release_time = None if self._gone is None else float(track.times[self._gone] - track.times[0])
         self.world = fill_world(self.setup, KINEMATIC if self._gone is None else DYNAMIC)
         self.phases = (Phase("goal", *self._pull()),)
@@ -147,11 +148,10 @@ class Replay:
     def advance(self) -> None:
         """Go on by a step, from where tool and target were; beyond the last sample physics alone goes on."""
         if self._steps < self._told:
-            for name, way in self._ways.items():
-                before, after = way[self._steps : self._steps + 2]
-                self.world.place(name, before)
+            for name, (poses, speeds) in self._ways.items():
+                self.world.put(name, poses[self._steps])
                 if not self.world.component(name).kinematic:
-                    self.world.set_velocity(name, (after - before)[:3, 3] * SETTINGS.frequency)
+                    self.world.set_velocity(name, speeds[self._steps])
         self.world.step()
         self._steps += 1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,9 +39,9 @@ from magic_verifier.cases import Case
 
 Array = NDArray[np.float64]
 
-#: Ticks between two messages of each kind: /clock at 25 Hz, /tf at 20 Hz (robot_state_publisher's own), the truth at 20 Hz; and s between two words of a
+#: Ticks between two messages of each kind: /clock at 10 Hz, /tf at 20 Hz (robot_state_publisher's own), the truth at 20 Hz; and s between two words of a
 #: trajectory's feedback.  Each message on /clock wakes every node.
-CLOCK_EVERY, TF_EVERY, TRUTH_EVERY, FEEDBACK = 4, 5, 5, 0.05
+CLOCK_EVERY, TF_EVERY, TRUTH_EVERY, FEEDBACK = 10, 5, 5, 0.05
 #: How far this clock may be behind the wall's before the difference is given up, s: it never runs faster to catch up.
 BEHIND = 0.05
 #: How long a reset may take, s.
@@ -59,7 +59,7 @@ class LabNode(Node):
         /clock: its own, which follows the wall's at ``rate`` and is slower where the machine is: every other node needs use_sim_time.
         For each camera NAME, left and right, at ``camera_rate``: ``camera/NAME/color/image_raw`` (rgb8), ``color/camera_info``,
         ``aligned_depth_to_color/image_raw`` (16UC1, mm), ``aligned_depth_to_color/camera_info``; ``joint_states`` at 100 Hz;
-        /tf (the arm's links, 50 Hz), /tf_static (cameras, fixed links); ``known_objects`` (latched): the scene's fixtures.
+        /tf (the arm's links, 20 Hz), /tf_static (cameras, fixed links); ``known_objects`` (latched): the scene's fixtures.
         ``lab/truth`` (tf2_msgs/TFMessage, 20 Hz): where everything truly is, for judging alone.
     Serves
         ``trajectory_action`` (control_msgs/FollowJointTrajectory), ``gripper_action`` (control_msgs/GripperCommand), and
@@ -259,16 +259,12 @@ class LabNode(Node):
             )
             if tick % TF_EVERY == 0:
                 moving = [joint for joint in self.robot.joints.values() if joint.name in positions]
-                self._tf_out.publish(
-                    TFMessage(
-                        transforms=[
-                            self._transform(j.parent, j.child, j.parent_from_joint @ j.motion(positions[j.name]), stamp) for j in moving
-                        ]
-                    )
-                )
+                places = [(j.parent, j.child, j.parent_from_joint @ j.motion(positions[j.name])) for j in moving]
+                self._tf_out.publish(TFMessage(transforms=self._transforms(places, stamp)))
         if tick % TRUTH_EVERY == 0:
             truth = {**lab.world.poses(), TCP: lab.world.tcp(), **{name + PUT: pose for name, pose in lab.put.items()}}
-            self._truth_out.publish(TFMessage(transforms=[self._transform(self._base, name, pose, stamp) for name, pose in truth.items()]))
+            places = [(self._base, name, pose) for name, pose in truth.items()]
+            self._truth_out.publish(TFMessage(transforms=self._transforms(places, stamp)))
         if tick % self._picture_every == 0:
             self._photograph(lab, positions, stamp)
 
@@ -286,25 +282,26 @@ class LabNode(Node):
                     self._camera_out[name] = self.create_publisher(type(message), name, qos.RELIABLE)
                 self._camera_out[name].publish(message)
 
-    def _transform(self, parent: str, child: str, pose: Array, stamp: float) -> TransformStamped:
+    def _transforms(self, places: Sequence[tuple[str, str, Array]], stamp: float) -> list[TransformStamped]:
+        """Of parents, children and poses parent_from_child (4, 4)."""
         names = {self.robot.base: self._base}
-        return TransformStamped(
-            header=cv.header(names.get(parent, parent), stamp), child_frame_id=child, transform=cv.transform_to_msg(pose)
-        )
+        return [
+            TransformStamped(header=cv.header(names.get(parent, parent), stamp), child_frame_id=child, transform=transform)
+            for (parent, child, _), transform in zip(places, cv.transforms_to_msgs(np.stack([pose for *_, pose in places])), strict=True)
+        ]
 
     def _static(self) -> list[TransformStamped]:
         """The cameras as calibrated, each with its driver's frames, and the links that do not move."""
-        found = []
+        places: list[tuple[str, str, Array]] = []
         for camera in self._cameras:
             name = camera.name
-            chain = (
+            places += (
                 (self._base, f"{name}_link", camera.world_from_camera @ transforms.inverse(OPTICAL)),
                 (f"{name}_link", f"{name}_color_frame", np.eye(4)),
                 (f"{name}_color_frame", f"{name}_color_optical_frame", OPTICAL),
             )
-            found += [self._transform(parent, child, pose, self.now) for parent, child, pose in chain]
-        fixed = [joint for joint in self.robot.joints.values() if joint.name not in self.robot.moving]
-        return [*found, *(self._transform(j.parent, j.child, j.parent_from_joint, self.now) for j in fixed)]
+        places += [(j.parent, j.child, j.parent_from_joint) for j in self.robot.joints.values() if j.name not in self.robot.moving]
+        return self._transforms(places, self.now)
 
     def _report(self) -> list[DiagnosticStatus]:
         lab = self.lab

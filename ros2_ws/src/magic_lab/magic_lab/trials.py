@@ -149,7 +149,7 @@ class Session:
         from magic_core import conversions as cv
 
         self.seen.first.setdefault(f"/camera/{camera}/color/image_raw", message)
-        small = cv2.resize(cv.color_from_msg(message)[:, :, ::-1], SIZE, interpolation=cv2.INTER_AREA)
+        small = cv2.cvtColor(cv2.resize(cv.color_from_msg(message), SIZE), cv2.COLOR_RGB2BGR)
         self.seen.pictures.append((cv.time_from_msg(message.header.stamp), camera, cv2.imencode(".jpg", small)[1].tobytes()))
 
     # ------------------------------------------------------------ what is done
