@@ -480,18 +480,29 @@ class ClosedLoop:
     # ------------------------------------------------------------ the goal
 
     def _judge(self, job: Job) -> str:
-        """Look whether the goal is met, twice, so that what moves is seen to move; raises GOAL_MISSED, GOAL_UNSEEN."""
+        """Look whether the goal is met, twice, so that what moves is seen to move, and on while what may come to rest is all that speaks against it; raises
+        GOAL_MISSED, GOAL_UNSEEN."""
         settle, apart = seen_goal.patience(self._strategy, self._settings.accuracy)
         self._say("looking whether the goal is met")
-        first = self._fresh(self._now() + max(settle, SETTLED))
-        second = None
-        if first is not None:
-            stamp = conversions.time_from_msg(first.header.stamp)
-            second = self._fresh(max(stamp + apart, math.nextafter(stamp, math.inf)))
-        if first is None or second is None:
-            raise MagicError(
-                Code.GOAL_UNSEEN, f"carried out, but no picture came within {self._settings.look_time:g} s that shows what came of it"
-            )
+        begin = self._now()
+        look = self._fresh(begin + max(settle, SETTLED))
+        while True:
+            first, look = look, None if look is None else self._fresh(_later(look, apart))
+            if first is None or look is None:
+                raise MagicError(
+                    Code.GOAL_UNSEEN, f"carried out, but no picture came within {self._settings.look_time:g} s that shows what came of it"
+                )
+            seen = self._seen_goal(job, first, look)
+            if not seen.moving or self._now() >= begin + settle + seen_goal.CALMING:
+                break
+        if seen.met is None:
+            raise MagicError(Code.GOAL_UNSEEN, f"carried out, but whether the goal is met cannot be told by what is seen: {seen.message}")
+        if not seen.met:
+            raise MagicError(Code.GOAL_MISSED, f"carried out, but the goal is not met by what is seen: {seen.message}")
+        return seen.message
+
+    def _seen_goal(self, job: Job, first: SceneObjectArray, second: SceneObjectArray) -> seen_goal.SeenGoal:
+        """The goal asked of two looks after the motion."""
         outcome = job.outcome
         names = {"tool": outcome.tool_id, "target": outcome.target_id}
         table = conversions.plane_from_msg(first.table)
@@ -500,12 +511,7 @@ class ClosedLoop:
         away = None if let_go is None else float(np.linalg.norm((self._server.hand() - let_go)[:3, 3]))
         hand = seen_goal.Hand(self._held is None, away, self._arm_surface())
         phases = [phase.name for phase in outcome.plan.phases]
-        seen = seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
-        if seen.met is None:
-            raise MagicError(Code.GOAL_UNSEEN, f"carried out, but whether the goal is met cannot be told by what is seen: {seen.message}")
-        if not seen.met:
-            raise MagicError(Code.GOAL_MISSED, f"carried out, but the goal is not met by what is seen: {seen.message}")
-        return seen.message
+        return seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
 
     def _arm_surface(self) -> NDArray[np.float64]:
         """Points (N, 3) on arm and hand where the joints are now."""
@@ -579,6 +585,12 @@ def contact_time(plan: MotionPlan) -> float:
     """When the tool may first touch the target, s of the plan: as soon as it is in the hand where no phase says."""
     starts = [p.start for p in plan.phases if p.name in CONTACT_PHASES]
     return min(starts, default=plan.grasp_time)
+
+
+def _later(scene: SceneObjectArray, seconds: float) -> float:
+    """The stamp of the next look that is at least so much later than one, s."""
+    stamp = conversions.time_from_msg(scene.header.stamp)
+    return max(stamp + seconds, math.nextafter(stamp, math.inf))
 
 
 def _places(candidate: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

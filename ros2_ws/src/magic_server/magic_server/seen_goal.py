@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,7 +33,9 @@ Array = NDArray[np.float64]
 
 #: What no camera tells.
 UNASKED = frozenset({"masses", "history", "trying"})
-#: Points that stand for a surface.
+#: Points that stand for a surface lie about so far apart, m, much nearer than its place is known: what touches is as near as points are. At most so many.
+SPACING, MOST = 0.002, 20000
+#: Points that stand for a link of the arm.
 SURFACE = 1000
 #: The gripper, by the names that goals have for it.
 HAND = ("hand", "arm", "fingers")
@@ -41,6 +43,8 @@ HAND = ("hand", "arm", "fingers")
 ENDING = ("retreat",)
 #: Looks are put no farther apart than this to tell slow motions, s.
 APART = 5.0
+#: What a goal lets come to rest is looked at for so long, s: a simulation calms it, by itself a thing that hangs swings on.
+CALMING = 20.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,9 @@ class Thing:
         corners = transforms.apply(world_from_object, mesh.vertices)
         surface = mesh.vertices
         if len(mesh.faces):
-            surface = np.concatenate([surface, trimesh.sample.sample_surface(mesh.to_trimesh(), SURFACE, seed=0)[0]])
+            body = mesh.to_trimesh()
+            count = min(MOST, int(np.ceil(body.area / SPACING**2)))
+            surface = np.concatenate([surface, trimesh.sample.sample_surface(body, count, seed=0)[0]])
         return cls(transforms.apply(world_from_object, surface), (corners.min(axis=0) + corners.max(axis=0)) / 2)
 
     @property
@@ -80,10 +86,11 @@ class Sight:
 
 @dataclass(frozen=True)
 class SeenGoal:
-    """met: whether the goal is met, ``None`` where it cannot be told; message: by what."""
+    """met: whether the goal is met, ``None`` where it cannot be told; message: by what; moving: it would be met if what the goal lets come to rest were at rest."""
 
     met: bool | None
     message: str
+    moving: bool = False
 
 
 @dataclass(frozen=True)
@@ -133,7 +140,11 @@ def judge(
     if found is None:
         return SeenGoal(None, "none of it shows")
     unasked = dict.fromkeys(asked.unasked) if found.truth else ()
-    return SeenGoal(found.truth, "; ".join(filter(None, (found.text, f"not looked at: {', '.join(unasked)}" if unasked else ""))))
+    moving = False
+    if not found.truth:
+        calm = replace(asked, calm=True, unasked=[]).node(strategy.goal.tree, True)
+        moving = calm is not None and calm.truth is True
+    return SeenGoal(found.truth, "; ".join(filter(None, (found.text, f"not looked at: {', '.join(unasked)}" if unasked else ""))), moving)
 
 
 @dataclass
@@ -147,14 +158,18 @@ class _Asked:
     table: Array
     hand: Hand
     accuracy: float
+    #: What the goal lets come to rest is taken to be at rest.
+    calm: bool = False
     #: What was left out, in words.
     unasked: list[str] = field(default_factory=list)
 
     # ------------------------------------------------------------ the tree
 
-    def node(self, node: Node, plain: bool) -> _Told | None:
-        """The answer of a node; ``None`` where it is left out.  plain: there is no 'any' or 'not' above, so that it may be."""
+    def node(self, node: Node, plain: bool, rests: bool = False) -> _Told | None:
+        """The answer of a node; ``None`` where it is left out.  plain: there is no 'any' or 'not' above, so that it may be.  rests: it is asked when something
+        has come to rest."""
         moment = node.after
+        rests = rests or (moment is not None and moment.kind == "rest")
         if (moment is not None and moment.kind == "push") or (node.kind in PREDICATES and UNASKED & set(PREDICATES[node.kind].needs)):
             if not plain:
                 return _Told(None, f"that {node_words(node)}: no look tells")
@@ -164,9 +179,9 @@ class _Asked:
         if moment is not None and moment.kind == "phase" and not self.at_the_end(moment.args["phase"]):
             return _Told(None, f"that {node_words(node)}: it was not looked at then")
         if node.kind in PREDICATES:
-            return self.leaf(node, plain)
+            return _Told(True, "") if self.calm and rests and node.kind == "at_rest" else self.leaf(node, plain)
         plain = plain and node.kind == "all"
-        found = [answer for child in node.of if (answer := self.node(child, plain)) is not None]
+        found = [answer for child in node.of if (answer := self.node(child, plain, rests)) is not None]
         if not found:
             return None
         if node.kind == "not":

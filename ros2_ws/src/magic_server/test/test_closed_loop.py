@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -404,3 +405,21 @@ def test_a_goal_is_asked_with_the_motions_phases_and_the_hand_as_it_is(bench, mo
     assert before.stamp < first.stamp < second.stamp and set(second.things) == {"object_1", "object_2"}
     let_go, gone = (ROBOT.forward(np.full(7, angle))[0][:3, 3] for angle in (0.2, 0.3))
     assert hand.released and hand.away == pytest.approx(np.linalg.norm(gone - let_go), abs=1e-6)
+
+
+@pytest.mark.parametrize("rests, code", [(True, Code.OK), (False, Code.GOAL_UNSEEN)])
+def test_what_swings_is_looked_at_until_it_rests_and_not_for_ever(bench, monkeypatch, rests, code):
+    looked = []
+
+    def judge(_strategy, _names, _phases, looks, *_):
+        looked.append((looks[1].stamp, looks[2].stamp))
+        over = rests and len(looked) == 3
+        return seen_goal.SeenGoal(True if over else None, "as it should be" if over else "it swings", not over)
+
+    monkeypatch.setattr(seen_goal, "judge", judge)
+    monkeypatch.setattr(seen_goal, "CALMING", 20.0 if rests else 1.0)
+    bench.fakes.on_plan = letting_go
+    bench.server._loop = replace(bench.usual, judge=True, watch=False, look=False)
+    run(bench, code)
+    assert all(after[0] == before[1] for before, after in pairwise(looked))
+    assert len(looked) == 3 if rests else 1 < len(looked) < 20

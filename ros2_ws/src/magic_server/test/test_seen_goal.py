@@ -96,6 +96,29 @@ def test_a_ring_on_a_rod_is_seen_to_hang(where, hand, met, says):
     assert found.met is met and says in found.message, found.message
 
 
+@pytest.mark.parametrize(
+    "swung, height, met, moving",
+    [(0.0, 0.376, True, False), (0.018, 0.376, None, True), (0.04, 0.376, False, True), (0.04, 0.1, False, False)],
+)
+def test_what_swings_would_be_met_at_rest_and_what_fell_would_not(swung, height, met, moving):
+    phases = ("grasp", "transfer", "contact", "release", "retreat")
+    places = [{**STAND, "object_1": at(0.5, y, height, UPRIGHT)} for y in (swung, 0.0)]
+    found = asked("hang", STAND, places[1], AWAY, then=places[0], phases=phases)
+    assert (found.met, found.moving) == (met, moving), found.message
+
+
+def test_what_touches_in_one_place_is_not_seen_apart():
+    """Points that stand for surfaces lie beside the place where they touch, not on it."""
+    cup, rod = from_trimesh(trimesh.creation.annulus(0.04, 0.045, 0.1)), ROD.transformed(transforms.from_rpy(np.pi / 4, 0.0, 0.0))
+    now = {"object_1": at(0.5, 0.0, 0.4, cup), "object_2": at(0.5, 0.045 + 0.006 * np.sqrt(2), 0.4, rod)}
+    assert asked(tree({"touching": {"what": "tool", "whom": "target"}}), BESIDE, now, accuracy=0.002).met
+
+
+def test_what_rolls_on_after_it_had_to_stand_is_not_waited_for():
+    found = asked("hook", BESIDE, {**BESIDE, "object_2": at(0.2)}, then={**BESIDE, "object_2": at(0.28)}, seconds=0.1)
+    assert found.met is False and not found.moving
+
+
 def test_what_hangs_beside_something_else_may_hang_on_that():
     now = {**STAND, "object_1": at(0.5, 0.0, 0.376, UPRIGHT), "object_3": at(0.5, 0.0, 0.31)}
     found = asked("hang", STAND, now, AWAY)
