@@ -28,6 +28,7 @@ from magic_core import presence, presets
 from magic_core.diagnostics import Diagnostics, status
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
+from magic_core.listening import join_all
 from magic_core.robot_description import file_of
 
 #: What a node is given to wind down while messages still flow, and then its callbacks to end, s.
@@ -102,6 +103,7 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        join_all()
     if not ended:  # Python would wait for such a thread without a limit
         print("a callback has not ended in time and is left", file=sys.stderr, flush=True)
         os._exit(status)

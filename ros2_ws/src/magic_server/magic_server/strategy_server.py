@@ -27,6 +27,7 @@ from magic_core import conversions, presence, qos
 from magic_core import strategy as strategies
 from magic_core.diagnostics import Diagnostics, clock_complaint, status
 from magic_core.errors import Code, MagicError
+from magic_core.listening import listen_apart
 from magic_core.node import RESULT_TIMEOUT, describe, robot_parameters, run
 from magic_core.open_words import OpenWords
 from magic_core.robot import Description, RobotConfig
@@ -136,12 +137,12 @@ class StrategyServer(LifecycleNode):
         self._outlet = Outlet(self, self.robot.base_frame)
         self.publication = Publication(self._outlet, self.world, self._limits)
         # What comes on a topic is taken in the order in which it came: two at a time, the older could be the one that stays.
-        one, two, three = (MutuallyExclusiveCallbackGroup() for _ in range(3))
+        one, two = (MutuallyExclusiveCallbackGroup() for _ in range(2))
         self.objects_topic = self.create_subscription(
             SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=one
         ).topic_name
-        self.create_subscription(JointState, "joint_states", self._on_joints, qos.STATES, callback_group=two)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=three)
+        listen_apart(self, JointState, "joint_states", self._on_joints, qos.STATES)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=two)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self._frames_pub = self.create_publisher(TFMessage, "/tf_static", qos.LATCHED)
         self._held_pub = self.create_publisher(SceneObjectArray, "in_hand", qos.LATCHED)
