@@ -26,6 +26,7 @@ from magic_core import devices, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
+from magic_core.listening import listen_apart
 from magic_core.node import describe, parameter, robot_parameters, run
 from magic_core.qos import LATCHED, SENSOR, STATES
 from magic_core.robot import Description, RobotConfig
@@ -125,6 +126,9 @@ class Perception(Node):
         self.tracker = Tracker()
         # What the last scene was made of, and the scene.
         self.looked: tuple[list[RgbdFrame], tuple[SceneObject, ...], Scene] | None = None
+        # The message of it, and the scene whose markers nobody has seen yet.
+        self.told: SceneObjectArray | None = None
+        self.unshown: Scene | None = None
         # By topic: calibrated fixtures, and what other software knows of.
         self.known: dict[str, tuple[SceneObject, ...]] = {}
         self.known_problems: dict[str, tuple[Code, str]] = {}
@@ -154,8 +158,8 @@ class Perception(Node):
         if self.robot is not None:
             # Not behind the images: who is cut out by a state that is missing is not cut out.
             self.listen(SceneObjectArray, "in_hand", self.on_held, LATCHED, inputs)
-            self.create_subscription(JointState, "joint_states", self.on_joints, STATES, callback_group=MutuallyExclusiveCallbackGroup())
-        wall_timer(self, min(0.05, self.period / 4), self.on_work, work)
+            listen_apart(self, JointState, "joint_states", self.on_joints, STATES)
+        wall_timer(self, min(0.1, self.period / 4), self.on_work, work)
         wall_timer(self, 0.5, self.on_look, report)
         self.diagnostics = Diagnostics(self, self.on_report, report)
         self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
@@ -394,7 +398,7 @@ class Perception(Node):
             with self.lock:
                 known = tuple(item for items in self.known.values() for item in items)
             if (kept := self.same(frames, known)) is not None:
-                self.publish(kept)
+                self.publish(kept, kept=True)
                 self.done += 1
                 return
             report = Report(notes=notes)
@@ -518,8 +522,8 @@ class Perception(Node):
             return None
         if newest < self.done_stamp - 1.0:
             self.done_stamp = -math.inf  # a bag began again
-        if newest <= self.done_stamp and not self.again:
-            return None
+        if newest - self.done_stamp < self.period * (1 - 1e-6) and not self.again:
+            return None  # the next scene's stamp is still to come
         streams = []
         for camera, stream in self.streams.items():
             silent = now - max(stream.last.get("pair", -math.inf), self.resumed)
@@ -648,17 +652,31 @@ class Perception(Node):
                 raise
         return frame
 
-    def publish(self, scene: Scene) -> None:
-        """Objects and markers."""
-        self.objects_out.publish(cv.scene_to_msg(scene))
-        self.markers_out.publish(pc.markers(scene))
+    def publish(self, scene: Scene, kept: bool = False) -> None:
+        """Objects and markers; kept: nothing but the stamp is other than what was published last."""
+        if kept and self.told is not None:
+            self.told.header.stamp = cv.time_to_msg(scene.stamp)
+            for item in self.told.objects:
+                item.cloud.header.stamp = self.told.header.stamp
+        else:
+            self.told, self.unshown = cv.scene_to_msg(scene), scene
+        self.objects_out.publish(self.told)
+        self.show()
+
+    def show(self) -> None:
+        """Markers, once for a scene, as soon as somebody is there to see them: making them takes as long as all else of publishing."""
+        scene = self.unshown
+        if scene is not None and self.markers_out.get_subscription_count():
+            self.unshown = None
+            self.markers_out.publish(pc.markers(scene))
 
     # ------------------------------------------------------------ diagnostics
 
     def on_look(self) -> None:
-        """Look twice a second for images that come compressed only."""
+        """Look twice a second for images that come compressed only, and for who wants to see markers."""
         try:
             self.find_compressed()
+            self.show()
         except Exception as error:
             self.get_logger().error(describe(self, error)[1], throttle_duration_sec=5.0)
 

@@ -16,6 +16,8 @@ from magic_core.self_filter import Body, Margins, SelfFilter, shown
 
 #: Joint states that ended so long before a picture, s, say nothing of it: nobody sends them any more.
 SILENT = 2.0
+#: No part of an arm is farther than this from any of its axes, m.
+REACH = 1.5
 #: What a thing in the hand may be off where it is said to be, m: the closing fingers turn it.
 IN_HAND = 0.01
 #: What is drawn of it is it, but for the pixels at its edge, and noise.
@@ -58,8 +60,11 @@ class RobotInView:
         known = self.history.known()
         fingers = [joint.name for joint in self.robot.fingers]
         names = [*self.robot.names, *(name for name, joint in self.robot.joints.items() if joint.moves and name in known)]
-        states = [self.history.at(names, stamp, self.age)]
-        states += [self.history.at(names, at, self.age + self.slack) for at in (stamp - self.slack, stamp + self.slack)]
+        here = self.history.at(names, stamp, self.age)
+        states = [self.history.at(names, at, self.age + self.slack) for at in (stamp - self.slack, stamp + self.slack)]
+        # What is between two places is within the margin of them where they are near each other.
+        if sum(abs(states[0][name] - states[1][name]) for name in names) * REACH > 2 * self.filter.margins.space:
+            states.append(here)
         told = [i for i, name in enumerate(fingers) if name in known]
         shares = [0.0, 0.5, 1.0] if not told else [None]
         return [self._with_fingers(state, share, told) for state in states for share in shares]

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
@@ -70,12 +71,12 @@ class Cut:
 
 
 class Body:
-    """A rigid shape that is drawn: the vertices (V, 3) of its mesh, and Open3D's scene of rays."""
+    """A rigid shape that is drawn: the corners (V, 3) of its convex hull, which bound it in every picture, and Open3D's scene of rays."""
 
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
 
-        self.vertices, self._tensor = np.unique(mesh.vertices, axis=0), o3d.core.Tensor
+        self.vertices, self._tensor = _corners(mesh.vertices), o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32)))
 
@@ -91,7 +92,8 @@ class Body:
         if corners[:, 2].min() <= NEAR:
             c0, c1, r0, r1 = 0, width, 0, height
         else:
-            low, high = (edge(k.project(corners), axis=0) / STEP for edge in (np.min, np.max))
+            seen = k.project(corners) / STEP
+            low, high = seen.min(axis=0), seen.max(axis=0)
             c0, r0 = (max(int(np.floor(x)) - pad - 1, 0) for x in low)
             c1, r1 = (min(int(np.ceil(x)) + pad + 2, most) for x, most in zip(high, (width, height), strict=True))
         if c0 >= c1 or r0 >= r1:
@@ -131,6 +133,15 @@ class _Cast:
     @property
     def _around(self) -> NDArray[np.uint8]:
         return np.ones((2 * self.pad + 1,) * 2, np.uint8)
+
+
+def _corners(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Those of points (N, 3) that are corners of their convex hull; all of them where they are flat."""
+    points = np.unique(vertices, axis=0)
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:
+        return points
 
 
 def _size(k: Intrinsics) -> tuple[int, int]:
