@@ -704,7 +704,8 @@ PARALLEL, FLAT, FACE, FACE_SHARE = 8.0, 0.004, 60, 0.15
 def _one_face(look: Looked, image: NDArray[np.int32], a: int, b: int) -> bool:
     """Whether upright faces of two labels lie in one plane, as those of a box do that something hides in its middle."""
     x, y, w, h = cv2.boundingRect(((image == a) | (image == b)).view(np.uint8))
-    cut = (slice(max(y - 8, 0), y + h + 8), slice(max(x - 8, 0), x + w + 8))
+    height, width = image.shape
+    cut = (slice(max(y - 8, 0), min(y + h + 8, height)), slice(max(x - 8, 0), min(x + w + 8, width)))
     points = look.points(*np.mgrid[cut])
     normal = convexity.normals(points, look.frame.world_from_camera[:3, 3])
     up = look.normal.astype(np.float32)

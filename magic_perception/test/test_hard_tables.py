@@ -18,7 +18,7 @@ from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces, _with_depth
+from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces, _one_face, _with_depth
 
 RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
 POSE = scenes.pose([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
@@ -176,3 +176,14 @@ def test_what_has_hardly_any_depth_of_its_own_is_no_thing():
     look = Looked(frame, heights, heights, np.ones(shape, bool), np.full(shape, 0.001, np.float32))
     (kept,) = _with_depth([labels], [look], Parameters())
     assert kept[40, 40] == 1 and kept.max() == 1
+
+
+@pytest.mark.parametrize(("behind", "one"), [(0.0, True), (0.05, False)])
+def test_a_face_that_the_picture_ends_is_one_with_what_lies_in_its_plane(behind, one):
+    labels = np.zeros((120, 160), np.int32)
+    labels[60:, 20:60], labels[60:, 100:] = 1, 2
+    depth = np.full(labels.shape, 0.8, np.float32)
+    depth[:, 100:] += behind
+    frame = RgbdFrame(np.zeros((*labels.shape, 3), np.uint8), depth, Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0), np.eye(4), "camera")
+    look = Looked(frame, depth, depth, np.ones(labels.shape, bool), np.full_like(depth, 0.001), np.array([0.0, -1.0, 0.0]))
+    assert _one_face(look, labels, 1, 2) == one
