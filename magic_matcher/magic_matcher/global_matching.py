@@ -127,14 +127,6 @@ def patch_side(n: int, share: float = PATCH_SHARE) -> int:
     return max(1, int(round(share * n)) // 2 * 2 + 1)
 
 
-def box_sums(features: NDArray[np.float32], m: int) -> NDArray[np.float32]:
-    """Sums (n, n, d) over the m x m neighbourhood of each token of a map (n, n, d), cut off at the border."""
-    return np.stack(
-        [cv2.boxFilter(features[..., k], -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT) for k in range(features.shape[-1])],
-        axis=-1,
-    )
-
-
 def pairs_similarity(patch: NDArray[np.float32], inside: NDArray[np.bool_], features: NDArray[np.float32]) -> NDArray[np.float32]:
     """The paper's s_dino at every token: the mean over all pairs of a patch's and the neighbourhood's tokens.
 

@@ -295,12 +295,6 @@ def solid(pieces: Iterable[Mesh]) -> Solid:
     return _SOLIDS.put(key, (hulls, made), len(faces) * TREE_BYTES + normals.nbytes + offsets.nbytes)[1]
 
 
-def face_planes(pieces: Iterable[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Outward unit normals (P, F, 3) and offsets (P, F) of the faces of P convex pieces: inside is where normals @ x <= offsets."""
-    known = solid(pieces)
-    return known.normals, known.offsets
-
-
 class Body:
     """A named rigid body of convex pieces that can be moved and asked what it touches."""
 

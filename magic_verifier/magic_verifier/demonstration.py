@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan, Phase, ToolMotion
-from magic_core.scene import CanonicalView, SceneObject
+from magic_core.scene import SceneObject
 from magic_core.strategy import Physics
 from magic_verifier.floating import TARGET, TOOL, FloatingRun, make_setup
 from magic_verifier.predicates import TOUCH
@@ -206,12 +206,3 @@ class _Stretch:
 
     def meeting(self) -> Meeting:
         return Meeting(self.first, self.last, *self.read(), self.moved[0], self.moved[-1])
-
-
-def distance_in_view(view: CanonicalView, point: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Distance in metres between two points (3,) of the object's frame as the canonical view shows them.
-
-    Contacts are modelled in the view's plane; how deep in the picture a point lies does not matter.
-    """
-    pixels = view.pixels(np.stack([point, other]))
-    return float(np.linalg.norm(pixels[0] - pixels[1])) * view.metres_per_pixel

@@ -85,8 +85,8 @@ COLUMNS_5 = (
 PAPER_5 = {"KETO": (66.4, 46.3, 71.7), "MAGIC": (75.6, 53.7, 76.3)}
 TASKS_FG = (("Scooping", "scooping"), ("Hanging", "hanging"), ("Hooking", "hooking"))
 #: Cases of a cell in the short run, by variant (see :func:`short`); negative controls; cases from images.
-QUICK = {"fg": 3, "fg_no_selection": 3, "arm": 1}
-QUICK_CONTROLS, QUICK_IMAGES = 2, {"fg": 2, "arm": 1}
+QUICK = {"fg": 5, "fg_no_selection": 5, "arm": 2}
+QUICK_CONTROLS, QUICK_IMAGES = 3, {"fg": 4, "arm": 2}
 #: The reports are written anew every so many seconds while cases run.
 REPORT_EVERY = 300.0
 NO_WEIGHTS = "no weights at hand"

@@ -153,11 +153,6 @@ def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]
     return chosen * np.where(largest < 0, -1.0, 1.0)
 
 
-def square_on(mesh: Mesh, direction: ArrayLike, kind: str) -> bool:
-    """Whether a direction (3,) looks at an object squarely: :func:`square_axis` gives an axis."""
-    return square_axis(mesh, direction, kind) is not None
-
-
 def square_axis(mesh: Mesh, direction: ArrayLike, kind: str) -> NDArray[np.float64] | None:
     """The principal axis (3,) of an object's surface along which, or against which, a direction (3,) looks, to 12 degrees; ``None`` where it is askew.
 
@@ -461,17 +456,12 @@ def _best_side(mesh: Mesh) -> tuple[NDArray[np.float64], float, float]:
     return direction, float(told[best]), confidence
 
 
-def long_axis(mesh: Mesh) -> NDArray[np.float64]:
-    """(3,): unit horizontal direction of the long principal axis of a mesh's area as seen from above.
+def _plan(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The unit long principal axis (3,), level, and the centroid (3,) of a mesh's area as seen from above.
 
     For a thing with an upright plane of symmetry along it (a spoon) the plane contains this axis, which does not hold
     for the side of the smallest box.
     """
-    return _plan(mesh)[0]
-
-
-def _plan(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The long axis (3,) and the centroid (3,) of a mesh's area as seen from above."""
     corners = mesh.vertices[mesh.faces]
     u, v = corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]
     # A closed mesh is seen from below and from above: the area counts twice, which does not matter here.

@@ -195,15 +195,6 @@ def test_the_section_of_a_spoon_is_its_profile() -> None:
     assert ball_view.mask.sum() * ball_view.metres_per_pixel**2 == pytest.approx(np.pi * 0.03**2, rel=0.01)
 
 
-def test_regions_can_be_painted_on_a_view() -> None:
-    hook = SHAPES["l_hook", 0]
-    view = hook.view(size=192)
-    mask = hook.region_mask(view, "inner", 0.004)
-    contact = hook.contact("inner", view)
-    u, v = np.round(contact.pixel).astype(int)
-    assert mask[v, u] and 0 < mask.mean() < 0.1
-
-
 def test_as_object_is_complete() -> None:
     pose = transforms.from_rpy(0.1, 0.2, 0.3, [0.4, 0.1, 0.2])
     item = SHAPES["caliper", 0].as_object("caliper", pose)

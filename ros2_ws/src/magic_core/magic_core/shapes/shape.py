@@ -86,16 +86,6 @@ class Shape:
             return section_view(self.mesh, self.view_direction, self.view_up, size)
         return canonical_view(self.mesh, self.view_direction, self.view_up, kind, size)
 
-    def region_mask(self, view: CanonicalView, name: str, tolerance: float) -> NDArray[np.bool_]:
-        """Pixels (H, W) of the view within ``tolerance`` metres of a region."""
-        height, width = view.mask.shape
-        v, u = np.mgrid[0:height, 0:width]
-        on_plane = view.points(np.stack([u, v], axis=-1).reshape(-1, 2).astype(float))
-        region = self.region(name)
-        depth = transforms.apply(transforms.inverse(view.object_from_view), region.points)[:, 2]
-        flat = Region(region.points - depth[:, None] * view.direction, region.normals, region.radius, region.concave)
-        return (flat.distance(on_plane) <= tolerance).reshape(height, width)
-
     def region(self, name: str) -> Region:
         """The region of that name; raises ``BAD_REQUEST`` naming those there are."""
         if name not in self.regions:
