@@ -15,6 +15,7 @@ the Panda's state broadcaster::
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -60,13 +61,14 @@ def _type_name(message: Any) -> str:
 class Recording:
     """A bag under construction; use it in a ``with`` statement.  Raises ``BAD_BAG`` where the folder exists.
 
-    Equal content gives equal bytes.  Stamps are seconds since the epoch.
+    Equal content gives equal bytes, unless ``repeatable`` is false, which takes half the time.  Stamps are seconds since the epoch.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, repeatable: bool = True) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self._writer = BagWriter(path)
+        self._repeatable = repeatable
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._topics: set[str] = set()
 
@@ -91,11 +93,11 @@ class Recording:
                     {k: v for k, v in get_types_from_msg(message_definition(name)[0], name).items() if k not in self._store.fielddefs}
                 )
         data = serialize_message(message)
-        try:
-            # Padding in DDS's serialisation is whatever was in memory; written once more, it is zero.
-            data = bytes(self._store.serialize_cdr(self._store.deserialize_cdr(data, name), name))
-        except SerdeError:
-            pass  # what the library cannot read over again is written as it is
+        if self._repeatable:
+            # Padding in DDS's serialisation is whatever was in memory; written once more, it is zero.  What the library cannot read over
+            # again is written as it is.
+            with contextlib.suppress(SerdeError):
+                data = bytes(self._store.serialize_cdr(self._store.deserialize_cdr(data, name), name))
         self._writer.write(topic, round(stamp * 1e9), data)
 
     def cameras(self, frames: Sequence[RgbdFrame], stamp: float) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 
 from magic_bringup.graph import Graph, peak_memory
 from magic_bringup.record import CAMERA_TOPIC, IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
-from magic_core import environment
+from magic_core import environment, viewerless
 from magic_core import strategy as strategies
 from magic_core.domain import isolated
 from magic_core.entry import version
@@ -320,6 +320,7 @@ class Demo:
     def _run(self) -> None:
         options = self.options
         environment.prepare()
+        viewerless.prepare()
         strategies.find(options.strategy)  # a wrong name is told before anything is started
         topics, self._length = look_into(options.bag, options.topics, options.cameras)
         env = isolated()

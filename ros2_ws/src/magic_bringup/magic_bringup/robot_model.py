@@ -98,13 +98,12 @@ class RobotModel(Node):
             ghost.update(zip(names, played(times, rows, time.monotonic() - began), strict=True))
         frames |= link_frames(self.robot, ghost, GHOST)
         stamp = self.get_clock().now().to_msg()
+        moved = conversions.transforms_to_msgs(np.stack(list(frames.values())))
         self._tf.publish(
             TFMessage(
                 transforms=[
-                    TransformStamped(
-                        header=Header(stamp=stamp, frame_id=parent), child_frame_id=child, transform=conversions.transform_to_msg(pose)
-                    )
-                    for (parent, child), pose in frames.items()
+                    TransformStamped(header=Header(stamp=stamp, frame_id=parent), child_frame_id=child, transform=transform)
+                    for (parent, child), transform in zip(frames, moved, strict=True)
                 ]
             )
         )

@@ -46,7 +46,7 @@ def write(record: Record, folder: Path) -> Path:
     path = folder / NAME
     shutil.rmtree(path, ignore_errors=True)
     start = datetime.datetime.fromisoformat(record.summary["date"]).timestamp()
-    with Recording(path) as bag:
+    with Recording(path, repeatable=False) as bag:
         bag.write("/strategy/summary", String(data=json.dumps(record.summary)), start, latched=True, depth=1)
         for topic, message in record.images.items():
             bag.write(topic if topic.startswith("/") else f"/{topic}", message, start)
@@ -95,11 +95,10 @@ def _tell(bag: Recording, result: Any, start: float) -> None:
             held = arm.grasp_time <= when and not (arm.release_time is not None and when > arm.release_time)
             width = arm.grasp_width if held else robot.config.opening
             positions |= dict(zip((joint.name for joint in robot.fingers), robot.finger_positions(width).tolist(), strict=True))
+            frames = link_frames(robot, positions)
             transforms = [
-                TransformStamped(
-                    header=conversions.header(parent, start + when), child_frame_id=child, transform=conversions.transform_to_msg(pose)
-                )
-                for (parent, child), pose in link_frames(robot, positions).items()
+                TransformStamped(header=conversions.header(parent, start + when), child_frame_id=child, transform=transform)
+                for (parent, child), transform in zip(frames, conversions.transforms_to_msgs(np.stack(list(frames.values()))), strict=True)
             ]
             messages.append((float(when), "/tf", TFMessage(transforms=transforms)))
     for when, topic, message in sorted(messages, key=lambda entry: entry[0]):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from magic_bringup import report
 from magic_bringup.record import Record, empty_summary, take, write_summary
-from magic_core import environment
+from magic_core import environment, viewerless
 from magic_core.errors import Code, MagicError
 from magic_lab.scenarios import SCENARIOS, case_of, scenario_of
 from magic_lab.trials import Session
@@ -36,6 +36,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         case = case_of(scenario, options.object, options.seed)
         environment.prepare()
+        viewerless.prepare()
         out.mkdir(parents=True, exist_ok=True)
         say(f"starting the graph and the laboratory: {scenario.name}, {case.name}, seed {options.seed}")
         with Session(out / "logs", say, pictures=True) as session:
