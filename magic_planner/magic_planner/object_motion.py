@@ -8,8 +8,8 @@ pose of the tool's contact frame in the target's:
 ``retarget`` takes C(t) from the demonstration, ``plan`` leads the squarely opposed
 frames through the strategy's waypoints.  A strategy may have several pairs of contacts.  Of one that waypoints name the
 frames are led at these waypoints as those of the first are at the others; between two such waypoints the tool turns
-evenly.  One that no waypoint names is met together with the first: the tool is turned about the first contact as suits all
-of them best (:mod:`magic_core.placement`).  Where the tool has no room to meet the target
+evenly.  One that no waypoint names is met together with the first: the tool is turned about the first contact, and shifted, as suits
+all of them best (:mod:`magic_core.placement`).  Where the tool has no room to meet the target
 at the contact itself, the contact slides along it (:mod:`magic_planner.sliding`); what
 the table still lacks raises the whole motion; what is still in the way is given way to
 (:mod:`magic_planner.giving_way`).
@@ -29,7 +29,7 @@ from magic_core import transforms
 from magic_core.contact import OPPOSED, Companion, Contact, ContactCandidate, turned_over
 from magic_core.errors import Code, MagicError
 from magic_core.motion import Phase, ToolMotion
-from magic_core.placement import Pairs, pairs_of, placement, relative, waypoint_poses
+from magic_core.placement import Pairs, pairs_of, relative, together, waypoint_poses
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
 from magic_planner.collision import Body, grown, outer_points, solid_pieces
@@ -190,7 +190,7 @@ def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[
 
 
 def placed_contact_frame(strategy: Strategy, candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:
-    """As :func:`tool_contact_frame`, turned about the contact so that further contacts, which no waypoint names, meet the target together with it.
+    """As :func:`tool_contact_frame`, turned and shifted so that further contacts, which no waypoint names, meet the target together with it.
 
     Raises BAD_REQUEST for a candidate that lacks contacts of the strategy.
     """
@@ -201,15 +201,16 @@ def placed_contact_frame(strategy: Strategy, candidate: ContactCandidate, reflec
         told = f"{given}, {lacking} without a target contact" if lacking else given
         raise MagicError(Code.BAD_REQUEST, f"further contacts of the candidate on {candidate.tool_id or 'the tool'}", told, names)
     named = {waypoint.contact for waypoint in strategy.waypoints}
-    together = [companion for companion in candidate.companions if companion.name not in named]
-    if not together or candidate.target is None:
+    at_once = [companion for companion in candidate.companions if companion.name not in named]
+    if not at_once or candidate.target is None:
         return frame
     first = _rigid(candidate.target.object_from_contact, "contact frame of the target") @ OPPOSED
-    wanted = [relative(first, c.target.object_from_contact @ OPPOSED) for c in together if c.target is not None]
-    found = [relative(frame, _further_frame(candidate, c, reflection)) for c in together]
-    size = max(float(np.hypot(*place.vector)) for place in (*wanted, *found))
-    angle = placement(wanted, found, (max(size, 1e-6), max(size, 1e-6))).angle
-    return frame @ transforms.from_rotvec([0.0, 0.0, angle])
+    wanted = [relative(first, c.target.object_from_contact @ OPPOSED) for c in at_once if c.target is not None]
+    found = [relative(frame, _further_frame(candidate, c, reflection)) for c in at_once]
+    pairs = [(candidate.tool, candidate.target), *((c.tool, c.target) for c in at_once)]
+    straight = [not all(np.isfinite(contact.radius) for contact in pair if contact is not None) for pair in pairs]
+    angle, shift = together(wanted, found, straight)
+    return frame @ transforms.from_rotvec([0.0, 0.0, angle]) @ transforms.make(translation=[*-shift, 0.0])
 
 
 def _further_frame(candidate: ContactCandidate, companion: Companion, reflection: str) -> NDArray[np.float64]:

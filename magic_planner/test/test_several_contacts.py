@@ -80,6 +80,24 @@ def test_a_contact_that_no_waypoint_names_turns_the_tool_to_meet_both():
     np.testing.assert_array_equal(placed_contact_frame(replace(plain, contacts=()), replace(candidate, companions=()), "keep"), first)
 
 
+def test_two_sides_of_a_corner_are_met_at_once_by_a_corner_of_other_lengths():
+    """Both straight sides lie on the target's, though the places that were told on them are at other distances from the corner."""
+    strategy, _, _, candidate = two_contacts()
+    plain = replace(strategy, waypoints=scenes.pulling().waypoints)
+
+    def side(point, normal):
+        return replace(scenes.contact(scenes.DOWN, point, normal), radius=np.inf)
+
+    far, flank = side([0.02, 0, 0], [1, 0, 0]), side([0, 0.025, 0], [0, 1, 0])
+    head, handle = side([0.2, -0.07, 0], [-1, 0, 0]), side([0.12, -0.01, 0], [0, -1, 0])
+    both = replace(candidate, tool=head, target=far, companions=(Companion("back", handle, flank),))
+    placed = far.object_from_contact @ OPPOSED @ transforms.inverse(placed_contact_frame(plain, both, "keep"))
+    for of_tool, of_target in ((head, far), (handle, flank)):
+        met, wanted = placed @ of_tool.object_from_contact, of_target.object_from_contact
+        np.testing.assert_allclose(met[:3, 0], -wanted[:3, 0], atol=1e-9)
+        assert abs((met[:3, 3] - wanted[:3, 3]) @ wanted[:3, 0]) < 1e-3
+
+
 def test_further_contacts_are_turned_over_with_the_tool():
     strategy, tool, target, candidate = two_contacts()
     flipped = replace(candidate, flipped=True)

@@ -25,6 +25,8 @@ Pairs = Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 ANGLE, LENGTH, SCALE = np.deg2rad(25.0), np.log(1.5), np.log(3.0)
 #: A vector shorter than this share of its tool's size has no direction.
 SHORT = 0.03
+#: Where a side is straight two that lie on each other may be so many times farther from where they were told along it than across it.
+ALONG = 10.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,32 @@ def placement(wanted: Sequence[Relative], found: Sequence[Relative], sizes: tupl
     if stretched:
         cost += np.mean(((np.array(stretched) - scale) / LENGTH) ** 2) + ((scale - np.log(sizes[1] / sizes[0])) / SCALE) ** 2
     return Placement(float(np.exp(-0.5 * cost)), angle, float(np.exp(scale)))
+
+
+def together(wanted: Sequence[Relative], found: Sequence[Relative], straight: Sequence[bool]) -> tuple[float, NDArray[np.float64]]:
+    """The turn (rad) about the first contact and then the shift (2,) m along its normal and tangent by which a tool meets its target at
+    several places at once.
+
+    wanted: where further contacts are on the target, seen from the first, normals as those of the tool that lies against it; found: where
+    they are on the tool.  straight: of the first contact and of each further one, whether tool or target is straight there: what lies on
+    a straight side may do so anywhere along it.
+    """
+    turned = [0.0, *(_wrapped(b.angle - a.angle) for a, b in zip(wanted, found, strict=True))]
+    for a, b, free in zip(wanted, found, straight[1:], strict=True):
+        # Where the one lies from the other says nothing of a side along which either may be.
+        if not free and not straight[0] and min(np.hypot(*a.vector), np.hypot(*b.vector)) > 0:
+            turned.append(_wrapped(float(np.arctan2(b.vector[1], b.vector[0]) - np.arctan2(a.vector[1], a.vector[0]))))
+    angle = float(np.angle(np.mean(np.exp(1j * np.array(turned)))))
+    back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    normals, gaps = [0.0, *(place.angle for place in wanted)], [np.zeros(2)]
+    gaps += [a.vector - back @ b.vector for a, b in zip(wanted, found, strict=True)]
+    rows, lacks = [], []
+    for normal, gap, free in zip(normals, gaps, straight, strict=True):
+        across = np.array([np.cos(normal), np.sin(normal)])
+        for direction, weight in ((across, 1.0), (np.array([-across[1], across[0]]), 1 / ALONG if free else 1.0)):
+            rows.append(weight * direction)
+            lacks.append(weight * float(direction @ gap))
+    return angle, np.linalg.lstsq(np.array(rows), np.array(lacks), rcond=None)[0]
 
 
 def pairs_of(

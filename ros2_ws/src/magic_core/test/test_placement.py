@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magic_core import transforms
-from magic_core.placement import Relative, mirrored, placement, relative
+from magic_core.placement import Relative, mirrored, placement, relative, together
 
 FIRST = transforms.frame(np.array([0.1, 0.02, 0.0]), np.array([-1.0, 0, 0]), np.array([0, 0, -1.0]))
 OTHERS = [
@@ -73,3 +73,37 @@ def test_places_at_one_point_have_no_direction():
     wanted = [Relative(np.zeros(2), 0.0)]
     assert placement(wanted, [Relative(np.array([0.0, 1e-5]), 0.0)], (0.2, 0.2)).agreement == pytest.approx(1.0, abs=1e-3)
     assert placement(wanted, [Relative(np.array([0.0, 0.15]), 0.0)], (0.2, 0.2)).agreement < 0.1
+
+
+def corner(size, turn=0.0, along=(0.0, 0.0)):
+    """Two places on a square corner's inner sides, the first's and the second's, so far along them (m): relative to the first."""
+    first = transforms.frame(np.array([0.0, -size - along[0], 0.0]), np.array([-1.0, 0, 0]), np.array([0, 0, -1.0]))
+    second = transforms.frame(np.array([-size - along[1], 0.0, 0.0]), np.array([0, -1.0, 0]), np.array([0, 0, -1.0]))
+    return relative(first, second @ transforms.from_rotvec([0, 0, turn]))
+
+
+def test_two_straight_sides_are_met_wherever_along_them_they_were_told():
+    angle, shift = together([corner(0.02)], [corner(0.02, along=(0.03, 0.01))], [True, True])
+    # The second side is 30 mm too far away along the first's tangent; nothing is lacking across the first.
+    assert angle == pytest.approx(0.0, abs=1e-9)
+    assert abs(shift[0]) < 1e-3 and abs(shift[1]) == pytest.approx(0.03, rel=0.03)
+    moved = corner(0.02, along=(0.03, 0.01)).vector + shift
+    across = np.array([np.cos(corner(0.02).angle), np.sin(corner(0.02).angle)])
+    assert abs((moved - corner(0.02).vector) @ across) < 1e-3
+
+
+def test_two_round_places_share_what_is_lacking():
+    angle, shift = together([corner(0.02)], [corner(0.02, along=(0.03, 0.0))], [False, False])
+    assert abs(angle) > 0.05 and 0.005 < np.hypot(*shift) < 0.03
+
+
+def test_a_skew_corner_is_turned_by_half_of_it():
+    angle, _ = together([corner(0.02)], [corner(0.02, turn=0.2)], [True, True])
+    assert angle == pytest.approx(0.1, abs=1e-9)
+
+
+def test_between_two_jaws_the_middle_is_taken():
+    facing = Relative(np.array([-0.05, 0.0]), np.pi)
+    wider = Relative(np.array([-0.07, 0.0]), np.pi)
+    angle, shift = together([facing], [wider], [True, True])
+    assert angle == pytest.approx(0.0, abs=1e-9) and np.allclose(shift, [0.01, 0.0], atol=1e-6)
