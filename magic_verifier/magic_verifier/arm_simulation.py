@@ -4,7 +4,8 @@ The arm is an articulation with PD joint drives, gravity and Coriolis torques fe
 forward, and the effort limits of its URDF, as a position-controlled arm has.  Which
 arm and which gripper: :class:`magic_core.robot.Description`, the Panda where none is
 given.  The tool is a free body from the start; the fingers close on it, and what
-they have closed on is held by no more than their friction (:mod:`magic_verifier.grip`).
+they have closed on is held by no more than their friction (:mod:`magic_verifier.grip`),
+by a joint that stands for soft pads or, where the options say so, by the engine's contacts.
 """
 
 from __future__ import annotations
@@ -93,6 +94,7 @@ class ArmRun:
             setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
         self.setup = setup
         self.options = options or ArmOptions()
+        self._coupled = self.options.past is None  # hand and tool, by a joint
         self.limits = limits
         self.phases = motion.phases or plan.tool_motion.phases
         self.duration = float(times[-1] - times[0])
@@ -110,7 +112,13 @@ class ArmRun:
         self._q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
         self._qd = np.gradient(self._q, 1.0 / frequency, axis=0) if len(self._q) > 1 else np.zeros_like(self._q)
         self._positions = self._q.tolist()
-        self._led = (self._q + self._arm.lead * self._qd).tolist()
+        led = self._q + self._arm.lead * self._qd
+        if self.options.command_period > 0:
+            # A command that stays is that of the middle of its time.
+            period = self.options.command_period * frequency
+            middle = ((np.floor(np.arange(len(led)) / period + 1e-9) + 0.5) * period).astype(int)
+            led = led[np.minimum(middle, len(led) - 1)]
+        self._led = led.tolist()
         self._index = self._first = 0
         self._hold = 0.0
         self._widths: list[float] = []  # between the closing fingers, step by step
@@ -135,7 +143,7 @@ class ArmRun:
             self._arm.open_fingers()
         else:
             self._index = self._first = min(round(held.time * frequency), len(self._q) - 1)
-            self._arm.place(self._q[self._index], held.width + WIDER)
+            self._arm.place(self._q[self._index], held.width + (WIDER if self._coupled else 0.0))
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(held.tool_from_tcp))
             self._closed = True
             self._take(held.patch)
@@ -218,10 +226,9 @@ class ArmRun:
             patch = self._touched()
             if patch is not None:
                 self._take(patch)
-                self._arm.rest_fingers()
-        if self._grip is not None or self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
+        if self._patch is not None or self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
             self._closed = True
-            if self._grip is None:
+            if self._patch is None:
                 raise MagicError(
                     Code.GRASP_SLIPPED,
                     f"the gripper closed on nothing at {self.time:.2f} s",
@@ -230,7 +237,7 @@ class ArmRun:
                 )
             return False
         self._arm.close_fingers()
-        return True
+        return self._coupled
 
     def _touched(self) -> Patch | None:
         """Where both pads touch the tool; ``None`` where they do not hold it between them."""
@@ -244,7 +251,11 @@ class ArmRun:
         if self._in_hand:
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(planned))
         self.world.component(TOOL).disable_gravity = False
-        self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
+        if self._coupled:
+            self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
+            self._arm.rest_fingers()
+        else:
+            self._arm.close_fingers()
         self._from_reference = self._arm.tcp_pose.inv() * self.world.component(TOOL).entity_pose
         self._metrics["grip_width"] = self._arm.width()
         self._metrics["grasp_shift"] = float(np.linalg.norm((transforms.inverse(planned) @ self._tool_from_tcp())[:3, 3]))
@@ -316,9 +327,10 @@ class ArmRun:
                     )
 
     def _watch_grasp(self) -> None:
-        if self._grip is None or self._open_again:
+        if self._patch is None or self._open_again:
             return
-        self._metrics["grip_load"] = max(self._metrics["grip_load"], self._grip.load())
+        if self._grip is not None:
+            self._metrics["grip_load"] = max(self._metrics["grip_load"], self._grip.load())
         drift = self._from_reference * self.world.component(TOOL).entity_pose.inv() * self._arm.tcp_pose
         slip = math.hypot(*drift.p.tolist())
         turn = 2 * math.acos(min(abs(float(drift.q[0])), 1.0))

@@ -41,8 +41,12 @@ class ArmOptions:
     each joint or one for all (the defaults are those of Franka's joint impedance controller, near critical
     damping); armature kg m^2 is what the geared motors add to each joint's inertia; grip_force N with which each
     finger presses on what it has closed on; finger_stiffness N/m couples the two fingers, which a belt does in
-    the real hand; closing_speed m/s of each free finger; quiet s for which the fingers must stand still before
-    they have closed on nothing, closing_time s after which they have anyway.
+    the real hand, and finger_armature kg is what its gears add to each of them; closing_speed m/s of each free
+    finger; quiet s for which the fingers must stand still before they have closed on nothing, closing_time s after
+    which they have anyway.  past m: not the belt but a drive for each finger closes the hand, sent so far past
+    where the fingers meet while the arm goes on, and nothing but the engine's contacts holds the tool: what the hands
+    of other simulators do, not real ones.  command_period s: each command stays for so long, 0 for every step of the
+    simulation: by what it jumps the arm jerks.  effort Nm (N) that each drive of the arm gives at most, 0 for the URDF's.
     """
 
     stiffness: tuple[float, ...] = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
@@ -50,10 +54,14 @@ class ArmOptions:
     armature: float = 0.1
     grip_force: float = 60.0
     finger_stiffness: float = 1e4
+    finger_armature: float = 0.1
     closing_speed: float = 0.1
     finger_friction: float = 1.5
     quiet: float = 0.1
     closing_time: float = 1.5
+    past: float | None = None
+    command_period: float = 0.0
+    effort: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "damping"):
@@ -111,7 +119,7 @@ class Articulation:
         self._arm_joints = [body.find_joint_by_name(name) for name in robot.names]
         self._finger_joints = [body.find_joint_by_name(joint.name) for joint in robot.fingers]
         #: (J,): Nm, or N where a joint slides.
-        self.effort = np.array([joint.effort for joint in robot.arm])
+        self.effort = np.array([options.effort or joint.effort for joint in robot.arm])
         for joint, effort, (stiffness, damping) in zip(self._arm_joints, self.effort, gains, strict=True):
             joint.set_drive_properties(stiffness, damping, force_limit=float(effort), mode="force")
             joint.set_armature(np.array([options.armature], dtype=np.float32))
@@ -122,7 +130,7 @@ class Articulation:
                 force_limit=max(200.0, 3 * options.grip_force),
                 mode="force",
             )
-            joint.set_armature(np.array([0.1], dtype=np.float32))
+            joint.set_armature(np.array([options.finger_armature], dtype=np.float32))
         # Rows of the links that the arm's joints move, in the order in which the engine reports joint forces.
         links = [link.name for link in body.links]
         self._driven = [links.index(joint.child) for joint in robot.arm]
@@ -225,10 +233,12 @@ class Articulation:
     def close_fingers(self) -> None:
         """Drive both fingers to their mean less the way that gives the closing force.
 
-        What moves them together is resisted by that force alone, what moves one against the other by the stiffness.
+        What moves them together is resisted by that force alone, what moves one against the other by the stiffness.  Fingers that are
+        driven one by one go past where they would meet.
         """
         opened = self._opened_by()
         mean = 0.5 * float(opened[0] + opened[1]) - self._options.closing_force / self._options.finger_stiffness
+        mean = mean if self._options.past is None else -self._options.past
         for target, closed, outward in zip(self._finger_targets, self._closed.tolist(), self._outward.tolist(), strict=True):
             target(closed + outward * mean)
 

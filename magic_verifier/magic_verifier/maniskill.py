@@ -36,7 +36,10 @@ from magic_core.robot import RobotConfig
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy, find
 from magic_core.views import find_view
-from magic_verifier.verification import verify, wilson
+from magic_verifier import uncertainty
+from magic_verifier.simulation import Settings
+from magic_verifier.uncertainty import Uncertainty
+from magic_verifier.verification import Limits, verify, wilson
 
 Array = NDArray[np.float64]
 NAME = "PullCubeTool-v1"
@@ -44,6 +47,8 @@ NAME = "PullCubeTool-v1"
 NEAR = 0.6
 #: How much nearer the pull ends (m): a cube between the walls of a hook has some play.
 BEYOND = 0.03
+#: How far the cube may slide to the side in it (radii of the circle about it): the environment asks for nothing of that.
+DRIFT = 1.0
 #: How much of the pull may be gone before a cube that has some play is taken along (m).
 PLAY = 0.01
 #: The pull need not point at the arm: turns of its direction about the vertical (rad), in order of trial.
@@ -60,9 +65,17 @@ PAST = 0.01
 STANDOFF, LIFTS = 0.05, (0.03, 0.08)
 #: No finger is so near to where the tool meets the cube (m): the cube is 40 mm wide.
 AWAY = 0.045
-#: Of the grip's force so much is counted on by the planner, in order of trial: loaded to the full, the environment's contacts creep, and the
-#: tool turns between the fingers by some 10 degrees on the way.
-GRIP_SHARES = (0.8, 1.0)
+#: In order of trial: how much of the grip's force the planner counts on (what holds is the verifier's to say, by the environment's own
+#: contacts, and the planner adds up loads that do not act along one line), and whether all of the arm's limits is used.
+PASSES = ((1.0, False), (1.4, False), (1.4, True))
+#: The tool comes over the cube no higher than this above where it meets it (m): the cube is 40 mm high, the tool 50.
+OVER = 0.075
+#: Such a further box is smaller by this on each side (m).
+CORE = 0.0005
+#: Of what rollouts draw, what the environment tells exactly is drawn by a little only, so that no motion passes that hangs on the last digit.
+WIDTHS = {"friction": 0.1, "tool_density": 0.05, "target_density": 0.05, "centre_of_mass": 0.01, "grip_force": 0.05, "stiffness": 0.05}
+#: A tool that creeps between the fingers does so by chance, now by 2 degrees and now by 20: a motion on which it creeps far is none.
+LIMITS = Limits(slip_angle=0.12)
 #: A cube that is put into the tool is pushed out of it: so many control steps are waited for that.
 WAIT = 3
 #: Candidates of the matcher, and grasps of each, that are tried.
@@ -77,7 +90,8 @@ class Episode:
 
     joints (J,): the arm's, rad; step: seconds of a control step; steps: how many there are; lag: seconds by which the arm follows its
     targets, damping over stiffness of its drives.  friction, that of the fingers, and densities (kg/m^3) are those of its physics;
-    grip_force (N): of each finger that presses on the tool's handle.
+    grip_force (N): of each finger that presses on the tool's handle.  gains: stiffness and damping of the arm's drives, then of a
+    finger's; effort: what the arm's give at most, Nm; settings: of its solver.
     """
 
     tool: SceneObject
@@ -92,6 +106,9 @@ class Episode:
     target_density: float
     finger_friction: float
     grip_force: float
+    effort: float
+    gains: tuple[float, float, float, float]
+    settings: Settings
 
 
 def _numbers(values: Any) -> Array:
@@ -110,15 +127,20 @@ def _body(actor: Any, base_from_world: Array, name: str) -> tuple[SceneObject, f
     import trimesh
 
     (body,) = actor._bodies
-    boxes = [
-        trimesh.creation.box(2 * np.asarray(shape.half_size, dtype=float), np.asarray(shape.local_pose.to_transformation_matrix()))
-        for shape in body.collision_shapes
-    ]
+
+    def box(shape: Any, within: float = 0.0) -> Any:
+        pose = np.asarray(shape.local_pose.to_transformation_matrix())
+        return trimesh.creation.box(2 * (np.asarray(shape.half_size, dtype=float) - within), pose)
+
+    boxes = [box(shape) for shape in body.collision_shapes]
     union = boxes[0] if len(boxes) == 1 else trimesh.boolean.union(boxes, engine="manifold")
+    # A scene object has one density: a box that is denser has further ones within, which nothing touches.
+    least = min(float(shape.density) for shape in body.collision_shapes)
+    boxes += [box(shape, CORE) for shape in body.collision_shapes for _ in range(round(float(shape.density) / least) - 1)]
     mesh, pieces = from_trimesh(union), tuple(Mesh(box.vertices, box.faces) for box in boxes)
     item = SceneObject(name, mesh, pieces, base_from_world @ _pose(actor.pose), find_view(mesh, pieces, "top"), source="known")
     friction = float(np.mean([shape.physical_material.dynamic_friction for shape in body.collision_shapes]))
-    return item, float(body.mass) / float(union.volume), friction
+    return item, float(body.mass) / sum(float(box.volume) for box in boxes), friction
 
 
 def episode(env: Any, steps: int) -> Episode:
@@ -126,7 +148,17 @@ def episode(env: Any, steps: int) -> Episode:
     base_from_world = transforms.inverse(_pose(env.agent.robot.pose))
     tool, tool_density, friction = _body(env.l_shape_tool, base_from_world, "tool")
     target, target_density, target_friction = _body(env.cube, base_from_world, "target")
-    count = len(env.agent.arm_joint_names)
+    agent, count = env.agent, len(env.agent.arm_joint_names)
+    solver = env.sim_config.scene_config
+    settings = Settings(
+        frequency=float(env.sim_freq),
+        position_iterations=int(solver.solver_position_iterations),
+        velocity_iterations=int(solver.solver_velocity_iterations),
+        contact_offset=float(solver.contact_offset),
+        rest_offset=float(solver.rest_offset),
+        angular_damping=float(env.cube._bodies[0].angular_damping),
+        max_depenetration_speed=float(env.cube._bodies[0].max_depenetration_velocity),
+    )
     return Episode(
         tool=tool,
         target=target,
@@ -135,13 +167,22 @@ def episode(env: Any, steps: int) -> Episode:
         joints=_numbers(env.agent.robot.get_qpos())[:count],
         step=1.0 / float(env.control_freq),
         steps=steps,
-        lag=float(env.agent.arm_damping) / float(env.agent.arm_stiffness),
+        lag=float(agent.arm_damping) / float(agent.arm_stiffness),
         friction=(friction + target_friction) / 2,
         tool_density=tool_density,
         target_density=target_density,
-        finger_friction=float(env.agent.urdf_config["_materials"]["gripper"]["dynamic_friction"]),
-        grip_force=min(float(env.agent.gripper_force_limit), float(env.agent.gripper_stiffness) * (env.width / 2 + PAST)),
+        finger_friction=float(agent.urdf_config["_materials"]["gripper"]["dynamic_friction"]),
+        grip_force=min(float(agent.gripper_force_limit), float(agent.gripper_stiffness) * (env.width / 2 + PAST)),
+        effort=float(agent.arm_force_limit),
+        gains=(float(agent.arm_stiffness), float(agent.arm_damping), float(agent.gripper_stiffness), float(agent.gripper_damping)),
+        settings=settings,
     )
+
+
+def arm_of(env: Any) -> RobotConfig:
+    """The arm of an environment, itself without its wrappers: its own links and fingers, the limits of the real one."""
+    urdf = Path(env.agent.urdf_path)
+    return replace(ROBOT, urdf=str(urdf), srdf=str(urdf.with_suffix(".srdf")), preset="panda")
 
 
 def laid(item: SceneObject, table: Array) -> SceneObject:
@@ -179,7 +220,8 @@ def posed(strategy: Strategy, given: Episode, turn: float) -> Strategy:
     further = np.array([-whole - goal, 0.0, 0.0])
     # The episode ends with the pull: what would come after it is left out.
     kept = (w for w in strategy.waypoints if w.phase != "retreat")
-    waypoints = tuple(replace(w, offset=w.offset + further) if w.phase == "goal" else w for w in kept)
+    low = (replace(w, offset=np.maximum(w.offset, [-np.inf, -np.inf, -OVER])) for w in kept)
+    waypoints = tuple(replace(w, offset=w.offset + further) if w.phase == "goal" else w for w in low)
     physics = replace(
         strategy.physics,
         friction=given.friction,
@@ -187,7 +229,7 @@ def posed(strategy: Strategy, given: Episode, turn: float) -> Strategy:
         target_density=given.target_density,
         target_is_fixed=False,
     )
-    goal_tree = strategy.goal.with_values({"distance": max(least, 0.005)})
+    goal_tree = strategy.goal.with_values({"distance": max(least, 0.005), "drift": DRIFT})
     return replace(strategy, target_normal=direction, waypoints=waypoints, physics=physics, goal=goal_tree)
 
 
@@ -249,19 +291,25 @@ def done_at(plan: MotionPlan, direction: Array, length: float) -> float:
 class Solver:
     """Matches, plans and verifies episodes by one strategy; loads matcher and arm once."""
 
-    def __init__(self, strategy: Strategy, features: str = "embedded") -> None:
+    def __init__(self, strategy: Strategy, arm: RobotConfig, features: str = "embedded") -> None:
         from magic_matcher.features import from_strategy, load
         from magic_matcher.matching import Matcher
         from magic_planner.arm import ArmPlanner
         from magic_planner.request import ArmSettings
         from magic_planner.robot import Robot
+        from magic_verifier.articulation import described
 
         self.strategy = strategy
         self.matcher = Matcher(load(features, ""))
         self.reference = from_strategy(strategy)
-        robot = Robot(ROBOT)
-        self.planners = [ArmPlanner(robot, ArmSettings(dwell=CLOSING, standoff=STANDOFF, lift=lift)) for lift in LIFTS]
-        self.planners[0].warm_up()
+        hasty = replace(arm, acceleration_scale=1.0, jerk_scale=1.0)
+        self.arms = {False: described(arm), True: described(hasty)}
+        self.spreads = spreads()
+        self.planners = {
+            fast: [ArmPlanner(robot, ArmSettings(dwell=CLOSING, standoff=STANDOFF, lift=lift)) for lift in LIFTS]
+            for fast, robot in ((False, Robot(arm)), (True, Robot(hasty)))
+        }
+        self.planners[False][0].warm_up()
 
     def solve(self, given: Episode, seed: int, note: Callable[[dict[str, Any]], None]) -> MotionPlan | None:
         """The first motion that the verifier passes and that ends in time; ``note`` hears what became of each that was tried."""
@@ -270,8 +318,11 @@ class Solver:
 
         given = replace(given, tool=laid(given.tool, given.table), target=laid(given.target, given.table))
         candidates = None
-        for share, turn in itertools.product(GRIP_SHARES, TURNS):
-            said: dict[str, Any] = {"turn": round(math.degrees(turn)), "grip": share}
+        out_of_reach: set[float] = set()
+        for (share, fast), turn in itertools.product(PASSES, TURNS):
+            if turn in out_of_reach:
+                continue
+            said: dict[str, Any] = {"turn": round(math.degrees(turn)), "grip": share, "fast": fast}
             try:
                 strategy = posed(self.strategy, given, turn)
                 met = circle_about(given.target, strategy)
@@ -283,26 +334,29 @@ class Solver:
                     candidates = found.candidates
             except MagicError as error:
                 note({**said, "code": error.code.name, "message": error.message})
+                out_of_reach.add(turn)
                 continue
             agenda = Agenda([replace(c, target=met.contact) for c in candidates], strategy.reflections, ATTEMPTS)
             while (following := agenda.next()) is not None:
                 promise, trial = following
-                plan, code, what = self._try(strategy, given, trial, seed, share)
+                plan, code, what = self._try(strategy, given, trial, seed, share, fast)
                 note({**said, "candidate": trial.index, "reflection": trial.reflection, "attempt": trial.attempt, **what})
                 if plan is not None:
                     return plan
                 # What no grasp at all can follow, another attempt cannot either; there is no time to look.
+                if code == Code.NO_IK:
+                    out_of_reach.add(turn)
                 agenda.failed(promise, trial, Code.NO_GRASP if code == Code.NO_IK else code)
         return None
 
     def _try(
-        self, strategy: Strategy, given: Episode, trial: Any, seed: int, share: float
+        self, strategy: Strategy, given: Episode, trial: Any, seed: int, share: float, fast: bool
     ) -> tuple[MotionPlan | None, Code, dict[str, Any]]:
         from magic_planner.budget import Budget
         from magic_planner.giving_way import GAP_IN_HAND
         from magic_planner.grasps import GraspSettings
         from magic_planner.object_motion import plan_tool_motion
-        from magic_verifier.articulation import ArmOptions
+        from magic_verifier.articulation import SOFTLY, ArmOptions
 
         candidate, reflection = trial.candidate, trial.reflection
         started = time.perf_counter()
@@ -311,7 +365,7 @@ class Solver:
             friction = (given.finger_friction + given.friction) / 2
             grasping = GraspSettings(grip_force=share * given.grip_force, friction=friction, density=given.tool_density, away=AWAY)
             plan = None
-            for planner in self.planners:
+            for planner in self.planners[fast]:
                 planner.grasping = grasping
                 try:
                     plan = planner.plan(
@@ -320,7 +374,7 @@ class Solver:
                     )  # fmt: skip
                     break
                 except MagicError as error:
-                    if error.code != Code.PATH_IN_COLLISION or planner is self.planners[-1]:
+                    if error.code != Code.PATH_IN_COLLISION or planner is self.planners[fast][-1]:
                         raise
             end = done_at(plan, strategy.target_normal, strategy.goal.numbers["distance"])
             if end + given.lag > given.steps * given.step:
@@ -330,8 +384,24 @@ class Solver:
         except MagicError as error:
             return None, error.code, {"code": error.code.name, "message": error.message, "plan_seconds": time.perf_counter() - started}
         planned = time.perf_counter() - started
-        fingers = ArmOptions(grip_force=given.grip_force, finger_friction=given.finger_friction)
-        verdict = verify(strategy, given.tool, given.target, (), given.table, candidate, plan, seed=seed, arm_options=fingers)
+        stiffness, damping, grip_stiffness, grip_damping = given.gains
+        hand = ArmOptions(
+            stiffness=(stiffness,),
+            damping=(damping,),
+            armature=0.0,
+            grip_force=given.grip_force,
+            finger_stiffness=grip_stiffness,
+            closing_speed=SOFTLY / grip_damping,  # closing, so much force against the drive's damping
+            finger_friction=given.finger_friction,
+            finger_armature=0.0,
+            past=PAST,
+            command_period=given.step,
+            effort=given.effort,
+        )
+        verdict = verify(
+            strategy, given.tool, given.target, (), given.table, candidate, plan,
+            seed=seed, settings=given.settings, spreads=self.spreads, limits=LIMITS, arm_options=hand, robot=self.arms[fast],
+        )  # fmt: skip
         what = {
             "code": verdict.code.name,
             "message": verdict.message,
@@ -341,6 +411,14 @@ class Solver:
         }
         what |= {"plan_seconds": planned, "verify_seconds": verdict.seconds}
         return (plan if verdict.success else None), verdict.code, what
+
+
+def spreads() -> Uncertainty:
+    """What rollouts draw: shapes are what the environment says, other things nearly so (:data:`WIDTHS`)."""
+    shipped = uncertainty.read()
+    exact = {name: replace(getattr(shipped.known, name), width=0.0) for name in ("size", "thickness", "pieces")}
+    widths = {name: replace(getattr(shipped, name), width=width) for name, width in WIDTHS.items()}
+    return replace(shipped, **widths, known=replace(shipped.known, **exact))
 
 
 def beside(given: Episode) -> bool:
@@ -484,7 +562,7 @@ def evaluate(seeds: Iterable[int], out: Path, strategy: str = "hooking", log: Ca
         if path.is_file():
             results.append(json.loads(path.read_text()))
             continue
-        solver = solver or Solver(find(strategy))
+        solver = solver or Solver(find(strategy), arm_of(env.unwrapped))
         result = attempt(env, steps, solver, seed)
         temporary = path.with_suffix(".tmp")
         temporary.write_text(json.dumps(result))

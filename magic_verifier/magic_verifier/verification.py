@@ -471,6 +471,8 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None) -> Any:
     options = replace(
         options, grip_force=options.grip_force * drawn.grip_force, stiffness=tuple(k * drawn.stiffness for k in options.stiffness)
     )
+    if options.past is not None:  # what contacts alone have taken hold of has no state that could be begun from
+        return ArmRun(setup, task.plan, options, task.limits, task.robot, None, drawn.lag)
     held = replace(task.held, tool_from_tcp=transforms.inverse(drawn.tool_from_held) @ task.held.tool_from_tcp)
     return ArmRun(setup, task.plan, options, task.limits, task.robot, held, drawn.lag)
 
@@ -680,7 +682,8 @@ def make_task(
     spreads = spreads or uncertainty.read()
     eyes = spreads.eyes(tool), spreads.eyes(target)
     start = _start(strategy, setup, plan)
-    longer = _longer(setup, plan, start)
+    hard = arm_options is not None and arm_options.past is not None  # what contacts alone hold hangs on how long a step is
+    longer = 1.0 if hard else _longer(setup, plan, start)
     return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, start, longer=longer)
 
 

@@ -9,6 +9,7 @@ from magic_core.motion import ArmMotion, MotionPlan, ToolMotion
 from magic_core.robot import Description
 from magic_core.strategy import Physics
 from magic_verifier.arm_simulation import ArmRun
+from magic_verifier.articulation import ArmOptions
 from magic_verifier.floating import make_setup
 from magic_verifier.grip import LEAST, Grip, Patch, patch_of
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, usable_pieces
@@ -112,3 +113,46 @@ def test_what_is_in_the_hand_already_is_held_as_it_is():
         run.advance()
     off = transforms.inverse(held) @ run.held().tool_from_tcp
     assert np.linalg.norm(off[:3, 3]) < 0.0005 and transforms.rotation_angle(off, np.eye(4)) < 0.005
+
+
+def run_of(options, speed=0.0, grasp_time=0.1):
+    """The Panda at home, its first joint turned at a speed (rad/s), closing on a bar that lies on a post between its fingers."""
+    robot = Description()
+    home = np.asarray(robot.config.home, dtype=float)
+    tcp = robot.forward(home)[0]
+    tool = scenes.item("tool", [scenes.block((-0.08, 0.08), (-0.006, 0.006), (-0.008, 0.008))], tcp)
+    post = scenes.item("post", [scenes.block((-0.03, 0.03), (-0.004, 0.004), (0.008, 0.05))], tcp)
+    target = scenes.item("target", [scenes.block((-0.03, 0.03), (-0.03, 0.03), (0, 0.06))], transforms.make(translation=[0.5, 0.4, 0]))
+    around = () if speed else (post,)  # a hand that moves would meet it
+    setup = make_setup(tool, target, around, scenes.TABLE, Physics(0.5, 600.0, 600.0), Settings(frequency=200.0, contact_offset=0.002))
+    times = np.linspace(0.0, 0.8, 81)
+    q = home + np.outer(speed * times, np.eye(len(home))[0])
+    qd = np.tile(speed * np.eye(len(home))[0], (len(times), 1))
+    arm = ArmMotion(times, robot.names, q, qd, 0 * qd, np.eye(4), 0.012, grasp_time)
+    return ArmRun(setup, MotionPlan("arm", ToolMotion(times, np.tile(tcp, (len(times), 1, 1))), arm), options, Limits(), robot)
+
+
+def test_fingers_that_are_driven_one_by_one_hold_by_contacts_alone_while_the_arm_goes_on():
+    run = run_of(ArmOptions(finger_stiffness=1000.0, finger_armature=0.0, past=0.01))
+    while run.time < 0.75:
+        run.advance()
+    assert run.world.time == pytest.approx(run.time)
+    assert run.held() is not None and 0.008 < run.held().width < 0.0125
+    assert "grip_load" not in run.metrics() or run.metrics()["grip_load"] == 0.0
+    assert run.metrics()["grasp_slip"] < 0.003
+
+
+def test_a_command_that_stays_jerks_the_arm():
+    def ripple(period):
+        run = run_of(
+            ArmOptions(stiffness=(1000.0,), damping=(100.0,), armature=0.0, effort=100.0, command_period=period), 0.3, grasp_time=5.0
+        )
+        speeds = []
+        while run.time < 0.75:
+            run.advance()
+            if run.time > 0.4:
+                speeds.append(float(run._arm.speeds()[0]))
+        assert np.mean(speeds) == pytest.approx(0.3, rel=0.1)
+        return float(np.std(speeds))
+
+    assert ripple(0.0) < 0.01 < 0.03 < ripple(0.05)

@@ -93,6 +93,22 @@ def test_shunting_takes_both_contacts():
     assert not verdict.success and "not pushed away first" in verdict.message
 
 
+@pytest.mark.parametrize(("aside", "words"), [(0.0, ""), (0.025, "not where it was to be brought")])
+def test_cornering_takes_both_sides_at_once(aside, words):
+    """Of the flank what is told so far aside (m) of where it is leads the block elsewhere, though the head is right."""
+    strategy = handling.STRATEGIES["cornering"]()
+    target, obstacles, _ = scene_for(strategy, "demonstration")
+    entry = strategy.environment["tool"]
+    item = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("tool", transforms.make(translation=[0.4, -0.3, 0.02]))
+    (pair,) = strategy.contacts
+    told = replace(pair.tool, object_from_contact=pair.tool.object_from_contact @ transforms.make(translation=[-aside, 0, 0]))
+    further = (Companion(pair.name, told, pair.target),)
+    candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4), further)
+    motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
+    verdict = verify(strategy, item, target, obstacles, ev.TABLE, candidate, MotionPlan("fg", motion), repetitions=1)
+    assert verdict.success == (aside == 0.0) and words in verdict.message, verdict.message
+
+
 def test_a_ring_is_held_to_both_sides():
     verdict = shown("ring_pulling")
     assert verdict.success and verdict.metrics["sides_held"] == 2.0, verdict.message

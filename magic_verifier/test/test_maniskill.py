@@ -29,13 +29,14 @@ class Pose:
         return transforms.from_quaternion_wxyz(self.raw_pose[0, :3], self.raw_pose[0, 3:])
 
 
-def box(half, position=(0.0, 0.0, 0.0)):
+def box(half, position=(0.0, 0.0, 0.0), density=1000.0):
     material = SimpleNamespace(static_friction=0.3, dynamic_friction=0.3)
-    return SimpleNamespace(half_size=np.array(half), local_pose=Pose(position), physical_material=material)
+    return SimpleNamespace(half_size=np.array(half), local_pose=Pose(position), physical_material=material, density=density)
 
 
 def actor(pose, mass, *boxes):
-    return SimpleNamespace(pose=pose, _bodies=[SimpleNamespace(mass=mass, collision_shapes=list(boxes))])
+    body = SimpleNamespace(mass=mass, collision_shapes=list(boxes), angular_damping=0.05, max_depenetration_velocity=1e32)
+    return SimpleNamespace(pose=pose, _bodies=[body])
 
 
 @dataclass
@@ -49,19 +50,26 @@ class Fake:
     limit: int = 100
     sent: list = field(default_factory=list)
     control_freq = 20
+    sim_freq = 100
     width = 0.05
+    sim_config = SimpleNamespace(
+        scene_config=SimpleNamespace(solver_position_iterations=15, solver_velocity_iterations=1, contact_offset=0.02, rest_offset=0)
+    )
 
     def __post_init__(self):
         self.unwrapped = self
         self.cube = actor(Pose(self.cube_at, self.turn), 0.064, box((0.02, 0.02, 0.02)))
-        self.l_shape_tool = actor(Pose(self.tool_at), 0.5, box(HANDLE, (0.1, 0.0, 0.0)), box(HOOK, (0.175, 0.05, 0.0)))
+        self.l_shape_tool = actor(Pose(self.tool_at), 0.5, box(HANDLE, (0.1, 0.0, 0.0), 500.0), box(HOOK, (0.175, 0.05, 0.0)))
         self.agent = SimpleNamespace(
             robot=SimpleNamespace(pose=Pose((BASE, 0.0, 0.0)), get_qpos=lambda: np.arange(9.0)[None] / 10),
             arm_joint_names=[f"panda_joint{n}" for n in range(1, 8)],
             arm_stiffness=1e3,
             arm_damping=1e2,
+            arm_force_limit=100,
             gripper_stiffness=1e3,
+            gripper_damping=1e2,
             gripper_force_limit=100,
+            urdf_path="/robots/panda_v2.urdf",
             urdf_config={"_materials": {"gripper": {"dynamic_friction": 2.0}}},
         )
 
@@ -82,10 +90,18 @@ def test_what_the_environment_shows_is_told_in_the_frame_of_the_base():
     np.testing.assert_allclose(given.tool.mesh.bounds, [[0, -0.025, -0.025], [0.2, 0.1, 0.025]], atol=1e-6)
     volume = 0.2 * 0.05 * 0.05 + 0.05 * 0.075 * 0.05  # the boxes lie over each other
     assert given.tool.mesh.to_trimesh().volume == pytest.approx(volume, rel=1e-5)
-    assert given.tool_density == pytest.approx(0.5 / volume, rel=1e-5)
+    # The pieces weigh what the actor does, and where it does: the hook is of twice the handle's density.
+    volumes = [piece.to_trimesh().volume for piece in given.tool.pieces]
+    assert given.tool_density * sum(volumes) == pytest.approx(0.5)
+    middles = [piece.vertices.mean(axis=0) for piece in given.tool.pieces]
+    middle = np.average(middles, axis=0, weights=volumes)
+    np.testing.assert_allclose(middle, [0.1375, 0.025, 0.0], atol=1e-3)
     assert given.target_density == pytest.approx(1000, rel=1e-4)
     assert (given.step, given.lag, given.friction) == pytest.approx((0.05, 0.1, 0.3))
     assert given.grip_force == pytest.approx(35)  # 1000 N/m, 25 mm and 10 mm more
+    assert (given.settings.frequency, given.settings.position_iterations, given.settings.contact_offset) == (100, 15, 0.02)
+    assert (given.gains, given.effort) == ((1e3, 1e2, 1e3, 1e2), 100)
+    assert maniskill.arm_of(Fake()).srdf == "/robots/panda_v2.srdf"
     down = maniskill.laid(given.target, given.table)
     assert transforms.apply(down.world_from_object, down.mesh.vertices)[:, 2].min() == pytest.approx(0, abs=2e-4)
 
@@ -117,7 +133,8 @@ def test_the_strategy_is_told_how_far_and_nothing_else_of_its_way_changes():
     for before, after in zip(kept, told.waypoints, strict=True):
         assert (before.name, before.speed) == (after.name, after.speed)
         if before.phase != "goal":
-            np.testing.assert_array_equal(before.offset, after.offset)
+            np.testing.assert_array_equal(before.offset[:2], after.offset[:2])
+            assert after.offset[2] == max(before.offset[2], -maniskill.OVER)
     assert (told.physics.friction, told.physics.target_density) == pytest.approx((0.3, 1000), rel=1e-4)
     with pytest.raises(MagicError) as caught:
         maniskill.posed(shipped, maniskill.episode(Fake(cube_at=(0.25, 0.0, 0.02)), 100), np.deg2rad(60))
