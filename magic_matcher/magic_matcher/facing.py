@@ -45,6 +45,9 @@ ARM, APEX = 0.3, 0.12
 WITHIN = 0.7
 #: What leaves less than this share of what a circle leaves is a corner.
 CLEARLY = 0.7
+#: A place belongs to a straight side no farther from it than this share of the size, whose normal is within this angle (rad) of its own and which
+#: is as long as the last share.
+BESIDE, SKEW, SHORTEST = 0.05, np.deg2rad(45.0), 0.1
 #: Places at which stretches begin, and the lengths that are tried.
 _BEGIN, _LENGTHS = 180, 60
 
@@ -78,6 +81,25 @@ def side(contour: Contour, direction: NDArray[np.float64]) -> Side | None:
         if whole and flat is not None:
             return flat[0]
     return None
+
+
+def straight_at(contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float64]) -> tuple[Side, NDArray[np.float64]] | None:
+    """The straight side of the outermost loop at a place (2,) that faces a direction (2,), and its normal; ``None`` where there is none.
+
+    The normal of a place is that of what is around it: near a corner it is between those of both sides.
+    """
+    outline = _Outline(contour)
+    stretches = outline.stretches(max(RASTER, EVEN * outline.size))
+    along = np.column_stack([-stretches.normal[:, 1], stretches.normal[:, 0]])
+    off = point - stretches.middle
+    run = np.clip(np.einsum("ni,ni->n", off, along), -stretches.length / 2, stretches.length / 2)
+    nearest = stretches.middle + run[:, None] * along
+    fits = (np.linalg.norm(point - nearest, axis=1) < BESIDE * outline.size) & (stretches.normal @ normal > np.cos(SKEW))
+    fits &= stretches.length > SHORTEST * outline.size
+    if not fits.any():
+        return None
+    best = int(np.argmax(np.where(fits, stretches.normal @ normal, -1.0)))
+    return Side(nearest[best], np.inf, float(stretches.length[best])), stretches.normal[best]
 
 
 @dataclass(frozen=True)

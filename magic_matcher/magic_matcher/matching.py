@@ -559,8 +559,10 @@ class Matcher:
     ) -> tuple[list[ContactCandidate], list[Refusal]]:
         """Each candidate with the further contacts that suit it best as one rigid tool, its score that of all together; and why there are none.
 
-        The score is the mean of all contacts' times how well they agree (:mod:`magic_core.placement`).
+        The score is the mean of all contacts' times how well they agree (:mod:`magic_core.placement`).  Where the demonstrated contact is
+        straight, what was found is the straight side that is there.
         """
+        candidates = [_squared(view, contour, candidate, task.reference_contact) for candidate in candidates]
         sizes = task.reference.contour.size * task.reference.view.metres_per_pixel, contour.size * view.metres_per_pixel
         wanted = [
             relative(task.reference_contact.object_from_contact, one.reference_contact.object_from_contact) for _, one in task.further
@@ -574,7 +576,7 @@ class Matcher:
                 return [], [replace(refusal, what=f"{name}: {refusal.what}") for refusal in why]
             points = np.array([c.tool.pixel for c in found])
             order = global_stage.suppress(points, np.array([c.score for c in found]), SAME_PLACE * contour.size, COMPANIONS)
-            choices.append([found[i] for i in order])
+            choices.append([_squared(view, contour, found[i], one.reference_contact) for i in order])
         joined = []
         for candidate in candidates:
             frame = candidate.tool.object_from_contact
@@ -698,6 +700,17 @@ def _told(task: _Task, tool: Tool, seen: _Seen) -> _Seen:
         if next((v for v in view.direction[::-1] if abs(v) > 1e-6), -1.0) > 0:
             return _retold(task, seen, mirrored(view))
     return seen
+
+
+def _squared(view: CanonicalView, contour: Contour, candidate: ContactCandidate, reference: Contact) -> ContactCandidate:
+    """A candidate of a straight reference as the straight side of its outline at its place, where there is one."""
+    met = None if np.isfinite(reference.radius) else facing.straight_at(contour, candidate.tool.pixel, candidate.tool.normal)
+    if met is None:
+        return candidate
+    side, normal = met
+    scale = side.scale * view.metres_per_pixel
+    contact = Contact(side.point, normal, np.inf, False, scale, contact_frame(view, side.point, normal))
+    return _with_contact(candidate, contact, candidate.flipped, candidate.rotation, reference)
 
 
 def _on_surface(surface: Surface, view: CanonicalView, reference: Contact, candidate: ContactCandidate) -> ContactCandidate:

@@ -119,3 +119,25 @@ def test_a_notch_is_no_side():
 
     found = facing.side(outline(distance), DIRECTION)
     assert found is None or away(found) @ DIRECTION > 15
+
+
+@pytest.mark.parametrize("turn", [0.0, 25.0])
+@pytest.mark.parametrize(("place", "askew"), [((0.0, -12.0), 30.0), ((0.0, -3.0), 40.0), ((-3.0, 0.0), 60.0), ((-14.0, 0.0), 85.0)])
+def test_beside_an_inner_corner_the_straight_side_is_found(turn, place, askew):
+    """An L of 20 mm arms whose inner sides meet in the middle of the picture: x = 0 faces -x, y = 0 faces -y; told normals are askew."""
+    c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
+
+    def distance(u, v):
+        x, y = u * c + v * s, v * c - u * s
+        return np.where((x > -30) & (x < 10) & (y > -30) & (y < 10) & ((x > 0) | (y > 0)), -1.0, 1.0)
+
+    def shown(p):
+        return np.array([[c, -s], [s, c]]) @ p
+
+    found = outline(distance)
+    point = FINE * shown(np.array(place)) + (SIDE - 1) / 2
+    side, normal = facing.straight_at(found, point + 1.0, shown(np.array([-np.cos(np.deg2rad(askew)), -np.sin(np.deg2rad(askew))])))
+    wanted = np.array([-1.0, 0.0]) if place[0] == 0 else np.array([0.0, -1.0])
+    assert normal @ shown(wanted) > np.cos(np.deg2rad(1.0))
+    assert abs((side.point - point) @ normal) < 1.5 and side.radius == np.inf
+    assert facing.straight_at(found, point, -shown(wanted)) is None

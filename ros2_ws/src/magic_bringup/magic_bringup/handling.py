@@ -5,6 +5,7 @@ tipping       a block that stands on its end is tipped over by a push near its t
 pressing      a peg is pressed into a slot that holds it back.
 reaching      a thing that is far away is touched, and stays where it is.
 shunting      a block is pushed away with the outside of an L hook's tip, then pulled back and nearer with its inside.
+cornering     a block is taken between the head and the handle of a mallet, by two of its sides at once, and brought nearer and to the side.
 ring_pulling  a ring that lies on the table is pulled nearer by its inside, with the tip of an L hook that stands upright in it.
 """
 
@@ -224,7 +225,57 @@ def shunting() -> Strategy:
     )
 
 
+def cornering() -> Strategy:
+    """A block is brought 0.12 m nearer and 0.08 m to the side: two contacts at once."""
+    tool = make("mallet", 0, form="L", handle=0.25, width=0.022, thickness=0.018, head=0.1, head_width=0.03, head_depth=0.03)
+    target = make("block", 0, length=0.04, breadth=0.05, height=0.04)
+    tool_view = tool.view("top")
+    # The inner face of the head, across x, and the side of the handle that it stands out from, across y.
+    inner, side = float(tool.mesh.bounds[1, 0]) - 0.03, float(tool.mesh.bounds[1, 1]) - 0.022
+    head = target_contact(tool_view, np.array([inner, side - 0.025, 0.0]), NEAR_SIDE, float("inf"))
+    handle = target_contact(tool_view, np.array([inner - 0.02, side, 0.0]), np.array([0.0, -1.0, 0.0]), float("inf"))
+    seen, left = target_view(target, "top", DOWN), np.array([0.0, 1.0, 0.0])
+    far = target_contact(seen, 0.02 * OUTWARDS, OUTWARDS, float("inf"))
+    flank = target_contact(seen, 0.025 * left, left, float("inf"))
+    waypoints = (
+        Waypoint("above", np.array([0.04, -0.04, -0.12]), "approach"),
+        Waypoint("behind", np.array([0.04, -0.04, 0.0]), "approach"),
+        Waypoint("touch", np.zeros(3), "contact", 0.05),
+        Waypoint("brought", np.array([-0.12, 0.08, 0.0]), "goal"),
+        Waypoint("clear", np.array([-0.09, 0.05, 0.0]), "retreat"),
+        Waypoint("up", np.array([-0.09, 0.05, -0.12]), "retreat"),
+    )
+    times, contacts = through(waypoints)
+    return Strategy(
+        name="cornering",
+        description="A mallet's head and handle take a block by two sides at once and bring it nearer and to the side.",
+        view="top",
+        mode="plan",
+        **demonstrated(tool, tool_view, head, target, seen, far, OUTWARDS, DOWN, times, contacts),
+        contacts=(ContactPair("flank", handle, flank, left),),
+        waypoints=waypoints,
+        # What is led by both sides keeps its handedness: mirrored, a tool has to be turned over.
+        reflections=("turn",),
+        goal=shipped("bring"),
+        physics=Physics(friction=0.3, tool_density=600.0, target_density=600.0),
+        environment={
+            "world_from_target": pose_data(transforms.make(translation=[0.6, 0.04, 0.02])),
+            "tool": made_of(tool),
+            "target": made_of(target),
+            "evaluation": {
+                "sets": {
+                    "own": {"each": ["mallet:{},form=L", "mallet:{},form=T", "hammer:{}", "caliper:{}"], "first": 70_000, "count": 12},
+                    "unseen": unseen("mallet", "hammer", "caliper", "l_hook"),
+                },
+                "targets": ["demonstration", "block:1,height=0.04", "block:2,height=0.04"],
+                "near_misses": ["letter:60001,glyph=I", "cylinder:0.04", "sphere:0.04"],
+            },
+        },
+    )
+
+
 STRATEGIES = {
+    "cornering": cornering,
     "shunting": shunting,
     "pushing": pushing,
     "tipping": tipping,
