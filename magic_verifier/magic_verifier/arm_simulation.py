@@ -143,7 +143,7 @@ class ArmRun:
             self._arm.open_fingers()
         else:
             self._index = self._first = min(round(held.time * frequency), len(self._q) - 1)
-            self._arm.place(self._q[self._index], held.width + (WIDER if self._coupled else 0.0))
+            self._arm.place(self._q[self._index], held.width + WIDER)
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(held.tool_from_tcp))
             self._closed = True
             self._take(held.patch)
@@ -226,6 +226,8 @@ class ArmRun:
             patch = self._touched()
             if patch is not None:
                 self._take(patch)
+                if self._coupled:
+                    self._arm.rest_fingers()
         if self._patch is not None or self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
             self._closed = True
             if self._patch is None:
@@ -253,9 +255,6 @@ class ArmRun:
         self.world.component(TOOL).disable_gravity = False
         if self._coupled:
             self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
-            self._arm.rest_fingers()
-        else:
-            self._arm.close_fingers()
         self._from_reference = self._arm.tcp_pose.inv() * self.world.component(TOOL).entity_pose
         self._metrics["grip_width"] = self._arm.width()
         self._metrics["grasp_shift"] = float(np.linalg.norm((transforms.inverse(planned) @ self._tool_from_tcp())[:3, 3]))
