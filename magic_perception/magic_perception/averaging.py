@@ -68,21 +68,47 @@ def _summed(stack: NDArray) -> NDArray[np.float32]:
 
 def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
     """Whether a mean of frames shows what an earlier one of the same camera, from the same place, did: no blob of it differs by more than noise."""
-    if frame.camera != before.camera or frame.depth.shape != before.depth.shape or frame.intrinsics != before.intrinsics:
+    if not _comparable(frame, before):
         return False
-    if not np.allclose(frame.world_from_camera, before.world_from_camera, atol=PLACE):
-        return False
-    blind, veiled = (np.zeros(f.depth.shape, bool) if f.blind is None else f.blind for f in (frame, before))
-    held, was_held = (np.zeros(f.depth.shape, bool) if f.held is None else f.held > 0 for f in (frame, before))
-    valid, was = np.isfinite(frame.depth), np.isfinite(before.depth)
-    with np.errstate(invalid="ignore"):
-        other = (valid != was) | (np.abs(frame.depth - before.depth) > SHIFT * np.maximum(frame.depth, 0.5) ** 2)
+    (blind, veiled), (held, was_held) = _blind(frame, before), _held(frame, before)
+    other = (np.isfinite(frame.depth) != np.isfinite(before.depth)) | _deeper(frame, before)
     return not (
         _opened(_recolored(frame, before, FAINT), BLOB).any()
         or _opened(other & ~blind & ~veiled, DEEP_BLOB).any()
         or _opened(blind != veiled, DEEP_BLOB).any()
         or _opened(held != was_held, DEEP_BLOB).any()
     )
+
+
+def unchanged_beside_robot(frame: RgbdFrame, before: RgbdFrame) -> bool:
+    """The same but for where one of both shows the robot, or what that holds, and for depth that there is in one of both only: beside an arm is its shadow,
+    which the second imager does not see."""
+    if not _comparable(frame, before):
+        return False
+    robot = np.logical_or.reduce([*_blind(frame, before), *_held(frame, before)])
+    beside = cv2.dilate(robot.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) == 0
+    return not (_opened(_recolored(frame, before, FAINT) & beside, BLOB).any() or _opened(_deeper(frame, before) & beside, DEEP_BLOB).any())
+
+
+def _comparable(frame: RgbdFrame, before: RgbdFrame) -> bool:
+    """Whether two frames are of one camera at one place."""
+    if frame.camera != before.camera or frame.depth.shape != before.depth.shape or frame.intrinsics != before.intrinsics:
+        return False
+    return bool(np.allclose(frame.world_from_camera, before.world_from_camera, atol=PLACE))
+
+
+def _blind(*frames: RgbdFrame) -> list[NDArray[np.bool_]]:
+    return [np.zeros(f.depth.shape, bool) if f.blind is None else f.blind for f in frames]
+
+
+def _held(*frames: RgbdFrame) -> list[NDArray[np.bool_]]:
+    return [np.zeros(f.depth.shape, bool) if f.held is None else f.held > 0 for f in frames]
+
+
+def _deeper(frame: RgbdFrame, before: RgbdFrame) -> NDArray[np.bool_]:
+    """(H, W): where both have depth, and another one."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(frame.depth - before.depth) > SHIFT * np.maximum(frame.depth, 0.5) ** 2
 
 
 def _recolored(frame: RgbdFrame, other: RgbdFrame, least: float) -> NDArray[np.bool_]:

@@ -35,8 +35,9 @@ from magic_core.self_filter import Margins
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
-from magic_perception.averaging import average, unchanged
+from magic_perception.averaging import average
 from magic_perception.keyframes import STEADY, STILL, Keyframes
+from magic_perception.meanwhile import Made
 from magic_perception.parameters import METHODS, WORKSPACE, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
@@ -52,8 +53,6 @@ DECODERS = {
 }
 #: What a user can do about a unit.
 REMEDY = "set the driver's depth unit, or this node's parameter depth_unit"
-#: A scene in which nothing changes is looked at again after so long by the stamps, s; what noise has made of it is not for ever.
-AFRESH = 10.0
 #: After so long without a new pair of images, s, none of those that were taken together is still on its way.
 SETTLED = 0.5
 
@@ -124,10 +123,10 @@ class Perception(Node):
 
         self.streams = {camera: Stream(camera, tolerance, self.count + WAITING) for camera in self.cameras}
         self.tracker = Tracker()
-        # What the last scene was made of, and the scene.
-        self.looked: tuple[list[RgbdFrame], tuple[SceneObject, ...], Scene] | None = None
-        # The message of it, and the scene whose markers nobody has seen yet.
-        self.told: SceneObjectArray | None = None
+        # The last scene and what it was made of.
+        self.made: Made | None = None
+        # What was published last: the scene that it is but for its stamp, and the message.  And the scene whose markers nobody has seen yet.
+        self.told: tuple[Scene, SceneObjectArray] | None = None
         self.unshown: Scene | None = None
         # By topic: calibrated fixtures, and what other software knows of.
         self.known: dict[str, tuple[SceneObject, ...]] = {}
@@ -391,16 +390,25 @@ class Perception(Node):
         if now - self.last_run < self.period:
             return
         try:
+            held = () if self.robot is None else self.robot.held
             frames, notes, still = self.gather(now)
             if not frames:
                 return
             self.last_run = now
             with self.lock:
                 known = tuple(item for items in self.known.values() for item in items)
-            if (kept := self.same(frames, known)) is not None:
-                self.publish(kept, kept=True)
-                self.done += 1
-                return
+            if self.made is not None and self.made.recent(frames, known):
+                if self.made.same(frames):
+                    self.publish(replace(self.made.scene, stamp=max(frame.stamp for frame in frames)), self.made.scene)
+                    self.done += 1
+                    return
+                if (
+                    self.robot is not None
+                    and (scene := self.made.meanwhile(frames, self.robot, self.world_from_base(frames[-1]))) is not None
+                ):
+                    self.publish(scene)
+                    self.done += 1
+                    return
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
             scene = perceive(frames, known, self.parameters, self.segmenter, report, earlier)
@@ -408,11 +416,15 @@ class Perception(Node):
             whole = {f.camera for f in frames if not isinstance(self.cut.get(f.camera), MagicError)}
             numbers = [report.numbers.get(item.id, 0) for item in scene.objects]
             scene = self.tracker.update(replace(scene, frame_id=self.frame))
-            carried = [n for n, item in zip(numbers, scene.objects, strict=True) if self.tracker.carried(item)]
+            named = {item.id: n for n, item in zip(numbers, scene.objects, strict=True) if n}
+            carried = frozenset(item.id for item in scene.objects if self.tracker.carried(item))
             # What the robot holds is elsewhere in the next picture.
             there = [_free(frame, image) for frame, image in zip(frames, report.labels, strict=True)]
-            self.keyframes.update([frame.free for frame in frames], there, report.earlier, still & whole, carried)
-            self.looked = frames, known, scene
+            self.keyframes.update(
+                [frame.free for frame in frames], there, report.earlier, still & whole, [named[i] for i in carried if i in named]
+            )
+            masks = {i: [image == n for image in report.labels] for i, n in named.items()}
+            self.made = Made(scene, frames, known, held, masks, carried)
             self.publish(scene)
             seconds = time.monotonic() - now
             self.done += 1
@@ -456,20 +468,9 @@ class Perception(Node):
                 self.get_logger().info(f"first scene after {now - self.started:.1f} s: {self.outcome[2]}, in {seconds:.2f} s")
         except Exception as error:
             code, message = describe(self, error)
-            self.last_run, self.looked = now, None
+            self.last_run, self.made = now, None
             self.outcome = (DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
             self.get_logger().error(self.outcome[2], throttle_duration_sec=5.0)
-
-    def same(self, frames: list[RgbdFrame], known: tuple[SceneObject, ...]) -> Scene | None:
-        """The scene as it was, where the frames show nothing else than those it was made of, a moment ago; ``None``: it has to be looked at."""
-        if self.looked is None:
-            return None
-        before, fixtures, scene = self.looked
-        stamp = max(frame.stamp for frame in frames)
-        recent = 0 <= stamp - max(frame.stamp for frame in before) < AFRESH
-        if not recent or list(map(id, known)) != list(map(id, fixtures)) or len(frames) != len(before):
-            return None
-        return replace(scene, stamp=stamp) if all(unchanged(f, b) for f, b in zip(frames, before, strict=True)) else None
 
     def gather(self, now: float) -> tuple[list[RgbdFrame], list[str], set[str]]:
         """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for; notes; and which cameras stood still."""
@@ -633,18 +634,22 @@ class Perception(Node):
         depths.check_distance(frame.depth, self.topics[stream.name]["depth"], stream.unit, True, REMEDY)
         depths.check_pose(frame, stream.unit, REMEDY, self.parameters.region_low, self.parameters.region_high)
 
+    def world_from_base(self, frame: RgbdFrame) -> np.ndarray | None:
+        """Where the robot's base was at a frame's stamp (4, 4); ``None``: it is the frame of the results.  Raises NO_TRANSFORM."""
+        assert self.robot is not None
+        base = self.robot.robot.base
+        if base == self.frame:
+            return None
+        with self.lock:
+            return self.transforms.buffer.lookup(self.frame, base, frame.stamp)
+
     def without_robot(self, frame: RgbdFrame) -> RgbdFrame:
         """The frame, blind where the robot is; as it is where nobody tells, which the diagnostics then say.  Raises STALE_DATA where the arm is told of, but not
         where it was then: an arm that is not cut out is a thing on the table."""
         if self.robot is None:
             return frame
         try:
-            base = self.robot.robot.base
-            world_from_base = None
-            if base != self.frame:
-                with self.lock:
-                    world_from_base = self.transforms.buffer.lookup(self.frame, base, frame.stamp)
-            frame = self.robot.cut(frame, world_from_base)
+            frame = self.robot.cut(frame, self.world_from_base(frame))
             self.cut[frame.camera] = float(frame.blind.mean()) if frame.blind is not None else 0.0
         except MagicError as error:
             self.cut[frame.camera] = error
@@ -652,15 +657,17 @@ class Perception(Node):
                 raise
         return frame
 
-    def publish(self, scene: Scene, kept: bool = False) -> None:
-        """Objects and markers; kept: nothing but the stamp is other than what was published last."""
-        if kept and self.told is not None:
-            self.told.header.stamp = cv.time_to_msg(scene.stamp)
-            for item in self.told.objects:
-                item.cloud.header.stamp = self.told.header.stamp
+    def publish(self, scene: Scene, kept: Scene | None = None) -> None:
+        """Objects and markers; kept: the scene that this one is but for its stamp."""
+        if self.told is not None and self.told[0] is kept:
+            message = self.told[1]
+            message.header.stamp = cv.time_to_msg(scene.stamp)
+            for item in message.objects:
+                item.cloud.header.stamp = message.header.stamp
         else:
-            self.told, self.unshown = cv.scene_to_msg(scene), scene
-        self.objects_out.publish(self.told)
+            message = cv.scene_to_msg(scene)
+            self.told, self.unshown = (kept or scene, message), scene
+        self.objects_out.publish(message)
         self.show()
 
     def show(self) -> None:

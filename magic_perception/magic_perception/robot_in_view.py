@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import transforms
 from magic_core.camera import NEARLY, SURELY, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.joint_history import JointHistory
@@ -18,6 +19,8 @@ from magic_core.self_filter import Body, Margins, SelfFilter, shown
 SILENT = 2.0
 #: No part of an arm is farther than this from any of its axes, m.
 REACH = 1.5
+#: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds.
+MOVES, MOMENT = 0.002, 0.4
 #: What a thing in the hand may be off where it is said to be, m: the closing fingers turn it.
 IN_HAND = 0.01
 #: What is drawn of it is it, but for the pixels at its edge, and noise.
@@ -111,3 +114,17 @@ class RobotInView:
                 pixels[frame.blind] = 0
             frame = replace(frame, held=pixels if frame.held is None else np.maximum(frame.held, pixels))
         return frame
+
+    def moves(self, stamp: float) -> bool:
+        """Whether a joint of the arm has moved in the last moment before a stamp; false where that is not known."""
+        try:
+            now, then = (self.history.at(self.robot.names, at, self.age) for at in (stamp, stamp - MOMENT))
+        except MagicError:
+            return False
+        return any(abs(now[name] - then[name]) > MOVES for name in self.robot.names)
+
+    def moved(self, held: Held, then: float, now: float, world_from_base: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """What has carried (4, 4), in the world, a thing in the hand from where it was at one stamp to where it is at another; raises as :meth:`cut`."""
+        base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
+        was, here = (base @ self.robot.poses(self.history.at(self.robot.names, at, self.age))[held.link] for at in (then, now))
+        return here @ transforms.inverse(was)

@@ -146,12 +146,13 @@ class Watcher:
 
         from magic_core import qos
         from magic_core.actions import ActionClient
+        from magic_core.listening import join_all
         from magic_interfaces.action import RunStrategy
         from magic_interfaces.msg import SceneObjectArray
 
         # Not the command line: its --topics and --launch hold words that look like remappings.
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        self._rclpy = rclpy
+        self._rclpy, self._joined = rclpy, join_all
         self._say = say
         self._goal_type = RunStrategy.Goal
         self.node = Node("demo")
@@ -160,13 +161,15 @@ class Watcher:
         # The camera_info of an image goes out with it and is small: hearing it tells when the image went, and burdens nobody.
         self._topics = tuple(t for t in topics if t.endswith("camera_info"))
         self.first: dict[str, float] = {}
-        self.scene: Any = None
+        self._objects_type = SceneObjectArray
+        self._objects: bytes | None = None  # as they came last: making objects of them takes long, and few are looked at
+        self._scene: Any = None  # what they are
         self.objects_at: float | None = None
         self.complained_at: float | None = None
         self.replay_at = time.monotonic()
         self.trajectory: Any = None
         self._last = ""
-        self.node.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED)
+        self.node.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED, raw=True)
         self.node.create_subscription(JointTrajectory, "verified_trajectory", self._on_trajectory, qos.LATCHED)
         self.node.create_subscription(MultiDOFJointTrajectory, "verified_tool_trajectory", self._on_trajectory, qos.LATCHED)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE)
@@ -181,12 +184,22 @@ class Watcher:
         with self.changed:
             self.first.setdefault(topic, time.monotonic())
 
-    def _on_objects(self, message: Any) -> None:
+    def _on_objects(self, message: bytes) -> None:
         with self.changed:
-            self.scene = message
-            if self.objects_at is None and any(o.source == "camera" for o in message.objects):
+            self._objects, self._scene = message, None
+            if self.objects_at is None and any(o.source == "camera" for o in self.scene.objects):
                 self.objects_at = time.monotonic()
             self.changed.notify_all()
+
+    @property
+    def scene(self) -> Any:
+        """The newest objects; ``None``: none have come."""
+        from rclpy.serialization import deserialize_message
+
+        with self.changed:
+            if self._scene is None and self._objects is not None:
+                self._scene = deserialize_message(self._objects, self._objects_type)
+            return self._scene
 
     def _on_diagnostics(self, message: Any) -> None:
         """Note since when perception has had frames but no objects; waiting for the first frames is no complaint."""
@@ -262,6 +275,7 @@ class Watcher:
         self.node.destroy_node()
         self._rclpy.try_shutdown()
         self._thread.join(2.0)
+        self._joined()
 
 
 class Pending:

@@ -101,6 +101,7 @@ class Session:
         from tf2_msgs.msg import TFMessage
 
         from magic_core import qos
+        from magic_core.listening import listen_apart
 
         simulated = {"use_sim_time": True}
         nodes = ("perception", "matcher", "planner", "verifier", "strategy_server")
@@ -113,10 +114,10 @@ class Session:
         self.graph.processes["lab"] = Process.start("lab", command, logs / "lab.log", env)
         self.watcher = Watcher((), self._on_line)
         node = self.watcher.node
-        node.create_subscription(TFMessage, "lab/truth", self._on_truth, qos.RELIABLE)
+        listen_apart(node, TFMessage, "lab/truth", self._on_truth, qos.RELIABLE)
         for camera in ("left", "right"):
             topic = f"camera/{camera}/color/image_raw"
-            node.create_subscription(ImageMsg, topic, lambda message, name=camera: self._on_picture(name, message), qos.SENSOR)
+            listen_apart(node, ImageMsg, topic, lambda message, name=camera: self._on_picture(name, message), qos.SENSOR)
         self._parameters = AsyncParameterClient(node, "lab")
         self._reset = node.create_client(Trigger, "lab/reset")
 
@@ -379,9 +380,16 @@ def told(total: dict[str, Any]) -> str:
 
 
 def do(
-    scenario: Scenario, count: int, seed: int, out: Path, objects: Sequence[str] = (), say: Any = print, minutes: float = 0.0
+    scenario: Scenario,
+    count: int,
+    seed: int,
+    out: Path,
+    objects: Sequence[str] = (),
+    say: Any = print,
+    minutes: float = 0.0,
+    rate: float = 1.0,
 ) -> list[dict[str, Any]]:
-    """All trials, those that are on disk already read from there; with ``minutes`` no new one is begun after so long."""
+    """All trials, those that are on disk already read from there; with ``minutes`` no new one is begun after so long; rate: of the laboratory's clock."""
     wanted = [(case.name, seed + k) for k in range(count) for case in scenario.cases if not objects or case.name in objects]
     out.mkdir(parents=True, exist_ok=True)
     records: dict[tuple[str, int], dict[str, Any]] = {}
@@ -392,7 +400,7 @@ def do(
     missing = [key for key in wanted if key not in records]
     end = time.monotonic() + 60 * minutes if minutes > 0 else np.inf
     if missing:
-        with Session(out / "logs") as session:
+        with Session(out / "logs", lab={"rate": rate}) as session:
             session.ready()
             for case, number in missing:
                 if time.monotonic() > end:
@@ -420,6 +428,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--objects", nargs="+", default=[], metavar="NAME", help="with these objects alone")
     parser.add_argument("--seed", type=int, default=0, help="of the first trial; the next ones have the numbers after it (default 0)")
     parser.add_argument("--out", type=Path, required=True, help="folder for results; what is there already is not done again")
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=1.0,
+        help="of the laboratory's clock as a share of the wall's, at most; less where other work shares the machine",
+    )
     parser.add_argument("--minutes", type=float, default=0.0, help="begin no trial after so long; 0: all (default)")
     options = parser.parse_args(argv)
     scenario = scenario_of(options.scenario)
@@ -429,7 +443,7 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"object {unknown[0]!r} (allowed: {', '.join(names)})")
     try:
         environment.prepare()
-        done = do(scenario, options.trials, options.seed, options.out, options.objects, minutes=options.minutes)
+        done = do(scenario, options.trials, options.seed, options.out, options.objects, minutes=options.minutes, rate=options.rate)
     except MagicError as error:
         print(f"trials: {error}", file=sys.stderr)
         return 1
