@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -86,7 +87,8 @@ class Sight:
 
 @dataclass(frozen=True)
 class SeenGoal:
-    """met: whether the goal is met, ``None`` where it cannot be told; message: by what; moving: it would be met if what the goal lets come to rest were at rest."""
+    """met: whether the goal is met, ``None`` where it cannot be told; message: by what; moving: what the goal lets come to rest is seen to move, and nothing
+    else speaks against it: how it moves is why it cannot be told, or may be."""
 
     met: bool | None
     message: str
@@ -142,8 +144,9 @@ def judge(
     unasked = dict.fromkeys(asked.unasked) if found.truth else ()
     moving = False
     if not found.truth:
-        calm = replace(asked, calm=True, unasked=[]).node(strategy.goal.tree, True)
-        moving = calm is not None and calm.truth is True
+        calm = replace(asked, calm=True, unasked=[])
+        rest = calm.node(strategy.goal.tree, True)
+        moving = calm.restless and (rest is None or rest.truth is not False)
     return SeenGoal(found.truth, "; ".join(filter(None, (found.text, f"not looked at: {', '.join(unasked)}" if unasked else ""))), moving)
 
 
@@ -158,8 +161,9 @@ class _Asked:
     table: Array
     hand: Hand
     accuracy: float
-    #: What the goal lets come to rest is taken to be at rest.
+    #: What the goal lets come to rest is taken to be at rest; and whether it was seen to move.
     calm: bool = False
+    restless: bool = False
     #: What was left out, in words.
     unasked: list[str] = field(default_factory=list)
 
@@ -179,7 +183,7 @@ class _Asked:
         if moment is not None and moment.kind == "phase" and not self.at_the_end(moment.args["phase"]):
             return _Told(None, f"that {node_words(node)}: it was not looked at then")
         if node.kind in PREDICATES:
-            return _Told(True, "") if self.calm and rests and node.kind == "at_rest" else self.leaf(node, plain)
+            return self.calmed(node) if self.calm and rests and node.kind == "at_rest" else self.leaf(node, plain)
         plain = plain and node.kind == "all"
         found = [answer for child in node.of if (answer := self.node(child, plain, rests)) is not None]
         if not found:
@@ -194,6 +198,14 @@ class _Asked:
         if untold:
             return _Told(None, "; ".join(dict.fromkeys(answer.text for answer in untold)))
         return _Told(not decisive, "; ".join(dict.fromkeys(answer.text for answer in found if answer.text)))
+
+    def calmed(self, node: Node) -> _Told:
+        """What comes to rest is at rest."""
+        with suppress(LookupError):  # what is not seen is not seen to move
+            what = "target" if node.args["what"] == "row" else node.args["what"]
+            way = self.thing(what, self.now).middle - self.thing(what, self.first).middle
+            self.restless = self.restless or float(np.linalg.norm(way)) > self.accuracy
+        return _Told(True, "")
 
     def at_the_end(self, phase: str) -> bool:
         """Whether what holds at a phase's end is what is looked at: it is the last one in which the tool acts.  The goal that no phase is

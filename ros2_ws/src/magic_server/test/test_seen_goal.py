@@ -107,6 +107,15 @@ def test_what_swings_would_be_met_at_rest_and_what_fell_would_not(swung, height,
     assert (found.met, found.moving) == (met, moving), found.message
 
 
+def test_what_swings_may_touch_where_it_comes_to_rest():
+    """A mean of pictures of what swings lies beside it: whether it touches cannot be told before it rests, and then it is no question of time any more."""
+    phases = ("grasp", "transfer", "contact", "release", "retreat")
+    for swung, moving in ((0.012, True), (0.0, False)):
+        places = [{**STAND, "object_1": at(0.5, y, 0.385, UPRIGHT)} for y in (swung, 0.0)]
+        found = asked("hang", STAND, places[1], AWAY, then=places[0], phases=phases)
+        assert found.met is None and found.moving is moving and "mm from the target" in found.message
+
+
 def test_what_touches_in_one_place_is_not_seen_apart():
     """Points that stand for surfaces lie beside the place where they touch, not on it."""
     cup, rod = from_trimesh(trimesh.creation.annulus(0.04, 0.045, 0.1)), ROD.transformed(transforms.from_rpy(np.pi / 4, 0.0, 0.0))
