@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.scene import ROBOT, UNSEEN, Scene, SceneObject
@@ -80,11 +79,13 @@ def _veil(frame: RgbdFrame) -> NDArray[np.bool_]:
 
 
 def _carried(item: SceneObject, moved: NDArray[np.float64]) -> SceneObject:
+    """A thing that was carried; without points: nobody has looked where it is in the hand."""
     return replace(
         item,
         world_from_object=moved @ item.world_from_object,
         world_from_box=moved @ item.world_from_box,
-        points=transforms.apply(moved, item.points),
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
     )
 
 

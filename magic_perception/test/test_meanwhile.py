@@ -1,5 +1,8 @@
 """While the arm moves, and nothing else does, the scene stays, what the arm holds goes along, and what it hides is marked."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 from test_robot_in_view import OVER_THE_TABLE, REGION, hook_at, placed, seen, things
@@ -19,9 +22,8 @@ THEN, NOW = 10.0, 13.0
 
 
 @pytest.fixture(scope="module")
-def panda():
-    robot = Description()
-    return robot, RobotPictures(robot)
+def robot():
+    return Description()
 
 
 def told(robot, joints, held=()):
@@ -35,15 +37,36 @@ def told(robot, joints, held=()):
     return view
 
 
-def means(view, meshes, seed, stamp):
+@cache
+def pictures(what, where):
+    """Three frames of each camera of what is there, by name, with the arm at joints."""
+    robot = Description()
+    caliper, cylinder = things()
+    meshes = {
+        "things": [caliper, cylinder],
+        "moved": [caliper.transformed(transforms.make(translation=[0.0, 0.01, 0.0])), cylinder],
+        "come": [caliper, cylinder, placed("cylinder", 9, 0.45, 0.2, radius=0.015)],
+        "gone": [cylinder],
+        "hook": [hook_at(robot)[1].transformed(way(robot, OVER, where))],
+    }[what]
+    meshes += RobotPictures(robot).at(np.array(where))
+    return [seen(meshes, len(what) + 10 * k) for k in range(3)]
+
+
+def way(robot, *joints):
+    """What carries a thing in the hand from one place of the arm to another."""
+    then, now = (robot.forward(np.array(each[:7]))[0] for each in joints)
+    return now @ transforms.inverse(then)
+
+
+def means(view, what, where, stamp):
     """The mean of three frames of each camera."""
-    return [
-        average([view.cut(frame) for frame in frames]) for frames in zip(*(seen(meshes, seed + k, stamp) for k in range(3)), strict=True)
-    ]
+    frames = [[view.cut(replace(frame, stamp=stamp)) for frame in each] for each in pictures(what, tuple(where))]
+    return [average(list(each)) for each in zip(*frames, strict=True)]
 
 
-def made(view, meshes, carried=()):
-    frames = means(view, meshes, 10, THEN)
+def made(view, what, where):
+    frames = means(view, what, where, THEN)
     report = Report()
     scene = perceive(frames, (), REGION, report=report)
     masks = {i: [image == n for image in report.labels] for i, n in report.numbers.items()}
@@ -51,67 +74,46 @@ def made(view, meshes, carried=()):
     return Made(scene, frames, (), view.held, masks, hanging)
 
 
-def now(view, meshes):
-    return means(view, meshes, 20, NOW)
-
-
-def test_the_scene_stays_while_the_arm_alone_moves(panda):
-    robot, pictures = panda
+def test_the_scene_stays_while_the_arm_alone_moves(robot):
     view = told(robot, (ASIDE, OVER))
-    before = made(view, [*things(), *pictures.at(ASIDE)])
+    before = made(view, "things", ASIDE)
     assert len(before.scene.objects) == 2 and not any(o.cut_off for o in before.scene.objects)
-    frames = now(view, [*things(), *pictures.at(OVER)])
+    frames = means(view, "things", OVER, NOW)
     assert not before.same(frames)
     scene = before.meanwhile(frames, view)
     assert scene is not None and scene.stamp == NOW
     for item, was in zip(scene.objects, before.scene.objects, strict=True):
         assert item.id == was.id and item.mesh is was.mesh
-        hidden = [m & f.blind for m, f in zip(before.masks[item.id], frames, strict=True)]
-        share = max(h.sum() / m.sum() for h, m in zip(hidden, before.masks[item.id], strict=True))
-        assert (ROBOT in item.cut_off) == (share >= 0.05)
+        hidden = [(m & f.blind).sum() / m.sum() for m, f in zip(before.masks[item.id], frames, strict=True)]
+        assert (ROBOT in item.cut_off) == (max(hidden) >= 0.05)
     assert any(ROBOT in item.cut_off for item in scene.objects)
 
 
 @pytest.mark.parametrize("what", ["moved", "come", "gone"])
-def test_what_else_changes_is_looked_at(panda, what):
-    robot, pictures = panda
-    view = told(robot, (OVER, ASIDE))
-    caliper, cylinder = things()
-    before = made(view, [caliper, cylinder, *pictures.at(OVER)])
-    before = Made(before.scene, before.frames, (), (), before.masks, frozenset(o.id for o in before.scene.objects if o.cut_off))
-    after = {
-        "moved": [caliper.transformed(transforms.make(translation=[0.0, 0.01, 0.0])), cylinder],
-        "come": [caliper, cylinder, placed("cylinder", 9, 0.45, 0.2, radius=0.015)],
-        "gone": [cylinder],
-    }[what]
-    assert before.meanwhile(now(view, [*after, *pictures.at(ASIDE)]), view) is None
+def test_what_else_changes_is_looked_at(robot, what):
+    view = told(robot, (ASIDE, OVER))
+    assert made(view, "things", ASIDE).meanwhile(means(view, what, OVER, NOW), view) is None
 
 
-def test_an_arm_that_stands_is_looked_past(panda):
-    robot, pictures = panda
+def test_an_arm_that_stands_is_looked_past(robot):
     view = told(robot, (ASIDE, ASIDE))
-    before = made(view, [*things(), *pictures.at(ASIDE)])
-    frames = now(view, [*things(), *pictures.at(ASIDE)])
+    before, frames = made(view, "things", ASIDE), means(view, "things", ASIDE, NOW)
     assert before.meanwhile(frames, view) is None and before.same(frames) and before.recent(frames, ())
-    later = [type(f)(f.color, f.depth, f.intrinsics, f.world_from_camera, f.camera, THEN + AFRESH) for f in frames]
-    assert not before.recent(later, ())
+    assert not before.recent([replace(frame, stamp=THEN + AFRESH) for frame in frames], ())
 
 
-def test_what_is_held_goes_along(panda):
-    robot, pictures = panda
-    item, hook = hook_at(robot)
-    link = robot.config.move_group
-    turned = OVER_THE_TABLE + np.array([0.3, 0, 0, 0, 0, 0, 0, 0, 0])
-    view = told(robot, (OVER_THE_TABLE, turned), (Held.of(item, link),))
-    tips = [robot.forward(joints[:7])[0] for joints in (OVER_THE_TABLE, turned)]
-    way = tips[1] @ transforms.inverse(tips[0])
-    before = made(view, [hook, *pictures.at(OVER_THE_TABLE)])
+def test_what_is_held_goes_along(robot):
+    item, _ = hook_at(robot)
+    turned = OVER + np.array([0.3, 0, 0, 0, 0, 0, 0, 0, 0])
+    view = told(robot, (OVER, turned), (Held.of(item, robot.config.move_group),))
+    before, frames = made(view, "hook", OVER), means(view, "hook", turned, NOW)
     assert len(before.carried) == 1
-    scene = before.meanwhile(now(view, [hook.transformed(way), *pictures.at(turned)]), view)
+    scene = before.meanwhile(frames, view)
     assert scene is not None
     (carried,), (was,) = scene.objects, before.scene.objects
-    np.testing.assert_allclose(carried.world_from_object, way @ was.world_from_object, atol=1e-3)
-    np.testing.assert_allclose(carried.points, transforms.apply(way, was.points), atol=1e-3)
-    # Let go meanwhile, or something else is held: looked at anew.
+    gone = way(robot, OVER, turned)
+    np.testing.assert_allclose(carried.world_from_object, gone @ was.world_from_object, atol=1e-3)
+    assert len(carried.points) == 0 < len(was.points), "where it is in the hand nobody has looked"
+    # Let go meanwhile: looked at anew.
     view.held = ()
-    assert before.meanwhile(now(view, [hook.transformed(way), *pictures.at(turned)]), view) is None
+    assert before.meanwhile(frames, view) is None
