@@ -19,8 +19,9 @@ from magic_core.self_filter import Body, Margins, SelfFilter, shown
 SILENT = 2.0
 #: No part of an arm is farther than this from any of its axes, m.
 REACH = 1.5
-#: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds.
-MOVES, MOMENT = 0.002, 0.4
+#: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds: a picture taken 0.2 s after it stopped is one of an arm that
+#: stands, and the tool in its hand is looked at in it.
+MOVES, MOMENT = 0.002, 0.15
 #: What a thing in the hand may be off where it is said to be, m: the closing fingers turn it.
 IN_HAND = 0.01
 #: What is drawn of it is it, but for the pixels at its edge, and noise.

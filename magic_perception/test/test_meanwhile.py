@@ -102,6 +102,14 @@ def test_an_arm_that_stands_is_looked_past(robot):
     assert not before.recent([replace(frame, stamp=THEN + AFRESH) for frame in frames], ())
 
 
+def test_an_arm_stands_a_moment_after_it_stopped(robot):
+    view = RobotInView(robot)
+    for stamp in np.arange(9.0, 11.0, 0.01):
+        positions = robot.arm_positions(OVER + min(stamp - 10.0, 0.0) * 0.2)
+        view.history.take(list(positions), list(positions.values()), float(stamp))
+    assert view.moves(9.99) and view.moves(10.05) and not view.moves(10.2) and not view.moves(20.0)
+
+
 def test_what_is_held_goes_along(robot):
     item, _ = hook_at(robot)
     turned = OVER + np.array([0.3, 0, 0, 0, 0, 0, 0, 0, 0])
