@@ -36,7 +36,7 @@ from magic_matcher import curvature, enclosing, facing, global_stage, holding, s
 from magic_matcher.contour import Contour
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
-from magic_matcher.plausible import Demands, Refusal, demands, refusals, room_for
+from magic_matcher.plausible import Demands, Refusal, demands, lesser, refusals, room_for
 
 #: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
 #: all of these are refused.
@@ -55,13 +55,15 @@ DRAWN = 16 * 2**20
 DOWN = np.deg2rad(20.0)
 #: By so much a match in another view must be better for the tool to be turned for it.
 WORTH_TURNING = 0.05
+#: A tool that is turned by so much (rad) for a place is held and led another way; one that need not be turned at all by so much.
+ANOTHER_WAY, PRESENT_WAY = np.deg2rad(45.0), np.deg2rad(5.0)
 
 
 @dataclass(frozen=True)
 class MatchResult:
     """candidates best first (of all tools together); heatmap (H, W) float32 0..1 over the view
     of the best candidate's tool, ``None`` unless asked for; views: the view in which its
-    candidates were found, for each tool id; target_id: '' where the target came as a view or there was none; refused: why other tools have no candidate."""
+    best candidates were found, for each tool id (:func:`magic_core.views.view_of_contact` gives the view of each); target_id: '' where the target came as a view or there was none; refused: why other tools have no candidate."""
 
     candidates: tuple[ContactCandidate, ...]
     heatmap: NDArray[np.float32] | None
@@ -497,19 +499,21 @@ class Matcher:
         return first, tuple(target_contact(one, view, world_from_object, self) for one in further)
 
     def _seen_best(self, task: _Task, tool: Tool) -> _Seen:
-        """The tool's candidates in the one of its views that shows the contact best.
+        """The tool's candidates: those of the one of its views that shows the contact best, then those of its other views.
 
         The view as the tool stands is taken where the match in it is clear, or where no other is better by enough to turn the tool;
-        if it is askew, only where no other shows a contact.  Raises NO_MATCH with what the best place of all views lacks, HANDLE_NOT_SEEN
-        where a loop is asked for, none shows, and a part of the tool large enough for one was not seen.
+        if it is askew, only where no other shows a contact.  What other views show comes after all that the best one shows, as what
+        has to be turned for the one may be in no hand's reach.  Where these are few, and a simulation can judge what is tried, places that show
+        less (:func:`magic_matcher.plausible.lesser`) come after them.  Raises NO_MATCH with what the best place of all views lacks,
+        HANDLE_NOT_SEEN where a loop is asked for, none shows, and a part of the tool large enough for one was not seen.
         """
         failures: list[tuple[float, MagicError]] = []
         looked: list[CanonicalView] = []
 
-        def look(view: CanonicalView) -> _Seen | None:
+        def look(view: CanonicalView, asked: Demands) -> _Seen | None:
             looked.append(view)
             try:
-                seen = self._in_view(task, tool, view)
+                seen = self._in_view(task, tool, view, asked)
             except MagicError as error:
                 failures.append((-1.0, error))
                 return None
@@ -518,23 +522,34 @@ class Matcher:
                 return None
             return seen
 
-        best = None if tool.askew else look(tool.view)
-        if best is not None and max(c.s_dino for c in best.candidates) >= self.backend.clear:
-            return _told(task, tool, best)
-        value = -np.inf if best is None else best.candidates[0].score + WORTH_TURNING
-        for view in tool.others():
-            seen = look(view)
-            if seen is not None and seen.candidates[0].score > value:
-                best, value = seen, seen.candidates[0].score
-        if best is None and tool.askew:
-            best = look(tool.view)
-        if best is None:
+        present = None if tool.askew else look(tool.view, task.asked)
+        if present is not None and max(c.s_dino for c in present.candidates) >= self.backend.clear:
+            return _told(task, tool, present)
+        others = tool.others()
+        seen = [found for view in others if (found := look(view, task.asked)) is not None]
+        if tool.askew and not seen:
+            present = look(tool.view, task.asked)
+        if present is not None:
+            seen.append(present)
+        seen.sort(key=lambda s: -s.candidates[0].score - (WORTH_TURNING if s is present else 0.0))
+        # A loop that was not seen is asked for (HANDLE_NOT_SEEN) and not made do without.
+        judged = tool.mesh is not None and not task.asked.loop and not task.further
+        if judged and sum(len(s.candidates) for s in seen) < task.top_k:
+            less = [found for view in others if (found := look(view, lesser(task.asked))) is not None]
+            if not tool.askew or not (seen or less):
+                found = look(tool.view, lesser(task.asked))
+                less += [] if found is None else [found]
+            seen += sorted(less, key=lambda s: -s.candidates[0].score)
+        if not seen:
             error = max(failures, key=lambda failure: failure[0])[1]
             raise _not_seen(task, tool, looked, error) or error
-        return _told(task, tool, best)
+        told = [_told(task, tool, one) for one in seen]
+        near = 0.0 if tool.mesh is None else SAME_PLACE * float(tool.mesh.extents.max())
+        rest = [(one, before.view is tool.view and not tool.askew) for one, before in zip(told[1:], seen[1:], strict=True)]
+        return replace(told[0], candidates=[*told[0].candidates, *_further(told[0], rest, near, task.top_k)])
 
-    def _in_view(self, task: _Task, tool: Tool, view: CanonicalView) -> _Seen:
-        """The best different places of one view that can stand in for the contact."""
+    def _in_view(self, task: _Task, tool: Tool, view: CanonicalView, asked: Demands | None = None) -> _Seen:
+        """The best different places of one view that can stand in for the contact; asked: what they have to show, by default the task's."""
         contour = contours.extract(view.mask)
         radius = None if task.disc is None else task.disc / view.metres_per_pixel
         proposals = self.backend.propose(task.prepared, view, contour, radius, RESERVE * task.top_k, task.heatmap)
@@ -542,7 +557,7 @@ class Matcher:
         first = len(proposals.proposals) if task.further else OVERSAMPLING * task.top_k
         refused: list[Refusal] = []
         for some in (proposals.proposals[:first], proposals.proposals[first:]):
-            candidates, why = self._refine(task, tool, view, contour, radius, some)
+            candidates, why = self._refine(task, tool, view, contour, radius, some, asked)
             refused += why
             if candidates:
                 break
@@ -596,7 +611,14 @@ class Matcher:
         return joined, []
 
     def _refine(
-        self, task: _Task, tool: Tool, view: CanonicalView, contour: Contour, radius: float | None, proposals: Sequence[Proposal]
+        self,
+        task: _Task,
+        tool: Tool,
+        view: CanonicalView,
+        contour: Contour,
+        radius: float | None,
+        proposals: Sequence[Proposal],
+        asked: Demands | None = None,
     ) -> tuple[list[ContactCandidate], list[Refusal]]:
         """The local stage on proposals and the score of those that can stand in for the contact; why the others cannot."""
         reference, target = task.reference, task.target
@@ -611,7 +633,7 @@ class Matcher:
             curves = holding.centres(around, radius)
             pairs = [(p, _steadied(task.asked, contour, p, e, radius, curves)) for p, e in pairs]
         refused = refusals(
-            task.asked,
+            asked or task.asked,
             contour,
             np.array([e.point for _, e in pairs]),
             np.array([e.normal for _, e in pairs]),
@@ -683,6 +705,26 @@ def _steadied(
         return found
     held = holding.steadied(contour, found.point, found.normal, radius, curves, asked.hollow)
     return found if held is None else replace(found, point=held[0], normal=held[1])
+
+
+def _further(best: _Seen, others: Sequence[tuple[_Seen, bool]], near: float, count: int) -> list[ContactCandidate]:
+    """Candidates of other views, in their order, that make up those of the best view to ``count``; none promises more than those before it.
+
+    A place within ``near`` metres of one that there is already is another candidate only if the tool is held another way for it; with each
+    view: whether it is the present one, for which the tool need not be turned at all, so that a little askew is another way.
+    """
+    least = min(c.score for c in best.candidates)
+    found, more = list(best.candidates), []
+    for candidate, another in ((c, PRESENT_WAY if present else ANOTHER_WAY) for one, present in others for c in one.candidates):
+        frame = candidate.tool.object_from_contact
+        known = (c.tool.object_from_contact for c in found)
+        if len(found) < count and not any(
+            np.linalg.norm(frame[:3, 3] - k[:3, 3]) < near and abs(frame[:3, 2] @ k[:3, 2]) > np.cos(another) for k in known
+        ):
+            found.append(candidate)
+            least = min(least, candidate.score)
+            more.append(replace(candidate, score=least))
+    return more
 
 
 def _told(task: _Task, tool: Tool, seen: _Seen) -> _Seen:

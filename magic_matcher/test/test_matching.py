@@ -188,6 +188,52 @@ def test_the_sign_is_the_references(matcher):
     assert plausible.demands(bump, 0.3) == plausible.Demands(False, 0.3, None, None)
 
 
+def test_a_shallow_hollow_will_do_where_a_simulation_judges(matcher):
+    # A disc of 40 px on a bar lies against a step of 10 px: their normals are 41 degrees apart, and led along one 30 degrees from the step's
+    # the disc climbs over it by 1 - cos 30 = 0.134 radii.
+    v, u = np.mgrid[0:200, 0:400]
+    mask = ((v >= 100) & (v < 140) & (u >= 20) & (u < 360)) | ((v >= 90) & (v < 100) & (u >= 300) & (u < 360))
+    radius, c = 40.0, contour.extract(mask)
+    normal = np.array([[-np.sin(np.deg2rad(11.4)), -np.cos(np.deg2rad(11.4))]])
+    point = np.array([[300 - np.sqrt(40.0**2 - 30.0**2), 60.0]]) - radius * normal
+    reference, _ = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    asked = replace(plausible.demands(reference, 0.0), gap=None)
+    given = (c, point, normal, np.array([True]), np.array([0.9]), radius, 0.001)
+    assert asked.hollow == pytest.approx(0.2)
+    (refusal,) = plausible.refusals(asked, *given)
+    assert refusal.what == "depth of the hollow" and float(refusal.value.split()[0]) == pytest.approx(40 * 0.134, abs=1.0)
+    assert plausible.refusals(plausible.lesser(asked), *given) == [None]
+    # Led the other way it rolls off the bar, however little is asked for.
+    (refusal,) = plausible.refusals(plausible.lesser(asked), c, point, normal * [-1.0, 1.0], *given[3:])
+    assert refusal.what == "depth of the hollow"
+    assert plausible.lesser(plausible.Demands(True, 0.3, None, None)).hollow is None
+
+
+def test_other_views_make_up_the_candidates(matcher):
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    tools, target = [matching.Tool("same", reference.view)], jobs.disc_target(0.025, "top")
+    one = matcher.match_views(reference, contact, tools, target, 1, reference_target_radius=0.025).candidates[0]
+
+    def seen(*candidates):
+        """Candidates by place, m along x, turn of the view about the normal, degrees, and score."""
+        found = []
+        for x, turn, score in candidates:
+            frame = transforms.make(translation=[x, 0, 0]) @ transforms.from_rotvec([np.deg2rad(turn), 0, 0])
+            found.append(replace(one, score=score, tool=replace(one.tool, object_from_contact=frame)))
+        return matching._Seen(reference.view, found, None, None)
+
+    best = seen((0.0, 0, 0.5))
+    # The same place seen a little askew, and from behind, is no other; held across it is one, and so is another place.
+    others = [(seen((0.001, 20, 0.6), (0.0, 180, 0.58)), False), (seen((0.0, 90, 0.55), (0.05, 0, 0.4)), False)]
+    others.append((seen((0.1, 0, 0.45), (0.2, 0, 0.3)), False))
+    more = matching._further(best, others, 0.01, 4)
+    assert [(c.tool.object_from_contact[0, 3], c.score) for c in more] == [(0.0, 0.5), (0.05, 0.4), (0.1, 0.4)]
+    assert matching._further(best, others, 0.01, 1) == []
+    # As the tool stands, a little askew from the best view, it is one as well.
+    more = matching._further(best, [(seen((0.001, 20, 0.6), (0.0, 0, 0.6)), True)], 0.01, 4)
+    assert [(c.tool.object_from_contact[0, 3], c.score) for c in more] == [(0.001, 0.5)]
+
+
 # ---------------------------------------------------------------- tools in any attitude
 
 
