@@ -3,7 +3,7 @@
 Recorded tosses of a cube are simulated in the verifier's own world, and the question is
 which face ends up.  The state from which a toss is simulated is fitted to its rows of free
 flight, before anything touches.  Once each toss is simulated as it was recorded; then
-again and again with what is not known drawn at random (friction, velocities, turn), as
+again and again with what is not known drawn at random (friction, restitution, velocities, turn), as
 the verifier does with a motion.  The share of those rollouts that agree is the
 confidence of their answer, and what matters is whether it is worth that much.
 
@@ -37,18 +37,23 @@ from magic_verifier.simulation import DYNAMIC, Settings, World
 CHOSEN_ON = 4
 #: The corners of a cube of half edge 1.
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+#: Directions (7, 3) to the points that stand for a rounded corner of an octant: along its axes, so that the faces stay flat, and between them.
+ROUND = np.array([d / np.linalg.norm(d) for d in itertools.product((0.0, 1.0), repeat=3) if any(d)])
 #: A rollout ends when the cube has been slower than this (m/s, rad/s) for REST_STEPS steps, else after LONGEST seconds.
 REST_SPEED, REST_SPIN, REST_STEPS, LONGEST = 0.02, 0.2, 24, 3.0
+#: Slower than this (m/s) nothing springs back: a cube would never come to rest.
+BOUNCES = 0.05
 #: Edges of the bins of the reliability diagram: shares of rollouts that agree.
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.999, 1.0)
 
 
 @dataclass(frozen=True)
 class Spread:
-    """What a rollout draws: friction uniformly from (low, high); relative standard deviations of each component of
+    """What a rollout draws: friction and restitution uniformly from (low, high); relative standard deviations of each component of
     velocity and spin; standard deviation of the turn about each axis in rad."""
 
     friction: tuple[float, float]
+    restitution: tuple[float, float]
     velocity: float
     spin: float
     turn: float
@@ -56,10 +61,11 @@ class Spread:
 
 @dataclass(frozen=True)
 class Setting:
-    """What was recorded: edge (m) and mass (kg) of the cube, rows a second, height of the table (m), clearance above which the cube
-    flies freely (m), and the spread of what is not known."""
+    """What was recorded: edge (m), rounding of its edges and corners (radius, m) and mass (kg) of the cube, rows a second, height of
+    the table (m), clearance above which the cube flies freely (m), and the spread of what is not known."""
 
     edge: float
+    rounding: float
     mass: float
     rate: float
     table: float
@@ -70,6 +76,11 @@ class Setting:
     def density(self) -> float:
         """kg/m^3."""
         return self.mass / self.edge**3
+
+    @property
+    def hull(self) -> NDArray[np.float64]:
+        """The corners (N, 3) of the cube as it is simulated, m."""
+        return np.concatenate([corner * (self.edge / 2 - self.rounding + self.rounding * ROUND) for corner in CORNERS])
 
 
 @dataclass(frozen=True)
@@ -109,7 +120,7 @@ def load_setting(path: Path) -> Setting:
     try:
         data = yaml.safe_load(path.read_text())
         spread = data.pop("spread")
-        return Setting(**data, spread=Spread(**{**spread, "friction": tuple(spread["friction"])}))
+        return Setting(**data, spread=Spread(**{**spread, **{name: tuple(spread[name]) for name in ("friction", "restitution")}}))
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
         raise MagicError(Code.BAD_REQUEST, str(path), str(error), "the keys of magic_verifier/config/reality.yaml") from error
 
@@ -163,17 +174,18 @@ def as_toss(number: int, rows: NDArray[np.float64], setting: Setting) -> Toss:
 def rollout(toss: Toss, setting: Setting, draw: np.random.Generator | None) -> int:
     """The face that ends up in one simulation; ``draw``: what the unknown is drawn with, ``None`` for the middle of it."""
     spread = setting.spread
-    friction, velocity, spin, rotation = float(np.mean(spread.friction)), toss.velocity, toss.spin, toss.rotation
+    friction, restitution = float(np.mean(spread.friction)), float(np.mean(spread.restitution))
+    velocity, spin, rotation = toss.velocity, toss.spin, toss.rotation
     if draw is not None:
-        friction = float(draw.uniform(*spread.friction))
+        friction, restitution = float(draw.uniform(*spread.friction)), float(draw.uniform(*spread.restitution))
         velocity = velocity * (1 + spread.velocity * draw.standard_normal(3))
         spin = spin * (1 + spread.spin * draw.standard_normal(3))
         rotation = Rotation.from_rotvec(spread.turn * draw.standard_normal(3)) * rotation
-    # A thrown cube is not damped by the air.
-    world = World(Settings(angular_damping=0.0))
+    # A thrown cube is not damped by the air, and springs back at any speed.
+    world = World(Settings(angular_damping=0.0, restitution=restitution, bounce_threshold=BOUNCES))
     world.add_table(np.array([0.0, 0.0, 1.0, -setting.table]), friction)
     pose = transforms.make(rotation.as_matrix(), [0.0, 0.0, toss.position[2]])
-    world.add("cube", [CORNERS * setting.edge / 2], pose, DYNAMIC, setting.density, friction)
+    world.add("cube", [setting.hull], pose, DYNAMIC, setting.density, friction)
     cube = world.component("cube")
     cube.linear_velocity = velocity.astype(np.float32)
     cube.angular_velocity = spin.astype(np.float32)

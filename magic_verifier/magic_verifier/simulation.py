@@ -51,6 +51,7 @@ class Settings:
 
     frequency in Hz; contact_offset in metres: pairs nearer than twice this are
     solved (PhysX's default of 10 mm makes things of 20 mm hover and stick);
+    restitution counts where bodies meet faster than bounce_threshold (m/s);
     max_depenetration_speed in m/s: how fast an initial overlap is pushed apart;
     angular_damping in 1/s; rolling_damping, the same for balls, stands for the rolling
     resistance that PhysX does not have (5 / s slows a ball of 0.1 m/s by 0.14 m/s^2, a
@@ -64,6 +65,7 @@ class Settings:
     contact_offset: float = 0.001
     rest_offset: float = 0.0
     restitution: float = 0.0
+    bounce_threshold: float = 2.0
     max_depenetration_speed: float = 0.5
     linear_damping: float = 0.0
     angular_damping: float = 0.5
@@ -189,7 +191,7 @@ class World:
         # Configuration is global in SAPIEN and read when the system is made.
         sapien.physx.set_scene_config(
             gravity=np.array([0, 0, -self.settings.gravity], dtype=np.float32),
-            bounce_threshold=2.0,
+            bounce_threshold=self.settings.bounce_threshold,
             enable_pcm=True,
             enable_tgs=True,
             enable_ccd=False,

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_verifier import reality
+from magic_verifier.simulation import DYNAMIC, Settings, World
 
 PARAMETERS = Path(__file__).resolve().parents[1] / "config" / "reality.yaml"
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "contacts"
@@ -67,6 +69,34 @@ def test_a_cube_dropped_flat_keeps_its_face_and_one_that_tips_changes_it(setting
     # Leaning by 60 degrees about y it falls on to the side that it leans to, by less than what is drawn of its turn.
     leaning = replace(flat, position=np.array([0, 0, 0.075]), rotation=Rotation.from_euler("y", 60, degrees=True))
     assert reality.rollout(leaning, setting, None) == reality.face_up(Rotation.from_euler("y", 90, degrees=True))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_a_rounded_cube_is_flat_on_its_faces_and_short_at_edges_and_corners(setting, share):
+    half, rounding = setting.edge / 2, share * setting.edge
+    hull = replace(setting, rounding=rounding).hull
+    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+        reach = hull @ axis
+        assert reach.max() == pytest.approx(half)
+        flat = hull[reach > half - 1e-9] @ (np.eye(3) - np.outer(axis, axis))
+        assert np.abs(flat).max() == pytest.approx(half - rounding)
+    for count, way in ((2, [1.0, -1, 0]), (3, [1.0, 1, -1])):
+        reach = float((hull @ np.array(way)).max()) / np.sqrt(count)
+        assert reach == pytest.approx(np.sqrt(count) * half - (np.sqrt(count) - 1) * rounding)
+
+
+def test_a_cube_springs_back_by_its_restitution(setting):
+    height = {}
+    for restitution in (0.0, 0.5):
+        world = World(Settings(restitution=restitution, bounce_threshold=reality.BOUNCES))
+        world.add_table(np.array([0.0, 0.0, 1.0, 0.0]), 0.2)
+        world.add("cube", [setting.hull], transforms.make(translation=[0, 0, 0.1 + setting.edge / 2]), DYNAMIC, setting.density, 0.2)
+        upwards = 0.0
+        while world.time < 0.25:  # it falls for 0.143 s
+            world.step()
+            upwards = max(upwards, float(world.velocity("cube")[2]))
+        height[restitution] = upwards**2 / (2 * 9.81)
+    assert height[0.0] < 1e-4 and height[0.5] == pytest.approx(0.25 * 0.1, rel=0.15)
 
 
 def test_a_rollout_has_a_seed_of_its_own(setting):
