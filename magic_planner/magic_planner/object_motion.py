@@ -42,7 +42,7 @@ STEP_ANGLE = np.deg2rad(2.0)
 #: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up.
 TABLE_CLEARANCE, LOW_SHARE = 0.001, 0.2
 #: By so much (rad) a tool is turned out of the attitude in which its contact was seen, where it would pass over its target in that.
-LEVELLED = np.deg2rad(30.0)
+LEVELLED = np.deg2rad(45.0)
 #: How quickly the tool takes up and loses its speed between waypoints, m/s^2.
 ACCELERATION = 1.0
 #: How long a waypoint that does not move the tool lasts (the gripper opens), seconds.

@@ -144,7 +144,7 @@ def test_a_tool_in_a_gripper_keeps_off_the_table_as_off_other_things_and_meets_a
     assert lowest == pytest.approx(above, abs=1e-6)
 
 
-@pytest.mark.parametrize(("askew", "height", "flat"), [(20, 0.03, True), (20, 0.3, False), (40, 0.03, False)])
+@pytest.mark.parametrize(("askew", "height", "flat"), [(20, 0.03, True), (20, 0.3, False), (40, 0.03, True), (60, 0.03, False)])
 def test_a_tool_seen_a_little_askew_is_led_flat_where_it_would_pass_over_a_low_target(askew, height, flat):
     strategy, _tool, _, _ = setup()
     tool, tool_contact = scenes.hook()
