@@ -68,7 +68,8 @@ class ArmRun:
     Where the gripper of a plan closes at its very start the tool is in the hand already:
     the fingers are about it, and it does not fall before they have closed.  It is then held where
     the plan has it: real pads have turned it as they do, which those about its reconstruction would do once more.
-    ``lag``: seconds by which the arm follows its command late.
+    ``lag``: seconds by which the arm follows its command late; ``begin``: the moment of the trajectory at which a run
+    with an empty hand begins.
     """
 
     variant = "arm"
@@ -82,6 +83,7 @@ class ArmRun:
         robot: Description | None = None,
         held: Held | None = None,
         lag: float = 0.0,
+        begin: float = 0.0,
     ) -> None:
         self.robot = robot = robot or panda()
         motion = plan.arm_motion
@@ -139,7 +141,8 @@ class ArmRun:
             self._arm.place(self._q[0], min(motion.grasp_width + WIDER, robot.config.opening))
             self.world.component(TOOL).disable_gravity = True
         elif held is None:
-            self._arm.place(self._q[0])
+            self._index = self._first = min(round(begin * frequency), len(self._q) - 1)
+            self._arm.place(self._q[self._index])
             self._arm.open_fingers()
         else:
             self._index = self._first = min(round(held.time * frequency), len(self._q) - 1)

@@ -6,7 +6,7 @@ and a sentence, within its deadline.
 
 A verdict is a set of rollouts.  The first is the scene as given, the whole motion; each
 further one is a draw of what is not known (:mod:`magic_verifier.uncertainty`), from where
-the tool comes near anything.  The rollouts end as soon as the interval of the success
+the tool comes near anything; an arm takes hold of a seen tool before.  The rollouts end as soon as the interval of the success
 rate lies on one side of the rate that is required.
 """
 
@@ -54,6 +54,8 @@ ROLLOUTS = 24
 LEAD, NEAR = 0.1, 0.03
 #: A drawn rollout takes steps so many times as long as the scene as given: the longest for which the tool is slow enough (:func:`_longer`).
 LONGER = {"fg": (4.0, 2.0), "arm": (2.0,)}
+#: A drawn rollout of a tool that cameras saw begins with its grasp, from so many seconds before the fingers close until so many after.
+BEFORE_GRASP, AFTER_GRASP = 0.6, 1.0
 #: How an arm's hand yields (N/m): a usual stiffness of Cartesian impedance control.
 STIFFNESS = 2000.0
 #: Two-sided 95 % of the normal distribution.
@@ -380,15 +382,18 @@ def rollout(
     recorder = held = None
     run: Any = None
     metrics: dict[str, float] = {}
+    grasped = 0.0
 
     def simulated() -> float:
-        return float(run.world.time) if run is not None else 0.0
+        return grasped + (float(run.world.time) if run is not None else 0.0)
 
     try:
         stop.check(0.0)
         setup = task.setup if drawn is None else task.under(drawn)
         limits = limits if drawn is None else limits.yielding()
         if plan.variant == "arm":
+            if drawn is not None and _grasp_is_drawn(task):
+                grasped = _take_hold(task, drawn, limits, stop)
             run = _arm_run(task, setup, drawn)
         elif drawn is None:
             run = FloatingRun(setup, plan)
@@ -461,16 +466,50 @@ def _moving_from(task: Task, setup: Setup) -> float:
     return task.start
 
 
+def _grasp_is_drawn(task: Task) -> bool:
+    """Whether drawn rollouts take hold of the tool anew: of one whose shape cameras gave, which is not in the hand when the plan begins."""
+    motion = task.plan.arm_motion
+    return motion is not None and motion.grasp_time > 0 and task.eyes[0][0] == task.uncertainty.camera
+
+
+def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> float:
+    """The grasp of a drawn rollout, the tool on the table as far off as it is drawn to be in the hand and shaped as drawn; simulated seconds.
+
+    What is seen of a lying thing is its top: how steep its sides are, between which the fingers close, is the reconstruction's guess.
+    Steps are short, as closing fingers bear no longer ones.  Raises as the run does.
+    """
+    from magic_verifier.arm_simulation import ArmRun
+
+    motion = task.plan.arm_motion
+    assert motion is not None
+    setup = replace(task, longer=1.0).under(drawn)
+    lying = setup.tool.world_from_object @ drawn.tool_from_held
+    setup = replace(setup, tool=replace(setup.tool, world_from_object=lying))
+    begin, end = max(motion.grasp_time - BEFORE_GRASP, 0.0), min(motion.grasp_time + AFTER_GRASP, task.start)
+    run = ArmRun(setup, task.plan, _drawn_options(task, drawn), limits, task.robot, None, drawn.lag, begin)
+    while run.time < end:
+        run.advance()
+        if run.world.steps % CHECK_EVERY == 0:
+            stop.check(float(run.world.time))
+    return float(run.world.time)
+
+
+def _drawn_options(task: Task, drawn: Draw) -> Any:
+    from magic_verifier.articulation import ArmOptions
+
+    options = task.arm_options or ArmOptions()
+    return replace(
+        options, grip_force=options.grip_force * drawn.grip_force, stiffness=tuple(k * drawn.stiffness for k in options.stiffness)
+    )
+
+
 def _arm_run(task: Task, setup: Setup, drawn: Draw | None) -> Any:
     from magic_verifier.arm_simulation import ArmRun
     from magic_verifier.articulation import ArmOptions
 
-    options = task.arm_options or ArmOptions()
     if drawn is None:
-        return ArmRun(setup, task.plan, options, task.limits, task.robot)
-    options = replace(
-        options, grip_force=options.grip_force * drawn.grip_force, stiffness=tuple(k * drawn.stiffness for k in options.stiffness)
-    )
+        return ArmRun(setup, task.plan, task.arm_options or ArmOptions(), task.limits, task.robot)
+    options = _drawn_options(task, drawn)
     if options.past is not None:  # what contacts alone have taken hold of has no state that could be begun from
         return ArmRun(setup, task.plan, options, task.limits, task.robot, None, drawn.lag)
     held = replace(task.held, tool_from_tcp=transforms.inverse(drawn.tool_from_held) @ task.held.tool_from_tcp)

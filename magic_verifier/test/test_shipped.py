@@ -16,6 +16,7 @@ from magic_planner.arm import ArmPlanner
 from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
 from magic_planner.robot import Robot
+from magic_verifier import uncertainty, verification
 from magic_verifier.articulation import ArmOptions
 from magic_verifier.demonstration import replay
 from magic_verifier.film import film_strip
@@ -74,6 +75,30 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     film = film_strip(first.recording, tool, target, obstacles, scenes.TABLE, frames=2, columns=2, size=(160, 120))
     assert film.shape[2] == 3
     assert film.std() > 10
+
+
+def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
+    strategy, tool, target, obstacles, candidate = demonstration("hooking")
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(30.0))
+
+    def drawn_rollout(item):
+        task = verification.make_task(strategy, item, target, obstacles, scenes.TABLE, plan)
+        task = verification.from_held(task, verification.rollout(task, 0, record=False).held)
+        return verification.rollout(task, 1, record=False)
+
+    seen = replace(tool, source="camera", confidence=1.0, seen_share=1.0)
+    known, again = drawn_rollout(tool), drawn_rollout(seen)
+    assert known.judgement.code == again.judgement.code == Code.OK, again.judgement.message
+    grasp = verification.BEFORE_GRASP + verification.AFTER_GRASP
+    assert grasp < again.simulated - known.simulated < grasp + 1.5, "the fingers close as well"
+
+    # Where it truly lies so far off that the fingers close beside it, a hand that is taken for full would carry it all the same.
+    aside = transforms.make(translation=[0.0, 0.5, 0.0])
+    drawing = uncertainty.draw
+    monkeypatch.setattr(uncertainty, "draw", lambda *given: replace(drawing(*given), tool_from_held=aside))
+    failed = drawn_rollout(seen)
+    assert failed.judgement.code == Code.GRASP_SLIPPED and failed.judgement.cause == "the gripper closed on nothing"
 
 
 @pytest.mark.parametrize(
