@@ -74,8 +74,11 @@ OVER = 0.075
 CORE = 0.0005
 #: Of what rollouts draw, what the environment tells exactly is drawn by a little only, so that no motion passes that hangs on the last digit.
 WIDTHS = {"friction": 0.1, "tool_density": 0.05, "target_density": 0.05, "centre_of_mass": 0.01, "grip_force": 0.05, "stiffness": 0.05}
-#: A tool that creeps between the fingers does so by chance, now by 2 degrees and now by 20: a motion on which it creeps far is none.
-LIMITS = Limits(slip_angle=0.12)
+#: A tool that creeps between the fingers does so by chance, now by 2 degrees and now by 20: a motion on which it creeps far is none, and
+#: more rollouts than usual have to show that it does not.
+LIMITS = Limits(slip_angle=0.12, required_rate=0.8)
+#: At most so many, with which two may fail of a motion that comes after some others.
+ROLLOUTS = 48
 #: A cube that is put into the tool is pushed out of it: so many control steps are waited for that.
 WAIT = 3
 #: Candidates of the matcher, and grasps of each, that are tried.
@@ -317,7 +320,7 @@ class Solver:
         from magic_server.pipeline import Agenda
 
         given = replace(given, tool=laid(given.tool, given.table), target=laid(given.target, given.table))
-        candidates = None
+        candidates, simulated = None, 0
         out_of_reach: set[float] = set()
         for (share, fast), turn in itertools.product(PASSES, TURNS):
             if turn in out_of_reach:
@@ -339,7 +342,8 @@ class Solver:
             agenda = Agenda([replace(c, target=met.contact) for c in candidates], strategy.reflections, ATTEMPTS)
             while (following := agenda.next()) is not None:
                 promise, trial = following
-                plan, code, what = self._try(strategy, given, trial, seed, share, fast)
+                plan, code, what = self._try(strategy, given, trial, seed, share, fast, simulated)
+                simulated += "rollouts" in what
                 note({**said, "candidate": trial.index, "reflection": trial.reflection, "attempt": trial.attempt, **what})
                 if plan is not None:
                     return plan
@@ -350,7 +354,7 @@ class Solver:
         return None
 
     def _try(
-        self, strategy: Strategy, given: Episode, trial: Any, seed: int, share: float, fast: bool
+        self, strategy: Strategy, given: Episode, trial: Any, seed: int, share: float, fast: bool, simulated: int
     ) -> tuple[MotionPlan | None, Code, dict[str, Any]]:
         from magic_planner.budget import Budget
         from magic_planner.giving_way import GAP_IN_HAND
@@ -400,7 +404,8 @@ class Solver:
         )
         verdict = verify(
             strategy, given.tool, given.target, (), given.table, candidate, plan,
-            seed=seed, settings=given.settings, spreads=self.spreads, limits=LIMITS, arm_options=hand, robot=self.arms[fast],
+            seed=seed, settings=given.settings, spreads=self.spreads, limits=LIMITS, arm_options=hand, robot=self.arms[fast], tried=simulated,
+            repetitions=ROLLOUTS,
         )  # fmt: skip
         what = {
             "code": verdict.code.name,
