@@ -65,9 +65,9 @@ PAST = 0.01
 STANDOFF, LIFTS = 0.05, (0.03, 0.08)
 #: No finger is so near to where the tool meets the cube (m): the cube is 40 mm wide.
 AWAY = 0.045
-#: In order of trial: how much of the grip's force the planner counts on (what holds is the verifier's to say, by the environment's own
-#: contacts, and the planner adds up loads that do not act along one line), and whether all of the arm's limits is used.
-PASSES = ((1.0, False), (1.4, False), (1.4, True))
+#: How much of the grip's force the planner counts on, in order of trial (what holds is the verifier's to say, by the environment's own
+#: contacts, and the planner adds up loads that do not act along one line).
+GRIP_SHARES = (1.0, 1.4)
 #: The tool comes over the cube no higher than this above where it meets it (m): the cube is 40 mm high, the tool 50.
 OVER = 0.075
 #: Such a further box is smaller by this on each side (m).
@@ -305,14 +305,10 @@ class Solver:
         self.strategy = strategy
         self.matcher = Matcher(load(features, ""))
         self.reference = from_strategy(strategy)
-        hasty = replace(arm, acceleration_scale=1.0, jerk_scale=1.0)
-        self.arms = {False: described(arm), True: described(hasty)}
+        robot, self.arm = Robot(arm), described(arm)
         self.spreads = spreads()
-        self.planners = {
-            fast: [ArmPlanner(robot, ArmSettings(dwell=CLOSING, standoff=STANDOFF, lift=lift)) for lift in LIFTS]
-            for fast, robot in ((False, Robot(arm)), (True, Robot(hasty)))
-        }
-        self.planners[False][0].warm_up()
+        self.planners = [ArmPlanner(robot, ArmSettings(dwell=CLOSING, standoff=STANDOFF, lift=lift)) for lift in LIFTS]
+        self.planners[0].warm_up()
 
     def solve(self, given: Episode, seed: int, note: Callable[[dict[str, Any]], None]) -> MotionPlan | None:
         """The first motion that the verifier passes and that ends in time; ``note`` hears what became of each that was tried."""
@@ -322,10 +318,10 @@ class Solver:
         given = replace(given, tool=laid(given.tool, given.table), target=laid(given.target, given.table))
         candidates, simulated = None, 0
         out_of_reach: set[float] = set()
-        for (share, fast), turn in itertools.product(PASSES, TURNS):
+        for share, turn in itertools.product(GRIP_SHARES, TURNS):
             if turn in out_of_reach:
                 continue
-            said: dict[str, Any] = {"turn": round(math.degrees(turn)), "grip": share, "fast": fast}
+            said: dict[str, Any] = {"turn": round(math.degrees(turn)), "grip": share}
             try:
                 strategy = posed(self.strategy, given, turn)
                 met = circle_about(given.target, strategy)
@@ -342,7 +338,7 @@ class Solver:
             agenda = Agenda([replace(c, target=met.contact) for c in candidates], strategy.reflections, ATTEMPTS)
             while (following := agenda.next()) is not None:
                 promise, trial = following
-                plan, code, what = self._try(strategy, given, trial, seed, share, fast, simulated)
+                plan, code, what = self._try(strategy, given, trial, seed, share, simulated)
                 simulated += "rollouts" in what
                 note({**said, "candidate": trial.index, "reflection": trial.reflection, "attempt": trial.attempt, **what})
                 if plan is not None:
@@ -354,7 +350,7 @@ class Solver:
         return None
 
     def _try(
-        self, strategy: Strategy, given: Episode, trial: Any, seed: int, share: float, fast: bool, simulated: int
+        self, strategy: Strategy, given: Episode, trial: Any, seed: int, share: float, simulated: int
     ) -> tuple[MotionPlan | None, Code, dict[str, Any]]:
         from magic_planner.budget import Budget
         from magic_planner.giving_way import GAP_IN_HAND
@@ -369,7 +365,7 @@ class Solver:
             friction = (given.finger_friction + given.friction) / 2
             grasping = GraspSettings(grip_force=share * given.grip_force, friction=friction, density=given.tool_density, away=AWAY)
             plan = None
-            for planner in self.planners[fast]:
+            for planner in self.planners:
                 planner.grasping = grasping
                 try:
                     plan = planner.plan(
@@ -378,7 +374,7 @@ class Solver:
                     )  # fmt: skip
                     break
                 except MagicError as error:
-                    if error.code != Code.PATH_IN_COLLISION or planner is self.planners[fast][-1]:
+                    if error.code != Code.PATH_IN_COLLISION or planner is self.planners[-1]:
                         raise
             end = done_at(plan, strategy.target_normal, strategy.goal.numbers["distance"])
             if end + given.lag > given.steps * given.step:
@@ -404,7 +400,7 @@ class Solver:
         )
         verdict = verify(
             strategy, given.tool, given.target, (), given.table, candidate, plan,
-            seed=seed, settings=given.settings, spreads=self.spreads, limits=LIMITS, arm_options=hand, robot=self.arms[fast], tried=simulated,
+            seed=seed, settings=given.settings, spreads=self.spreads, limits=LIMITS, arm_options=hand, robot=self.arm, tried=simulated,
             repetitions=ROLLOUTS,
         )  # fmt: skip
         what = {
