@@ -45,6 +45,9 @@ WIDER = 0.004
 #: The fingers have come to a stop when they are no nearer than so many metres to where they were so many seconds before; a stiff
 #: contact makes them tremble meanwhile.
 STOPPED, LOOK_BACK = 0.0003, 0.05
+#: A target that weighs more than so many times the tool is pushed by more solver iterations, in proportion, up to so many times as many:
+#: with too few a light tool lags behind the hand by what it moves in a step, which is read as a load on the pads, and creeps out of them.
+HEAVIER, MOST_ITERATIONS = 10.0, 4.0
 #: An arm that has let go and come to the end of its motion is left to stand still, unsolved, after so many seconds.
 ASLEEP = 0.15
 
@@ -106,6 +109,10 @@ class ArmRun:
         self.contact_time = self.duration if start is None else start
         self._motion = motion
         self.world = fill_world(setup, DYNAMIC)
+        if setup.target_kind == DYNAMIC:
+            tool, target = self.world.component(TOOL), self.world.component(TARGET)
+            share = min(max(target.mass / tool.mass / HEAVIER, 1.0), MOST_ITERATIONS)
+            tool.solver_position_iterations = round(share * setup.settings.position_iterations)
         self._arm = Articulation(self.world, robot, self.options)
         self._obstacles = frozenset((TARGET, *(o.id for o in setup.obstacles)))
         self._lag = round(lag * setup.settings.frequency)

@@ -77,6 +77,16 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     assert film.std() > 10
 
 
+def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
+    strategy, tool, target, obstacles, candidate = demonstration("hooking")
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(30.0))
+    # 4 g pull 0.2 kg, whose friction is a hundredth of what the pads hold: the load is that of the motion, as with heavier tools.
+    light = replace(strategy, physics=replace(strategy.physics, tool_density=40.0, target_density=3000.0))
+    verdict = verify(light, tool, target, obstacles, scenes.TABLE, candidate, plan, repetitions=1)
+    assert verdict.success and verdict.metrics["grip_load"] < 0.5, (verdict.message, verdict.metrics)
+
+
 def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
