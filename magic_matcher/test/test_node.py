@@ -9,7 +9,7 @@ import pytest
 
 from magic_core.domain import free_domain
 
-os.environ["ROS_DOMAIN_ID"] = str(free_domain())
+os.environ["ROS_DOMAIN_ID"] = str(free_domain(for_good=True))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 rclpy = pytest.importorskip("rclpy")

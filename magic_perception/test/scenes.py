@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import random
-import socket
-
 import cv2
 import numpy as np
 
@@ -60,16 +57,3 @@ def capture(meshes, name="left", seed=0, noise=1.0, world_from_camera=None, stam
         measured[edge & (rng.random(size) < 0.6)] = np.nan
     measured = np.round(measured * 1000) / 1000
     return RgbdFrame(np.clip(image, 0, 255).astype(np.uint8), measured.astype(np.float32), intrinsics, where, name, stamp), cast.ids - 1
-
-
-def free_domain() -> int:
-    """A ROS domain in which nobody on this machine is at work: its first two discovery ports (RTPS 2.2, 9.6.1.1) can be bound."""
-    for domain in random.SystemRandom().sample(range(1, 102), 101):
-        try:
-            for participant in range(2):
-                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                    probe.bind(("0.0.0.0", 7400 + 250 * domain + 10 + 2 * participant))
-        except OSError:
-            continue
-        return domain
-    raise RuntimeError("no free ROS domain among 1 to 101")

@@ -22,6 +22,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from magic_core import conversions as cv
 from magic_core import shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
+from magic_core.domain import free_domain
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene
 from magic_interfaces.msg import SceneObjectArray
@@ -36,7 +37,7 @@ class Bench:
     """One perception node and a tester that plays two cameras."""
 
     def __init__(self, **parameters):
-        rclpy.init(domain_id=scenes.free_domain())
+        rclpy.init(domain_id=free_domain())
         values = {"average": 1, "rate": 10.0, "camera_timeout": 1.0, **parameters}
         self.node = _with_overrides(values)
         self.tester = rclpy.create_node("tester")
@@ -714,7 +715,7 @@ def test_a_camera_that_dies_is_named_and_the_other_goes_on(frames):
 
 
 def test_a_bad_start_is_refused():
-    rclpy.init(domain_id=scenes.free_domain())
+    rclpy.init(domain_id=free_domain())
     try:
         from magic_core.errors import Code, MagicError
 

@@ -32,7 +32,7 @@ from magic_core.domain import free_domain
 from magic_core.errors import Code, MagicError
 from magic_core.qos import LATCHED, SENSOR
 
-DOMAIN = str(free_domain())
+DOMAIN = str(free_domain(for_good=True))
 FOREVER = QosTime(9223372036, 854775807)
 
 

@@ -16,6 +16,8 @@ FIRST_PORT, PORTS = 7400, 250
 
 #: The last port of each domain that this process drew last: no participant comes so far, and other processes see that it is taken.
 _held: deque[socket.socket] = deque(maxlen=20)
+#: The same of those that it drew for good.
+_kept: list[socket.socket] = []
 
 #: Where Fast DDS keeps its shared memory.
 SHARED_MEMORY = Path("/dev/shm")
@@ -47,27 +49,31 @@ def unclean() -> set[int]:
     return {(int(name) - FIRST_PORT) // PORTS for name in names if name.isdigit()}
 
 
-def free_domain(exclude: tuple[int, ...] = ()) -> int:
+def free_domain(exclude: tuple[int, ...] = (), for_good: bool = False) -> int:
     """A domain in which nobody on this machine is at work, and which nobody else has drawn just now.
 
-    Domains that a killed process has left something of are taken only where there are no others.
+    Domains that a killed process has left something of are taken only where there are no others.  One drawn ``for_good`` is this
+    process's as long as it lives, however many it draws later and whether or not somebody is at work in it.
     """
     domains = [d for d in SAFE if d not in exclude]
     random.SystemRandom().shuffle(domains)
     domains.sort(key=unclean().__contains__)
     for domain in domains:
-        if is_free(domain) and _hold(domain):
+        if is_free(domain) and _hold(domain, for_good):
             return domain
     raise RuntimeError(f"no free ROS domain among {SAFE.start} to {SAFE.stop - 1}")
 
 
-def _hold(domain: int) -> bool:
+def _hold(domain: int, for_good: bool) -> bool:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         sock.bind(("0.0.0.0", ports(domain)[-1]))
     except OSError:  # between the look and this, somebody else
         sock.close()
         return False
+    if for_good:
+        _kept.append(sock)
+        return True
     if len(_held) == _held.maxlen:
         _held.popleft().close()
     _held.append(sock)

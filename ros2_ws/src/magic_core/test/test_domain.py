@@ -22,6 +22,15 @@ def test_what_is_drawn_is_drawn_by_nobody_else_for_a_while():
     assert not any(domain.is_free(number) for number in drawn)
 
 
+def test_what_is_drawn_for_good_is_nobody_elses_however_many_are_drawn_later():
+    mine = domain.free_domain(for_good=True)
+    try:
+        assert mine not in {domain.free_domain() for _ in range(60)}
+        assert not domain.is_free(mine)
+    finally:
+        domain._kept.pop().close()
+
+
 def test_ports_are_those_of_the_standard():
     # RTPS 2.2, 9.6.1.1: multicast discovery at 7400 + 250 d, unicast discovery of participant p at 7410 + 250 d + 2 p.
     assert domain.ports(0)[0] == 7400
@@ -38,7 +47,7 @@ def test_what_a_killed_process_left_is_avoided(tmp_path, monkeypatch):
     (tmp_path / "fastrtps_0a4d6975d272e425").touch()
     assert domain.unclean() >= set(domain.SAFE) - {40, 41}
     monkeypatch.setattr(domain, "is_free", lambda number: True)
-    monkeypatch.setattr(domain, "_hold", lambda number: True)
+    monkeypatch.setattr(domain, "_hold", lambda number, for_good: True)
     assert {domain.free_domain() for _ in range(30)} == {40, 41}
     monkeypatch.setattr(domain, "is_free", lambda number: number not in (40, 41))
     assert domain.free_domain() in set(domain.SAFE) - {40, 41}

@@ -23,7 +23,7 @@ from magic_ros2cli import main
 HERE = Path(__file__).parent
 ENVIRONMENT = {
     **os.environ,
-    "ROS_DOMAIN_ID": str(free_domain()),
+    "ROS_DOMAIN_ID": str(free_domain(for_good=True)),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     "PYTHONUNBUFFERED": "1",
 }
