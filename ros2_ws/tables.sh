@@ -3,7 +3,7 @@
 #
 #   bash ros2_ws/tables.sh [--quick] [--only TABLE] [--jobs N] [--weights FEATURES=PATH] [--out DIR]
 #
-# --quick    a few cases of each cell, within 10 minutes on 2 cores that have nothing else to do; all cases else (many hours)
+# --quick    a few cases of each cell, within 10 minutes on 2 cores that have nothing else to do; all cases else (4,900, some hours)
 # --only     one table: I, II, III, IV, V, images, alphabet; may be given several times
 # --jobs     cases at a time (default 2, or 1 on one core); the results do not depend on it
 # --weights  weights of dinov2, dift or sd_dino, a hub name or a folder; rows without weights say so
