@@ -396,6 +396,8 @@ EDGE = 3
 BAR = 0.04
 #: The least hole between a handle and its body, m^2.
 HOLE = 6e-5
+#: A handle's bow is what stands off from the body farther than this share of how far it stands off at most.
+BOW = 0.4
 
 
 def handle_of(
@@ -404,7 +406,7 @@ def handle_of(
     """A handle as bars in the upright plane through the body's axis: meshes, convex pieces and the largest hole that it encloses with the body, m^2;
     ``None`` if nothing is left after carving."""
     local = out[:, :2] - body.axis
-    along, thickness = _handle_plane(local)
+    along, thickness = _handle_plane(local, np.linalg.norm(local, axis=1) - body.radius(out[:, 2]))
     e_s, e_z = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
     e_n = np.cross(e_s, e_z)
     cell = 0.001
@@ -521,8 +523,13 @@ def _widest(sight: Sight, mask: NDArray[np.bool_], plane: NDArray[np.float64]) -
     return max(2 * float(distance.max()) * away / sight.intrinsics.fx, 0.005)
 
 
-def _handle_plane(local: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Direction (2,) from the axis in which a handle's points (N, 2) stand off, seen from above, and its thickness in metres."""
+def _handle_plane(local: NDArray[np.float64], beyond: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Direction (2,) from the axis in which a handle's points (N, 2) stand off, seen from above, and its thickness in metres; beyond (N,): how far they are
+    outside of the body.
+
+    What stands off farthest tells it: near the body there is smear as well, and what of the body is not quite round.
+    """
+    local = local[beyond > BOW * np.percentile(beyond, 95)]
     direction = local.mean(axis=0)
     angle = float(np.arctan2(direction[1], direction[0]))
     for _ in range(3):

@@ -10,7 +10,7 @@ import trimesh
 from magic_core import sensor, shapes, transforms
 from magic_core.mesh import Mesh
 from magic_core.views import find_view, holes_of
-from magic_perception import scoops
+from magic_perception import scoops, turned
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 
@@ -151,6 +151,19 @@ def test_a_handle_partly_behind_its_body_stays_open(seed, yaw, names):
     assert shape == "round with handle"
     assert holes_of(find_view(item.mesh, item.pieces, "side").mask).sum() > 40
     assert item.mesh.to_trimesh().euler_number == 0  # one handle, one loop, nothing apart
+
+
+def test_a_handle_stands_where_it_stands_off_farthest_whatever_lies_at_the_foot():
+    random = np.random.default_rng(3)
+    reach, side = random.uniform(0.042, 0.085, 1000), random.uniform(-0.005, 0.005, 1000)
+    handle = np.column_stack([reach, side])
+    # Smear and what is not round: near the body, on one side of the handle.
+    turn = random.uniform(0.3, 1.2, 90)
+    foot = random.uniform(0.045, 0.050, 90)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    local = np.vstack([handle, foot])
+    along, thickness = turned._handle_plane(local, np.linalg.norm(local, axis=1) - 0.04)
+    assert np.degrees(np.arctan2(along[1], along[0])) == pytest.approx(0, abs=1)
+    assert thickness == pytest.approx(0.01, abs=0.001)
 
 
 def laid_down(mesh: Mesh) -> Mesh:
