@@ -5,7 +5,8 @@ The states, each left by a step that was looked at or by a failure with a code::
     carried out ----------------------------------------> judged --met--> the end, OK
      |   |   |                                              |  `--cannot be told--> the end, GOAL_UNSEEN
      |   |   |                                              `--missed--> next candidate
-     |   |   `--a thing has moved--> stopped, at rest --> perceived and planned anew, or with the tool in the hand from there
+     |   |   |--a thing has moved--> stopped, at rest --> perceived and planned anew, or with the tool in the hand from there
+     |   |   `--pictures are too old--> the same, once newer ones have come; the end (STALE_DATA) where the tool has been let go
      |   `--the tool is off in the hand--> planned anew from its pose as it is, or given up (TOOL_SLIPPED)
      `--the grasp failed--> next grasp or candidate
 
@@ -44,7 +45,7 @@ from magic_server.remote import Token
 from magic_server.scene_change import Changed
 from magic_server.settings import LoopSettings
 from magic_server.stages import Server, Stages, hull_of
-from magic_server.watch import Bounds, SceneWatch
+from magic_server.watch import Bounds, SceneWatch, Unwatched
 
 #: A picture shows what was there so many seconds before its stamp, too: several are averaged.
 SETTLED = 0.3
@@ -159,6 +160,11 @@ class ClosedLoop:
         self._in_hand = held
         self._server.tell_held(held)
 
+    @property
+    def _has_let_go(self) -> bool:
+        """Whether the tool has been taken up and let go."""
+        return self._carried is not None and self._carried.let_go_at is not None
+
     # ------------------------------------------------------------ the loop
 
     def execute(self) -> str:
@@ -171,8 +177,10 @@ class ClosedLoop:
                 error = MagicError(Code.TOOL_SLIPPED, f"the tool is off in the hand by {off.deviation}")
                 self._follow(error, lambda error: self._bounds.elsewhere(error, error.code, time.monotonic()))
                 following = self._corrected(job, off.held)
-            except Changed as change:
-                error = MagicError(Code.SCENE_CHANGED, change.message)
+            except (Changed, Unwatched) as stop:
+                if isinstance(stop, Unwatched) and self._has_let_go:
+                    raise  # what is left is the way back: nothing that another plan would do
+                error = MagicError(Code.SCENE_CHANGED if isinstance(stop, Changed) else stop.code, stop.message)
                 self._follow(error, lambda error: self._bounds.elsewhere(error, error.code, time.monotonic()))
                 following = self._anew()
             except MagicError as failure:

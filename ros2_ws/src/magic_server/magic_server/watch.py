@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_server import scene_change
-from magic_server.permission import AHEAD, Look, NotYet
+from magic_server.permission import AHEAD, Look
 from magic_server.scene_change import Changed, gap
 
 #: What is in none of so many looks that follow each other is gone: a single picture may miss a thing.
 GONE = 2
 #: A thing that is nearer to the hand than this, m, may be hidden by it, or by what it holds: it is not said to be gone.
 HIDES = 0.3
+
+
+class Unwatched(MagicError):
+    """Nobody has seen for too long what the arm moves among: a newer look at it, and another plan, may help."""
 
 
 class SceneWatch:
@@ -36,14 +40,14 @@ class SceneWatch:
         self._last = -math.inf
 
     def take(self, look: Look | None, began: float, clock: float, now: float, hand: NDArray[np.float64]) -> None:
-        """Take in the newest look there is; raises :class:`Changed`, and STALE_DATA where none came for too long.
+        """Take in the newest look there is; raises :class:`Changed`, and :class:`Unwatched` (STALE_DATA) where none came for too long.
 
         began, clock: when the move began, and now, s by the clock of the stamps; now: by the monotonic clock of this process; hand
         (3,): where it is, m.
         """
         age = math.inf if look is None else max(clock - look.stamp, now - look.came)
         if look is None or not age <= self._age or clock - look.stamp < -AHEAD:
-            raise NotYet(
+            raise Unwatched(
                 Code.STALE_DATA,
                 "age in s of the objects while the arm moves",
                 round(age, 1),

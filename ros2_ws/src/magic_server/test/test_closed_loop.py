@@ -273,22 +273,69 @@ def test_an_arm_that_goes_on_moving_ends_it(bench):
     assert "object_2 has moved" in result.message and moves(bench) == 1
 
 
-def test_an_arm_that_nobody_watches_any_more_is_stopped(bench):
+def unwatched(bench, number, until_stopped=True):
+    """While the arm is on its ``number``-th move nobody has seen the scene for too long; once it is stopped it is seen again, if so wanted."""
     stopped = threading.Event()
 
     def move(trajectory, canceled):
-        bench.table.blind = True
-        bench.server.scene_came -= 10.0
-        deadline = time.monotonic() + 10.0
-        while not canceled() and time.monotonic() < deadline:
-            time.sleep(0.002)
-        if canceled():
-            stopped.set()
+        if moves(bench) == number:
+            bench.table.blind = True
+            bench.server.scene_came -= 10.0
+            deadline = time.monotonic() + 10.0
+            while not canceled() and time.monotonic() < deadline:
+                time.sleep(0.002)
+            if canceled():
+                stopped.set()
+            bench.table.blind = not until_stopped
+            bench.arm.positions = list(trajectory.points[len(trajectory.points) // 2].positions)  # it stops half way
+        return 0, ""
+
+    bench.arm.on_move = move
+    return stopped
+
+
+def test_an_arm_that_nobody_watches_any_more_is_stopped(bench):
+    stopped = unwatched(bench, 1, until_stopped=False)
+    result = run(bench, Code.STALE_DATA, executed=False)
+    assert stopped.is_set() and "not moved blindly" in result.message
+    assert "planned again from there: nothing newer than what is to be looked at again came" in result.message
+    assert moves(bench) == 1
+
+
+@pytest.mark.parametrize("number, held", [(1, False), (3, True)])
+def test_an_arm_that_stands_because_nobody_watched_it_goes_on_once_somebody_does(bench, number, held):
+    stopped = unwatched(bench, number)
+    result = run(bench)
+    assert stopped.is_set()
+    assert "STALE_DATA: age in s of the objects while the arm moves" in result.notes[0]
+    second = asked(bench, "plan_motion")[1]
+    assert second.tool.hanging == held
+    where = second.start.position[list(second.start.name).index(fakes.JOINTS[0])]
+    assert where == pytest.approx(0.05 if number == 1 else 0.2)  # where it was stopped
+    assert len(asked(bench, "verify_motion")) == 2
+
+
+def test_pictures_that_stay_behind_end_it_after_so_many_plans(bench):
+    move_of = {}
+
+    def move(trajectory, canceled):
+        if moves(bench) not in move_of:
+            move_of[moves(bench)] = True
+            unwatched(bench, moves(bench))
+            first, bench.arm.on_move = bench.arm.on_move, move
+            return first(trajectory, canceled)
         return 0, ""
 
     bench.arm.on_move = move
     result = run(bench, Code.STALE_DATA, executed=False)
-    assert stopped.is_set() and "not moved blindly" in result.message
+    assert "planned anew 2 times (parameter loop.replans)" in result.message and moves(bench) == 3
+
+
+def test_an_arm_that_nobody_watches_after_it_let_go_is_not_sent_for_the_tool_again(bench):
+    bench.fakes.on_plan = letting_go
+    stopped = unwatched(bench, 3)
+    result = run(bench, Code.STALE_DATA, executed=False)
+    assert stopped.is_set() and len(asked(bench, "plan_motion")) == 1 and "not moved blindly" in result.message
 
 
 def pulls(bench, *by):

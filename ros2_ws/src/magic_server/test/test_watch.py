@@ -8,9 +8,9 @@ import pytest
 
 from magic_core.errors import Code, MagicError
 from magic_server import scene_change
-from magic_server.permission import Look, NotYet
+from magic_server.permission import Look
 from magic_server.scene_change import Changed
-from magic_server.watch import Bounds, SceneWatch
+from magic_server.watch import Bounds, SceneWatch, Unwatched
 
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
 BEGAN = 1000.0
@@ -126,7 +126,7 @@ def test_what_was_hidden_when_it_was_planned_is_watched_once_it_is_seen():
 
 @pytest.mark.parametrize("seen", [None, look(TABLE, after=-6.0, came=0.0), look(TABLE, after=0.0, came=-6.0), look(TABLE, after=math.nan)])
 def test_an_arm_is_not_moved_blindly(seen):
-    with pytest.raises(NotYet, match="not moved blindly"):
+    with pytest.raises(Unwatched, match="not moved blindly"):
         watch().take(seen, BEGAN, BEGAN + 0.3, 0.1, FAR)
 
 
