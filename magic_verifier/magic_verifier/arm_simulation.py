@@ -253,7 +253,7 @@ class ArmRun:
 
     def _touched(self) -> Patch | None:
         """Where both pads touch the tool; ``None`` where they do not hold it between them."""
-        touches = self.world.touches(TOOL, FINGERS, SOFTNESS)
+        touches = self.world.pressed(TOOL, FINGERS, SOFTNESS)
         return patch_of(touches, self._arm.tcp(), "xy".index(self.robot.config.closing_axis), self._friction)
 
     def _take(self, patch: Patch) -> None:

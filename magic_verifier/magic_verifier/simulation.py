@@ -446,6 +446,27 @@ class World:
                         )
         return result
 
+    def pressed(self, first: str, second: str, depth: float) -> list[Touch]:
+        """Where two bodies touch, one of which gives way by ``depth`` metres: the contact points of the last step whose separation is at most that
+        and, between those of a contact beyond it and those within, where it is that, without an impulse.
+
+        Two flat faces a little askew touch along an edge, and the engine tells the far ends of what faces each other besides.
+        """
+        result = []
+        for sign, pair in ((1.0, (first, second)), (-1.0, (second, first))):
+            for contact in self._contacts().get(pair, ()):
+                points = [(np.asarray(p.position, dtype=float), float(p.separation), p) for p in contact.points]
+                within = [p for p in points if p[1] <= depth]
+                result += [
+                    Touch(at, sign * np.asarray(p.normal, float), apart, sign * np.asarray(p.impulse, float)) for at, apart, p in within
+                ]
+                for far, beyond, p in points:
+                    if beyond > depth:
+                        for at, apart, _ in within:
+                            edge = at + (depth - apart) / (beyond - apart) * (far - at)
+                            result.append(Touch(edge, sign * np.asarray(p.normal, dtype=float), depth, np.zeros(3)))
+        return result
+
     def touching(self, first: str, second: str, within: float = 0.0) -> bool:
         """Whether two bodies were within ``within`` metres of each other in the last step."""
         pairs = ((first, second), (second, first))

@@ -96,6 +96,42 @@ def test_no_patch_where_one_pad_touches_nothing_or_only_pushes():
     assert patch_of([*one, *aside], np.eye(4), 1, FRICTION) is None
 
 
+def test_a_pad_that_gives_way_touches_as_far_as_it_does_what_lies_askew():
+    """Rigid faces a little askew touch along an edge; one that gives way by 1 mm touches 1 mm / slope of the other."""
+    slope = 0.06
+    world = World(Settings(frequency=960.0, contact_offset=0.002))
+    world.add("pad", usable_pieces("pad", (scenes.block((-0.01, 0.01), (-0.01, 0.01), (-0.02, 0)),)), np.eye(4), KINEMATIC, 1000.0, 0.5)
+    askew = transforms.from_rpy(0.0, -slope, 0.0, [-0.01, 0.0, 0.0])
+    tool = usable_pieces("tool", (scenes.block((-0.02, 0.04), (-0.03, 0.03), (0, 0.01)),))
+    world.add("tool", tool, askew, DYNAMIC, 600.0, 0.5)
+    world.step()
+    rigid = [touch.position[0] for touch in world.touches("tool", "pad", 0.0005)]
+    assert rigid and max(rigid) < -0.009
+    soft = world.pressed("tool", "pad", 0.001)
+    assert max(touch.position[0] for touch in soft) == pytest.approx(-0.01 + 0.001 / slope, abs=0.001)
+    assert max(touch.separation for touch in soft) == 0.001
+    assert sum(touch.impulse for touch in soft) == pytest.approx(sum(touch.impulse for touch in world.touches("tool", "pad", 0.001)))
+    np.testing.assert_allclose([t.normal for t in soft], np.tile([np.sin(-slope), 0, np.cos(slope)], (len(soft), 1)), atol=0.02)
+
+
+def test_a_plate_a_little_askew_is_held_between_pads_that_give_way():
+    """The pads of rigid fingers touch it at opposite edges; what holds it is what the pads touch when they give way."""
+    plate = scenes.block((-0.03, 0.03), (-0.0015, 0.0015), (-0.05, 0.03))
+    tcp = np.eye(4)
+    world = World(Settings(frequency=960.0, contact_offset=0.002))
+    world.add("tool", usable_pieces("tool", (plate,)), transforms.from_rpy(0.06, 0.0, 0.0), DYNAMIC, 600.0, 2.0)
+    edge = 0.0015 / np.cos(0.06) + 0.009 * np.tan(0.06)  # where a pad of 18 mm first meets the plate
+    for name, side in (("left", 1), ("right", -1)):
+        y = sorted((side * edge, side * (edge + 0.01)))
+        hull = usable_pieces(name, (scenes.block((-0.009, 0.009), tuple(y), (-0.009, 0.009)),))
+        world.add(name, hull, np.eye(4), KINEMATIC, 1000.0, 2.0)
+    world.step()
+    rigid, soft = ([t for name in ("left", "right") for t in ask("tool", name, 0.001)] for ask in (world.touches, world.pressed))
+    assert patch_of(rigid, tcp, 1, 2.0) is None
+    patch = patch_of(soft, tcp, 1, 2.0)
+    assert patch is not None and patch.half[1] == pytest.approx(0.001 / 0.06 / 2, abs=0.001)
+
+
 def test_what_is_in_the_hand_already_is_held_as_it_is():
     """A bar lies askew between the pads, as it was seen there: that they would turn it true has been settled in the real hand."""
     robot = Description()

@@ -188,7 +188,7 @@ class LabWorld:
             if thing is None or thing.kind != DYNAMIC:
                 continue
             friction = (self._options.finger_friction + thing.friction) / 2  # of a pair, as the engine has it
-            patch = patch_of(self.engine.touches(name, FINGERS, SOFTNESS), self.tcp(), self._closing_axis, friction)
+            patch = patch_of(self.engine.pressed(name, FINGERS, SOFTNESS), self.tcp(), self._closing_axis, friction)
             if patch is None:
                 continue
             body = self.engine.component(name)
