@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.contact import ContactCandidate
@@ -34,7 +35,7 @@ from magic_core.robot import Description
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier import goals, motion_check, uncertainty
-from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, FloatingRun, Setup, make_setup, nears, phase_start, speed
+from magic_verifier.floating import CONTACT_PHASES, TABLE, TARGET, TOOL, Body, FloatingRun, Setup, make_setup, nears, phase_start, speed
 from magic_verifier.goals import Judgement
 from magic_verifier.simulation import DYNAMIC, LEAST_FREQUENCY, STATIC, Settings
 from magic_verifier.uncertainty import Draw, Eyes, Uncertainty
@@ -473,7 +474,8 @@ def _grasp_is_drawn(task: Task) -> bool:
 
 
 def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> float:
-    """The grasp of a drawn rollout, the tool on the table as far off as it is drawn to be in the hand and shaped as drawn; simulated seconds.
+    """The grasp of a drawn rollout, the tool on the table as far off as it is drawn to be in the hand and shaped as drawn
+    (:func:`standing`); simulated seconds.
 
     What is seen of a lying thing is its top: how steep its sides are, between which the fingers close, is the reconstruction's guess.
     Steps are short, as closing fingers bear no longer ones.  Raises as the run does.
@@ -483,8 +485,7 @@ def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> float:
     motion = task.plan.arm_motion
     assert motion is not None
     setup = replace(task, longer=1.0).under(drawn)
-    lying = setup.tool.world_from_object @ drawn.tool_from_held
-    setup = replace(setup, tool=replace(setup.tool, world_from_object=lying))
+    setup = replace(setup, tool=standing(setup.tool, task.setup.tool, drawn.tool_from_held, setup.table))
     begin, end = max(motion.grasp_time - BEFORE_GRASP, 0.0), min(motion.grasp_time + AFTER_GRASP, task.start)
     run = ArmRun(setup, task.plan, _drawn_options(task, drawn), limits, task.robot, None, drawn.lag, begin)
     while run.time < end:
@@ -492,6 +493,27 @@ def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> float:
         if run.world.steps % CHECK_EVERY == 0:
             stop.check(float(run.world.time))
     return float(run.world.time)
+
+
+def standing(drawn: Body, seen: Body, tool_from_held: NDArray[np.float64], table: NDArray[np.float64]) -> Body:
+    """A tool of a drawn shape on the table (4,), displaced from where it was ``seen`` along the table and about the vertical alone, by what is drawn.
+
+    It was seen to stand: no height, tilt or underside is drawn with which it would not.  What is drawn of heights fades out towards
+    the table, over the lower half of the tool; without that mugs toppled that stood as they were seen to stand.
+    """
+    up, pose = table[:3], seen.world_from_object
+    turn, shift = pose[:3, :3], pose[:3, :3] @ tool_from_held[:3, 3]
+    angle = float(up @ turn @ Rotation.from_matrix(tool_from_held[:3, :3]).as_rotvec())
+    heights = [transforms.apply(pose, hull) @ up + table[3] for hull in seen.hulls]
+    highest = max(float(h.max()) for h in heights)
+    hulls = list(drawn.hulls)
+    for index, (before, ball) in enumerate(zip(heights, drawn.balls, strict=True)):
+        if ball is None:
+            kept = np.clip(1 - before / max(0.5 * highest, 1e-6), 0.0, 1.0)
+            after = transforms.apply(pose, hulls[index]) @ up + table[3]
+            hulls[index] = hulls[index] + (kept * (before - after))[:, None] * (up @ turn)
+    about = transforms.make(translation=pose[:3, 3] + shift - (shift @ up) * up) @ transforms.from_rotvec(angle * up)
+    return replace(drawn, hulls=tuple(hulls), world_from_object=about @ transforms.make(turn))
 
 
 def _drawn_options(task: Task, drawn: Draw) -> Any:

@@ -9,12 +9,13 @@ import pytest
 import scenes
 import yaml
 
-from magic_core import transforms
+from magic_core import shapes, transforms
 from magic_core.errors import Code, MagicError
 from magic_verifier import uncertainty, verification
-from magic_verifier.floating import TABLE, Body, FloatingRun, make_setup
+from magic_verifier.floating import TABLE, Body, FloatingRun, lifted_onto_table, make_setup
 from magic_verifier.floating import speed as fastest
 from magic_verifier.goals import Judgement
+from magic_verifier.simulation import DYNAMIC, World, usable_pieces
 from magic_verifier.uncertainty import ShapeError, Spread
 from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, passes, verify, wilson
 
@@ -305,3 +306,34 @@ def test_a_hand_gives_way_to_the_table_by_what_the_tool_is_thicker(thicker):
     planned = deepest(FloatingRun(setup, plan))
     assert deepest(FloatingRun(changed, plan, 0.0, np.eye(4), setup.tool)) <= planned + 1e-6
     assert thicker < 0 or deepest(FloatingRun(changed, plan)) > planned + 0.003
+
+
+def test_a_drawn_tool_stands_as_it_was_seen_to_stand():
+    """With an underside and a tilt that are drawn mugs topple by themselves; what is drawn of sides and top stays."""
+    mug = shapes.make("mug", 3).as_object("tool", transforms.make(translation=[0.5, 0.1, 0.0]))
+    mug = replace(mug, world_from_object=transforms.make(translation=[0.5, 0.1, -mug.mesh.bounds[0, 2]]))
+    seen = Body("tool", tuple(usable_pieces("tool", mug.pieces)), mug.world_from_object)
+    spreads = uncertainty.read()
+    eyes = spreads.camera, 2.5
+    moved = {"as drawn": [], "standing": []}
+    for index in range(1, 7):
+        drawn = uncertainty.draw(spreads, eyes, eyes, 5, index)
+        shaped = drawn.tool_error.applied(seen)
+        stood = verification.standing(shaped, seen, drawn.tool_from_held, scenes.TABLE)
+        np.testing.assert_allclose(stood.corners[:, :2], shaped.corners[:, :2], atol=1e-12)
+        upper = seen.corners[:, 2] > 0.001
+        np.testing.assert_allclose(stood.corners[upper], shaped.corners[upper], atol=1e-12)
+        shift = stood.world_from_object[:3, 3] - seen.world_from_object[:3, 3]
+        np.testing.assert_allclose(shift, [*drawn.tool_from_held[:2, 3], 0.0], atol=1e-12)
+        for name, body in (
+            ("as drawn", replace(shaped, world_from_object=seen.world_from_object @ drawn.tool_from_held)),
+            ("standing", stood),
+        ):
+            body = lifted_onto_table(body, scenes.TABLE)
+            world = World(DEFAULTS["arm"])
+            world.add_table(scenes.TABLE, 0.5, "table")
+            world.add("tool", list(body.hulls), body.world_from_object, DYNAMIC, 600.0, 0.5)
+            for _ in range(round(0.6 * world.settings.frequency)):
+                world.step()
+            moved[name].append(transforms.rotation_angle(body.world_from_object, world.pose("tool")))
+    assert max(moved["as drawn"]) > 0.1 and max(moved["standing"]) < 0.01
