@@ -380,7 +380,7 @@ def view_from_msg(msg: mi.CanonicalView) -> CanonicalView:
 def object_to_msg(item: SceneObject, header: Header) -> mi.SceneObject:
     """SceneObject to its message; ``header`` is that of the array it goes into."""
     msg = mi.SceneObject(id=item.id, source=item.source, camera=item.camera, confidence=float(item.confidence))
-    msg.seen_share = float(item.seen_share)
+    msg.seen_share, msg.surface_error = float(item.seen_share), float(item.surface_error)
     msg.cut_off = list(item.cut_off)
     msg.hanging = item.hanging
     msg.pose = pose_to_msg(item.world_from_object)
@@ -438,6 +438,7 @@ def object_from_msg(msg: mi.SceneObject, pictures: bool = True) -> SceneObject:
         seen_share=float(msg.seen_share),
         cut_off=tuple(msg.cut_off),
         hanging=msg.hanging,
+        surface_error=float(msg.surface_error),
     )
 
 

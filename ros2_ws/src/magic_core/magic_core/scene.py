@@ -92,7 +92,9 @@ class SceneObject:
     ``source`` is ``camera``, or ``known`` for a calibrated fixture or a given mesh.
     ``confidence`` 0..1 is the chance, as measured on known scenes, that mask and solid
     overlap the truth by more than 0.8; ``seen_share`` 0..1 how much of the mesh's surface,
-    what rests on the table left out, a camera saw.  ``cut_off`` names what keeps a part out
+    what rests on the table left out, a camera saw.  ``surface_error``: the root mean square
+    distance, m, between mesh and true surface, below which it is for five of six things that look
+    like this one; 0 where nobody says.  ``cut_off`` names what keeps a part out
     of sight: ``picture``, ``region``, ``fixture``, ``robot``, or ids of objects in front; ``unseen``:
     no camera sees it now, it is remembered.  Such a thing is no whole tool.
     """
@@ -114,6 +116,7 @@ class SceneObject:
     seen_share: float = 1.0
     cut_off: tuple[str, ...] = ()
     hanging: bool = False
+    surface_error: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -248,6 +248,7 @@ def test_scenes():
         confidence=0.5,
         seen_share=0.25,
         cut_off=("picture", "object_2"),
+        surface_error=0.0625,
     )
     scene = Scene((item,), np.array([0, 0, 1.0, -0.01]), stamp=12.5, camera_offset=0.03125, camera_angle=0.125, notes=("a", "b"))
     back = cv.scene_from_msg(cv.scene_to_msg(scene))
@@ -255,6 +256,7 @@ def test_scenes():
     assert (back.camera_offset, back.camera_angle, back.notes) == (0.03125, 0.125, ("a", "b"))
     other = back.find("object_1")
     assert (other.seen_share, other.cut_off, other.confidence) == (0.25, ("picture", "object_2"), 0.5)
+    assert other.surface_error == 0.0625
     np.testing.assert_allclose(other.mesh.vertices, mesh.vertices)
     np.testing.assert_array_equal(other.mesh.faces, mesh.faces)
     np.testing.assert_array_equal(other.mesh.colors, mesh.colors)
