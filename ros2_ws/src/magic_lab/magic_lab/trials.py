@@ -27,7 +27,7 @@ from magic_bringup.graph import Graph, Process
 from magic_core import environment
 from magic_core.domain import isolated
 from magic_core.errors import Code, MagicError
-from magic_lab.judge import Track, judge, middle, nearest
+from magic_lab.judge import Track, judge, loop_in_sight, middle, nearest
 from magic_lab.scenarios import SCENARIOS, Scenario, Scene, case_of, draw, scenario_of
 from magic_server.pipeline import split_metrics
 from magic_verifier.verification import wilson
@@ -42,6 +42,8 @@ LOOK, RUN = 60.0, 300.0
 AFTER = 1.0
 #: The arm has begun to move once its hand is so far from where it was, m.
 BEGUN = 0.01
+#: This share of a loop's opening has to be in a camera's sight for somebody to find it.
+SHOWN = 0.05
 #: A thing that perception sees is nearer to the true one than this share of its longest side.
 NEAR = 0.35
 #: Size of each camera's picture in the video, how long each picture stands, ms (twice as fast as it was), and how many there are at most: of a long trial every
@@ -282,6 +284,8 @@ class Session:
                 success = judgement.code == Code.OK and record["executed"]
                 record.update(truth=int(judgement.code), judgement=judgement.message, success=success)
         record.setdefault("code", int(Code.INTERNAL))
+        if record["code"] == Code.HANDLE_NOT_SEEN:
+            record["loop_in_sight"] = loop_in_sight(scene, scene.tools[0])
         record["stage"] = stage_of(record)
         record["wall_seconds"] = round(time.monotonic() - begun, 1)
         path = _path(out, case, seed)
@@ -303,6 +307,12 @@ def stage_of(record: dict[str, Any]) -> str:
     # Where no candidate succeeded: how far the one got that came furthest.
     code = max(record.get("refused", []), default=0) if record["code"] == Code.NO_CANDIDATE_SUCCEEDED else record["code"]
     return STAGES.get(code // 100, "execute")
+
+
+def rightly_refused(record: dict[str, Any]) -> bool:
+    """Whether a trial ended with HANDLE_NOT_SEEN where in truth the handle is out of every camera's sight."""
+    share = record.get("loop_in_sight")
+    return share is not None and share < SHOWN
 
 
 def film(seen: Seen, out: Path, name: str) -> dict[str, Any]:
@@ -346,6 +356,7 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
         low, high = wilson(good, count)
         return {"good": good, "of": count, "interval": [round(low, 3), round(high, 3)]}
 
+    shown = [r for r in records if not rightly_refused(r)]
     objects = {name: [r for r in records if r["object"] == name] for name in dict.fromkeys(r["object"] for r in records)}
     carried = [r for r in records if r["begun"]]  # the arm moves by what was verified alone
     timed = [r["seconds"] for r in records if "seconds" in r]
@@ -353,6 +364,8 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "scenario": records[0]["scenario"] if records else "",
         "objects": {name: rate(sum(r["success"] for r in own), len(own)) for name, own in objects.items()},
         "verified_motions": rate(sum(r["success"] for r in carried), len(carried)),
+        "rightly_refused": len(records) - len(shown),
+        "but_rightly_refused": rate(sum(r["success"] for r in shown), len(shown)),
         "failures": [
             {"object": r["object"], "seed": r["seed"], "stage": r["stage"], "code": Code(r["code"]).name, "reason": _reason(r)}
             for r in records
@@ -374,6 +387,13 @@ def told(total: dict[str, Any]) -> str:
     for name, r in {**total["objects"], "verified motions": total["verified_motions"]}.items():
         low, high = (round(100 * x) for x in r["interval"])
         lines.append(f"  {name}: {r['good']} of {r['of']} succeeded ({low} to {high} %)")
+    if total["rightly_refused"]:
+        rest = total["but_rightly_refused"]
+        low, high = (round(100 * x) for x in rest["interval"])
+        lines.append(
+            f"  rightly refused: {total['rightly_refused']}, the handle is out of every camera's sight; "
+            f"of the others {rest['good']} of {rest['of']} succeeded ({low} to {high} %)"
+        )
     lines += [f"  failed: {f['object']}, seed {f['seed']}, {f['stage']} [{f['code']}]: {f['reason']}" for f in total["failures"]]
     seconds = ", ".join(f"{k} {v:.1f}" for k, v in total["mean_seconds"].items())
     return "\n".join([*lines, f"  mean seconds: {seconds}; candidates tried: {total['mean_attempts']:.1f}"])

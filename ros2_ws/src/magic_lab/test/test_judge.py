@@ -10,7 +10,7 @@ from magic_core import transforms
 from magic_core.contact import OPPOSED
 from magic_core.errors import Code
 from magic_core.shapes import mug_of_set
-from magic_lab.judge import Replay, Track, judge, nearest
+from magic_lab.judge import Replay, Track, judge, loop_in_sight, nearest
 from magic_lab.scenarios import SCENARIOS, draw
 from magic_lab.world import SETTINGS
 
@@ -123,3 +123,19 @@ def test_the_hand_and_what_it_holds():
     assert left.times[left.let_go("tool_1")] == pytest.approx(1.05, abs=0.06)
     assert left.let_go("target") is None
     assert nearest({"a": np.array([0, 0, 9.0]), "b": np.array([1.0, 0, 0])}, np.array([0.2, 0, 0])) == "a"
+
+
+def test_a_handle_behind_its_cup_is_out_of_every_cameras_sight():
+    drawn = draw(SCENARIOS["hanging"], SCENARIOS["hanging"].cases[0], 22)  # the handle points at the robot, away from the cameras
+    mug = drawn.thing("tool_1").item
+    assert mug.world_from_object[0, 0] < -0.9
+    assert loop_in_sight(drawn, "tool_1") < 0.01
+    middle = transforms.make(translation=mug.world_from_box[:3, 3])
+    shares = []
+    for yaw in (np.pi / 2, np.pi, -np.pi / 2):
+        pose = middle @ transforms.from_rpy(0.0, 0.0, yaw) @ transforms.inverse(middle) @ mug.world_from_object
+        things = [replace(t, item=replace(t.item, world_from_object=pose)) if t.name == "tool_1" else t for t in drawn.things]
+        shares.append(loop_in_sight(replace(drawn, things=tuple(things)), "tool_1"))
+    assert min(shares) > 0.3 and max(shares) < 1.0
+    hooks = draw(SCENARIOS["hooking"], SCENARIOS["hooking"].cases[0], 0)
+    assert loop_in_sight(hooks, hooks.tools[0]) is None

@@ -44,6 +44,22 @@ def test_sums_are_by_object_and_name_each_failure():
     assert told(summary([])).startswith(":")
 
 
+def test_a_handle_that_no_camera_can_show_is_refused_rightly_and_told_apart():
+    refused = {"begun": False, "verified": False, "code": int(Code.HANDLE_NOT_SEEN), "stage": "match"}
+    records = [
+        record("mug", 0),
+        record("mug", 1, False, loop_in_sight=0.0, **refused),
+        record("mug", 2, False, loop_in_sight=0.3, **refused),
+    ]
+    records.append(record("hook", 0, False, loop_in_sight=None, **refused))
+    total = summary(records)
+    assert (total["objects"]["mug"]["good"], total["objects"]["mug"]["of"]) == (1, 3)
+    assert total["rightly_refused"] == 1
+    assert (total["but_rightly_refused"]["good"], total["but_rightly_refused"]["of"]) == (1, 3)
+    assert "rightly refused: 1," in told(total) and "of the others 1 of 3 succeeded" in told(total)
+    assert "rightly" not in told(summary(records[:1]))
+
+
 def test_where_no_candidate_succeeded_the_stage_is_how_far_the_best_got():
     code, refused = int(Code.NO_CANDIDATE_SUCCEEDED), [int(Code.NO_PATH), int(Code.GRASP_SLIPPED), int(Code.NO_IK)]
     assert stage_of(record("mug", 0, False, begun=False, code=code, refused=refused)) == "verify"
