@@ -10,6 +10,7 @@ is kept with its stage, and the failure that came furthest is the one reported.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
-from magic_core.motion import MotionPlan, ToolMotion
+from magic_core.motion import TOOL_SPEED, TOOL_TURN, Margin, MotionPlan, ToolMotion
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 from magic_planner import timing
@@ -33,10 +34,10 @@ from magic_planner.grasps import GraspSettings
 from magic_planner.hand_moves import HandMoves
 from magic_planner.held import grasp_in_hand
 from magic_planner.margins import margins
-from magic_planner.object_motion import placed_contact_frame, table_plane, waypoint_times
+from magic_planner.object_motion import placed_contact_frame, table_plane, turning, waypoint_times
 from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
 from magic_planner.robot import Robot
-from magic_planner.schedule import Schedule
+from magic_planner.schedule import Schedule, slowed
 from magic_planner.task_path import TaskPath, key_poses
 from magic_planner.workspace import Workspace
 
@@ -45,6 +46,9 @@ Array = NDArray[np.float64]
 WAYS = 3
 #: A tool that is tipped by more (rad) from how it lies to how it is used asks for a grasp that serves both attitudes.
 TIPPED = np.deg2rad(20.0)
+#: A tool that the arm can carry too fast for grip, joints or the tool's own speed is carried so many times as slowly at most; and so many
+#: times as slowly nothing is left of its inertia.
+GENTLEST, AT_REST = 3.0, 100.0
 #: What becomes of a request for which there is no such grasp.
 _REACHES = (Code.NO_GRASP, Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION)
 
@@ -238,7 +242,7 @@ class ArmPlanner:
                     try:
                         plan = self._complete(request, branch, len(chosen) < attempt, held is not None)
                         if plan is not None:
-                            plan = self._with_margins(request.tool, choice.grasping, tool_from_contact, plan)
+                            plan = self._bearable(request.tool, choice.grasping, tool_from_contact, plan)
                     except StageError as failure:
                         failures.add(failure.stage, failure.error)
                         if failure.stage == "approach" and failure.error.code == Code.PATH_IN_COLLISION:
@@ -255,14 +259,35 @@ class ArmPlanner:
             )
         raise failures.error()
 
-    def _with_margins(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
-        """The plan with its margins; raises StageError where one is negative."""
+    def _bearable(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
+        """The plan with its margins, the tool carried no faster than it may go and than grip and joints bear; raises StageError where that
+        is more than :data:`GENTLEST` times as slowly as the joints could."""
+        plan = slowed(plan, max(1.0, *haste(plan.tool_motion)))
+        try:
+            return self._with_margins(tool, grasping, tool_from_contact, plan)
+        except StageError:
+            quick, still = (self._margins(tool, grasping, tool_from_contact, p) for p in (plan, slowed(plan, AT_REST)))
+            # Each share grows at most by its inertial part, which falls with the square of the factor: the shares are sums of norms.
+            left = {margin.name: margin.left for margin in still}
+            needed = [(margin.left, left[margin.name]) for margin in quick if margin.left < 0]
+            if min(rest for _, rest in needed) <= 0:
+                raise
+            factor = max(math.sqrt((rest - moving) / rest) for moving, rest in needed) + 0.01
+            if factor > GENTLEST:
+                raise
+        return self._with_margins(tool, grasping, tool_from_contact, slowed(plan, factor))
+
+    def _margins(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> tuple[Margin, ...]:
         arm = plan.arm_motion
         assert arm is not None
         held = (arm.grasp_time, np.inf if arm.release_time is None else arm.release_time)
-        found = margins(
+        return margins(
             self.robot, grasping, tool, arm.tool_from_tcp, tool_from_contact, arm.times, arm.positions, held, plan.tool_motion.phases
         )
+
+    def _with_margins(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
+        """The plan with its margins; raises StageError where one is negative."""
+        found = self._margins(tool, grasping, tool_from_contact, plan)
         least = min(found, key=lambda margin: margin.left)
         if least.left < 0:
             code = Code.NO_GRASP if least.name == "grip" else Code.DYNAMIC_LIMIT
@@ -293,6 +318,14 @@ class ArmPlanner:
             come = self.free.come(request, pick[0][0])
         request.feedback("timing", "time parameterisation")
         return self.schedule.timed(request, branch, come, pick, carry, task, retreat)
+
+
+def haste(motion: ToolMotion) -> tuple[float, float]:
+    """Speed and turning speed of a tool at their greatest, in shares of what is allowed."""
+    steps = np.diff(motion.times)
+    way = np.linalg.norm(np.diff(motion.world_from_tool[:, :3, 3], axis=0), axis=1)
+    turns = turning(motion.world_from_tool[:-1], motion.world_from_tool[1:])
+    return float((way / steps).max() / TOOL_SPEED), float((turns / steps).max() / TOOL_TURN)
 
 
 def tipping(lying: Array, used: Array) -> float:

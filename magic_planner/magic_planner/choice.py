@@ -13,6 +13,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_planner.collision import Body, mass_centre, solid_pieces
 from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
+from magic_planner.margins import grip_at_rest
 from magic_planner.request import ArmSettings, Request
 from magic_planner.robot import Robot
 
@@ -38,7 +39,8 @@ class GraspChoice:
         self.static, self.swept = self._points()
 
     def lots(self) -> Iterator[list[Grasp]]:
-        """Grasps whose open hand is clear of everything, in lots of the settings' sizes; raises NO_GRASP where there is none."""
+        """Grasps whose open hand is clear of everything and whose grip holds the tool at least at rest, in lots of no more than the
+        settings' sizes; raises NO_GRASP where there is none."""
         problem: MagicError | None = None
         for finer in (1, 4):  # a tool that seems to have no grasp is looked at more closely before that is said
             self.request.budget.check("grasp")
@@ -53,13 +55,25 @@ class GraspChoice:
             free = collision_free(
                 self.robot, grasps, self.request.tool, self._checks(), blocked, self.request.budget, self.settings.standoff / 2
             )
-            found = False
+            shares: list[Array] = []
+            held = False
             for size in self.settings.lots:
                 if lot := list(itertools.islice(free, size)):
-                    found = True
-                    yield lot
-            if found:
+                    shares.append(self._at_rest(lot))
+                    if kept := [grasp for grasp, share in zip(lot, shares[-1], strict=True) if share <= 1]:
+                        held = True
+                        yield kept
+            if held:
                 return
+            if shares:
+                every = np.concatenate(shares)
+                raise MagicError(
+                    Code.NO_GRASP,
+                    f"stage grasp: margin of grip: {100 * every.min():.0f} % of what pads pressed with {self.grasping.grip_force:g} N hold, "
+                    f"at rest, in the best of {len(every)} grasps of {self.request.tool.id}",
+                    f"{100 * (1 - every.min()):.0f} % left",
+                    "0 % or more",
+                )
             name = max(blocked, key=lambda k: blocked[k])
             problem = MagicError(
                 Code.NO_GRASP,
@@ -81,6 +95,18 @@ class GraspChoice:
         physics = self.request.strategy.physics
         loaded, density = (self.request.tool, physics.tool_density) if self.fixed else (self.request.target, 2 * physics.target_density)
         return float(np.clip(mass_centre(solid_pieces(loaded))[0] * density * 9.81, 0.5, 30.0))
+
+    def _at_rest(self, lot: list[Grasp]) -> Array:
+        """(G,): the share of their grip that grasps need however slowly the tool is taken along its task."""
+        request = self.request
+        times = request.times[request.keys]
+        pushed = np.zeros(len(times), dtype=bool)
+        for phase in request.motion.phases:
+            if phase.name in ("contact", "goal"):
+                pushed |= (times >= phase.start) & (times < phase.end)
+        frames = np.stack([grasp.tool_from_tcp for grasp in lot])
+        poses = request.poses[request.keys]
+        return grip_at_rest(self.robot, self.grasping, request.tool, frames, self.tool_from_contact, poses, pushed)
 
     def _there(self, index: int) -> bool:
         """Whether the target is where it was when the motion's pose ``index`` is reached: once touched it goes along, unless it is fixed."""

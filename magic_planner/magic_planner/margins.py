@@ -60,6 +60,9 @@ def margins(
     tcp_from_tool = transforms.inverse(tool_from_tcp)
     world_from_tool = tip @ tcp_from_tool
     middle = world_from_tool[:, :3, :3] @ centre + world_from_tool[:, :3, 3]
+    # Before it is held it lies still: how the empty hand comes to rest is no load.
+    taken = int(np.searchsorted(times, held[0]))
+    middle[:taken] = middle[min(taken, len(middle) - 1)]
     weight = mass * (GRAVITY - _acceleration(times, middle)) * carried[:, None]
     contact = world_from_tool[:, :3, :3] @ tool_from_contact[:3, 3] + world_from_tool[:, :3, 3]
     push = -grasping.force * world_from_tool[:, :3, :3] @ tool_from_contact[:3, 0] * (pushed & carried)[:, None]
@@ -69,14 +72,9 @@ def margins(
         return Margin(name, 1 - float(share[worst]), float(times[worst]), _phase(phases, float(times[worst])), what)
 
     found = []
-    patches = Patches.of(robot, tool_from_tcp[None], pieces)
-    if patches.there[0]:
-        turn = world_from_tool[:, :3, :3].transpose(0, 2, 1)
-        forces = np.einsum("nij,nj->ni", turn, weight + push)
-        levers = np.cross(centre - tool_from_tcp[:3, 3], np.einsum("nij,nj->ni", turn, weight))
-        levers += np.cross(tool_from_contact[:3, 3] - tool_from_tcp[:3, 3], np.einsum("nij,nj->ni", turn, push))
-        share = pad_share(robot, tool_from_tcp[None], forces, levers[None], *patches.spans(), grasping.grip_force, grasping.friction)[0]
-        found.append(margin("grip", share, f"of what pads pressed with {grasping.grip_force:g} N hold of {1000 * mass:.0f} g"))
+    share = _pad_shares(robot, grasping, tool, tool_from_tcp[None], tool_from_contact, world_from_tool, weight, push)
+    if np.isfinite(share[0, 0]):
+        found.append(margin("grip", share[0], f"of what pads pressed with {grasping.grip_force:g} N hold of {1000 * mass:.0f} g"))
     torque = np.abs(_torques(chain, frames, times, [(weight, middle), (push, contact)])) / chain.effort
     joint = int(torque.max(axis=0).argmax())
     limit = f"{chain.effort[joint]:g} {'N' if chain.prismatic[joint] else 'N m'}"
@@ -89,6 +87,43 @@ def margins(
     home = float(_least_singular(chain, *chain.frames(robot.home[None]))[0])
     found.append(margin("singularity", 1 - np.minimum(least / home, 1.0), "of the mobility at home is lost"))
     return tuple(found)
+
+
+def _pad_shares(
+    robot: Robot,
+    grasping: GraspSettings,
+    tool: SceneObject,
+    frames: Array,
+    tool_from_contact: Array,
+    world_from_tool: Array,
+    weight: Array,
+    push: Array,
+) -> Array:
+    """(G, K): :func:`magic_planner.grasps.pad_share` of grasps (G, 4, 4) tool_from_tcp under forces (K, 3) in the world on a tool at K
+    poses, ``weight`` on its mass and ``push`` on the contact; NaN where a pad meets nothing."""
+    pieces = solid_pieces(tool)
+    centre = mass_centre(pieces)[1]
+    turn = world_from_tool[:, :3, :3].transpose(0, 2, 1)
+    weights, pushes = (np.einsum("nij,nj->ni", turn, force) for force in (weight, push))
+    origin = frames[:, None, :3, 3]
+    levers = np.cross(centre - origin, weights[None]) + np.cross(tool_from_contact[:3, 3] - origin, pushes[None])
+    patches = Patches.of(robot, frames, pieces)
+    share = pad_share(robot, frames, weights + pushes, levers, *patches.spans(), grasping.grip_force, grasping.friction)
+    return np.where(patches.there[:, None], share, np.nan)
+
+
+def grip_at_rest(
+    robot: Robot, grasping: GraspSettings, tool: SceneObject, frames: Array, tool_from_contact: Array, poses: Array, pushed: Array
+) -> Array:
+    """(G,): the share of what the pads of grasps (G, 4, 4) tool_from_tcp hold that is used however slowly the tool goes.
+
+    poses (K, 4, 4): world_from_tool along the motion; pushed (K,): whether ``grasping.force`` acts on the contact there.  0 where a pad
+    meets nothing, of which :func:`margins` says nothing either.
+    """
+    weight = np.tile(mass_centre(solid_pieces(tool))[0] * grasping.density * GRAVITY, (len(poses), 1))
+    push = -grasping.force * poses[:, :3, :3] @ tool_from_contact[:3, 0] * pushed[:, None]
+    share = _pad_shares(robot, grasping, tool, frames, tool_from_contact, poses, weight, push).max(axis=1)
+    return np.asarray(np.nan_to_num(share, nan=0.0))
 
 
 def _phase(phases: Sequence[Phase], time: float) -> str:

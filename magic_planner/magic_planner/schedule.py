@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,45 @@ from magic_planner.request import ArmSettings, Branch, Request, StageError
 from magic_planner.robot import Robot
 
 Array = NDArray[np.float64]
+
+
+def slowed(plan: MotionPlan, factor: float) -> MotionPlan:
+    """The arm's plan with the tool carried and used ``factor`` times as slowly; coming to it, closing and leaving it take as long as before.
+
+    The path is the same, speeds and accelerations are less by ``factor`` and its square.
+    """
+    arm = plan.arm_motion
+    assert arm is not None
+    since = next((p.end for p in arm.phases if p.name == "grasp"), arm.grasp_time)
+    until = float(arm.times[-1]) if arm.release_time is None else arm.release_time
+
+    def at(times: Array) -> Array:
+        return times + (factor - 1) * np.clip(times - since, 0.0, until - since)
+
+    def moment(time: float) -> float:
+        return float(at(np.array(time)))
+
+    slow = np.where((arm.times > since) & (arm.times <= until), factor, 1.0)[:, None]
+    phases = tuple(Phase(p.name, moment(p.start), moment(p.end)) for p in arm.phases)
+    tool = plan.tool_motion
+    return replace(
+        plan,
+        tool_motion=ToolMotion(
+            at(tool.times),
+            tool.world_from_tool,
+            tuple(Phase(p.name, moment(p.start), moment(p.end)) for p in tool.phases),
+            tuple((name, moment(time)) for name, time in tool.marks),
+        ),
+        arm_motion=replace(
+            arm,
+            times=at(arm.times),
+            velocities=arm.velocities / slow,
+            accelerations=arm.accelerations / slow**2,
+            grasp_time=moment(arm.grasp_time),
+            release_time=None if arm.release_time is None else moment(arm.release_time),
+            phases=phases,
+        ),
+    )
 
 
 class Schedule:

@@ -14,11 +14,14 @@ from magic_core.errors import Code, MagicError
 from magic_core.joint_limits import PUBLISHED
 from magic_core.strategy import Waypoint
 from magic_planner import timing
+from magic_planner.arm import haste
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, grown, roomy_shell, shell
 from magic_planner.free_motion import LONGEST
+from magic_planner.margins import margins
 from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
 from magic_planner.request import StageError
+from magic_planner.schedule import slowed
 
 
 def problem(at=(0.6, 0.0), **changes):
@@ -325,6 +328,84 @@ def test_a_plan_carries_its_margins_and_a_heavy_tool_is_refused_with_its_number(
     with pytest.raises(StageError) as caught:
         arm._with_margins(tool, dataclasses.replace(arm.grasping, density=1.2 * 600.0 / shares[0], force=0.0), contact, plan)
     assert caught.value.error.code in (Code.NO_GRASP, Code.DYNAMIC_LIMIT) and "margin of grip: 120 %" in caught.value.error.message
+
+
+def test_a_plan_is_slowed_from_when_the_tool_is_taken_until_it_is_let_go(solved):
+    _, plan = solved
+    slow = slowed(plan, 2.0)
+    before, after = plan.arm_motion, slow.arm_motion
+    taken = span(plan, "grasp").end
+    first = before.times <= taken
+    for field in ("times", "velocities", "accelerations"):
+        np.testing.assert_array_equal(getattr(after, field)[first], getattr(before, field)[first])
+    np.testing.assert_allclose(after.times[-1] - taken, 2 * (before.times[-1] - taken))
+    np.testing.assert_array_equal(after.positions, before.positions)
+    np.testing.assert_allclose(after.velocities[~first], before.velocities[~first] / 2)
+    np.testing.assert_allclose(after.accelerations[~first], before.accelerations[~first] / 4)
+    middle = 0.5 * (after.velocities[1:] + after.velocities[:-1]) * np.diff(after.times)[:, None]
+    assert np.abs(np.diff(after.positions, axis=0) - middle).max() < 2e-3
+    assert (after.grasp_time, after.release_time) == (before.grasp_time, None)
+    np.testing.assert_array_equal(slow.tool_motion.times, after.times)
+    np.testing.assert_allclose(span(slow, "goal").start - taken, 2 * (span(plan, "goal").start - taken))
+    let_go = dataclasses.replace(plan, arm_motion=dataclasses.replace(before, release_time=float(before.times[-50])))
+    after = slowed(let_go, 2.0).arm_motion
+    np.testing.assert_allclose(np.diff(after.times[-50:]), np.diff(before.times[-50:]))
+    np.testing.assert_array_equal(after.velocities[-49:], before.velocities[-49:])
+    assert after.release_time == pytest.approx(after.times[-50])
+
+
+def test_a_tool_that_the_grip_would_lose_at_the_arms_speed_is_carried_slower(arm, solved):
+    (_, tool, _, candidate, reflection, _), plan = solved
+    contact = tool_contact_frame(candidate, reflection)
+    plan = slowed(plan, 0.4)
+
+    def grip(density, motion):
+        found = arm._margins(tool, dataclasses.replace(arm.grasping, density=density, force=0.0), contact, motion)
+        return 1 - next(m.left for m in found if m.name == "grip")
+
+    # As dense as leaves a fifth of the grip for what the tool's inertia asks, which is more at this speed.
+    density = 600.0 * 0.8 / grip(600.0, slowed(plan, 100.0))
+    assert grip(density, plan) > 1.05
+    grasping = dataclasses.replace(arm.grasping, density=density, force=0.0)
+    gentle = arm._bearable(tool, grasping, contact, plan)
+    least = min(gentle.margins, key=lambda margin: margin.left)
+    assert least.name == "grip" and 0 <= least.left < 0.1
+    assert gentle.arm_motion.times[-1] > plan.arm_motion.times[-1]
+    np.testing.assert_array_equal(gentle.arm_motion.positions, plan.arm_motion.positions)
+    with pytest.raises(StageError) as caught:  # what it cannot hold at rest it holds at no speed
+        arm._bearable(tool, dataclasses.replace(grasping, density=1.5 * density), contact, plan)
+    assert "margin of grip" in caught.value.error.message
+
+
+def test_a_tool_is_carried_no_faster_than_a_tool_may_go(arm, solved):
+    (_, tool, _, candidate, reflection, _), plan = solved
+    quick = slowed(plan, max(haste(plan.tool_motion)) / 1.5)
+    assert max(haste(quick.tool_motion)) == pytest.approx(1.5)
+    light = dataclasses.replace(arm.grasping, density=1.0, force=0.0)
+    allowed = arm._bearable(tool, light, tool_contact_frame(candidate, reflection), quick)
+    assert max(haste(allowed.tool_motion)) <= 1 + 1e-9
+
+
+def test_how_the_empty_hand_comes_to_rest_is_no_load_on_the_grip(arm, solved):
+    (_, tool, _, candidate, reflection, _), plan = solved
+    motion, contact = plan.arm_motion, tool_contact_frame(candidate, reflection)
+    given = arm.robot, arm.grasping, tool, motion.tool_from_tcp, contact
+    rest = motion.positions, (motion.grasp_time, np.inf), plan.tool_motion.phases
+    # The same approach, five times as fast: only what comes before the grasp differs.
+    before = motion.times < motion.grasp_time
+    times = np.where(before, motion.grasp_time - (motion.grasp_time - motion.times) / 5, motion.times)
+    usual, rushed = (next(m for m in margins(*given, t, *rest) if m.name == "grip") for t in (motion.times, times))
+    assert rushed.left == pytest.approx(usual.left, abs=1e-9)
+
+
+def test_grasps_that_cannot_hold_the_tool_at_rest_are_not_planned_with(arm):
+    strategy, *rest = problem()
+    heavy = dataclasses.replace(strategy, physics=dataclasses.replace(strategy.physics, tool_density=60000.0))
+    heard = []
+    with pytest.raises(MagicError) as caught:
+        arm.plan(heavy, *rest, feedback=lambda stage, message: heard.append(stage))
+    assert caught.value.code == Code.NO_GRASP and "at rest" in caught.value.message and "margin of grip" in caught.value.message
+    assert set(heard) == {"grasp"}
 
 
 def in_hand(solved, arm, after, shift=(0.0, 0.0, 0.0)):

@@ -16,17 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from magic_core import interpolation, transforms
 from magic_core.errors import Code, MagicError
-from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
+from magic_core.motion import TOOL_SPEED, TOOL_TURN, ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.robot import Description
 
 Array = NDArray[np.float64]
 
 #: Nothing that a tool does on a table lasts longer (s); a longer one is a mistake in the units of time.
 LONGEST = 600.0
-#: Fastest that a tool may go, m/s and rad/s: Franka's limits of the hand (Franka Control Interface documentation), the arm that the
-#: floating gripper stands for.
-TOOL_SPEED = 1.7
-TOOL_TURN = 2.5
 #: Farthest between two samples, m and rad.  What is between them is not told: a consumer may interpolate it in its own way, which
 #: over a longer step would be another motion than the one simulated.  Motions are planned in steps of a tenth of this.
 TOOL_STEP = 0.05

@@ -11,6 +11,10 @@ from magic_core.errors import Code, MagicError
 
 #: The variants of the paper: a floating gripper moves the tool, or the arm grasps and moves it.
 VARIANTS = ("fg", "arm")
+#: Fastest that a tool may go, m/s and rad/s: Franka's limits of the hand (Franka Control Interface documentation), the arm that the
+#: floating gripper stands for.
+TOOL_SPEED = 1.7
+TOOL_TURN = 2.5
 
 
 @dataclass(frozen=True)
