@@ -174,6 +174,15 @@ def passes(successes: int, count: int, required: float, z: float = Z95) -> bool:
     return successes > 0 and wilson(successes, count, z)[0] >= required
 
 
+def fewest(required: float, tried: int = 0) -> int:
+    """With how many rollouts, none of which fails, a success rate is shown to be no lower than required, after so many motions that were
+    simulated for the same task before: given to :func:`verify` as the most there may be, one that fails is a no."""
+    count = 1
+    while not passes(count, count, required, _z(tried)):
+        count += 1
+    return count
+
+
 class _Recorder:
     def __init__(self, run: Any) -> None:
         self._run = run

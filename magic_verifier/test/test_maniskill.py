@@ -8,7 +8,7 @@ import pytest
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.motion import ArmMotion, Phase, ToolMotion
+from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.strategy import find
 from magic_verifier import maniskill
 
@@ -133,8 +133,7 @@ def test_the_strategy_is_told_how_far_and_nothing_else_of_its_way_changes():
     for before, after in zip(kept, told.waypoints, strict=True):
         assert (before.name, before.speed) == (after.name, after.speed)
         if before.phase != "goal":
-            np.testing.assert_array_equal(before.offset[:2], after.offset[:2])
-            assert after.offset[2] == max(before.offset[2], -maniskill.OVER)
+            np.testing.assert_array_equal(before.offset, after.offset)
     assert (told.physics.friction, told.physics.target_density) == pytest.approx((0.3, 1000), rel=1e-4)
     with pytest.raises(MagicError) as caught:
         maniskill.posed(shipped, maniskill.episode(Fake(cube_at=(0.25, 0.0, 0.02)), 100), np.deg2rad(60))
@@ -193,6 +192,28 @@ def test_a_pull_is_done_when_it_is_long_enough():
     out = np.array([1.0, 0.0, 0.0])
     assert maniskill.done_at(plan, out, 0.1) == pytest.approx(2 + 10 * (0.1 + maniskill.PLAY))
     assert maniskill.done_at(plan, out, 0.5) == 4  # it never is
+
+
+def test_what_time_there_is_goes_to_the_tool_in_the_hand():
+    """A pull of 0.3 m, grasped after 1 s and done after 3.2 s, in 5 s."""
+    times = np.linspace(0, 4, 401)
+    poses = np.tile(np.eye(4), (401, 1, 1))
+    poses[:, 0, 3] = -0.2 * np.maximum(times - 2, 0)
+    phases = (Phase("grasp", 0, 1), Phase("transfer", 1, 2), Phase("goal", 2, 4))
+    joints = np.tile(times[:, None], (1, 7))
+    arm = ArmMotion(times, tuple("abcdefg"), joints, joints * 0 + 1, joints * 0, np.eye(4), 0.05, 0.8, None, phases)
+    plan = MotionPlan("arm", ToolMotion(times, poses, phases), arm)
+    strategy = SimpleNamespace(target_normal=np.array([1.0, 0.0, 0.0]), goal=SimpleNamespace(numbers={"distance": 0.23}))
+    slower, end = maniskill.unhurried(plan, strategy, SimpleNamespace(steps=100, step=0.05, lag=0.1))
+    assert maniskill.done_at(plan, strategy.target_normal, 0.23) == pytest.approx(3.2, abs=0.01)
+    assert end == pytest.approx(5.0 - 0.1 - maniskill.SPARE, abs=0.02)
+    assert slower.arm_motion.grasp_time == 0.8
+    np.testing.assert_array_equal(slower.arm_motion.positions, arm.positions)
+    hurried, _ = maniskill.unhurried(plan, strategy, SimpleNamespace(steps=67, step=0.05, lag=0.1))
+    np.testing.assert_array_equal(hurried.arm_motion.times, times)  # as quick as it can be, and in time
+    with pytest.raises(MagicError) as caught:
+        maniskill.unhurried(plan, strategy, SimpleNamespace(steps=60, step=0.05, lag=0.1))
+    assert caught.value.code == Code.TIME_PARAMETERISATION
 
 
 def test_an_episode_is_played_to_its_step_limit():

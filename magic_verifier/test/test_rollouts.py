@@ -17,7 +17,7 @@ from magic_verifier.floating import speed as fastest
 from magic_verifier.goals import Judgement
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
 from magic_verifier.uncertainty import ShapeError, Spread
-from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, passes, verify, wilson
+from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, fewest, passes, verify, wilson
 
 RNG = np.random.default_rng
 
@@ -181,6 +181,16 @@ def test_intervals():
     assert not decided(8, 8, 24, 0.7) and decided(9, 9, 24, 0.7)
     assert decided(0, 2, 24, 0.7), "two failures and nothing else: the interval is below"
     assert decided(1, 1, 3, 0.7), "three rollouts cannot show it"
+
+
+@pytest.mark.parametrize(("required", "tried"), [(0.7, 0), (0.8, 0), (0.8, 3)])
+def test_with_the_fewest_rollouts_one_that_fails_is_a_no(required, tried):
+    most, z = fewest(required, tried), verification._z(tried)
+    assert passes(most, most, required, z) and not passes(most - 1, most - 1, required, z)
+    for done in range(1, most + 1):
+        assert decided(done - 1, done, most, required, z) and not passes(done - 1, done, required, z)
+    assert not decided(most - 1, most - 1, most, required, z)
+    assert fewest(0.7) == 9
 
 
 # ------------------------------------------------------------ what is drawn
