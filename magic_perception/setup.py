@@ -51,6 +51,7 @@ setup(
             "evaluate = magic_perception.programs:evaluate",
             "learn_seams = magic_perception.programs:learn_seams",
             "learn_confidence = magic_perception.programs:learn_confidence",
+            "learn_surface_error = magic_perception.programs:learn_surface_error",
         ]
     },
 )

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_perception import logistic
 from magic_perception.confidence import NUMBERS, SIGNS
@@ -55,12 +56,7 @@ class Judged:
 def judged(seed: int) -> list[Judged]:
     """The things found in the scene of a seed; every third of those with two cameras has one off by up to 10 mm."""
     made = pile(seed, ALONE)
-    random = np.random.default_rng([seed, 7])
-    frames = list(made.frames)
-    if len(frames) > 1 and random.random() < 1 / 3:
-        shift = random.normal(size=3)
-        shift *= random.uniform(0.002, 0.010) / np.linalg.norm(shift)
-        frames[1] = replace(frames[1], world_from_camera=transforms.make(None, shift) @ frames[1].world_from_camera)
+    frames = shifted(made.frames, seed)
     report = Report()
     try:
         scene = perceive(frames, parameters=Parameters(region_low=(-0.3, -0.8, -0.05), region_high=(1.3, 0.8, 0.6)), report=report)
@@ -70,7 +66,7 @@ def judged(seed: int) -> list[Judged]:
     result = []
     for item, number in zip(scene.objects, numbers, strict=True):
         masks = [image == number for image in report.labels]
-        thing = _shared_most(masks, made)
+        thing = shared_most(masks, made)
         if thing == 0:
             volume, mask = 0.0, 0.0
         else:
@@ -83,7 +79,18 @@ def judged(seed: int) -> list[Judged]:
     return result
 
 
-def _shared_most(masks: list[NDArray[np.bool_]], made: Pile) -> int:
+def shifted(frames: list[RgbdFrame], seed: int) -> list[RgbdFrame]:
+    """Frames of a scene, the second camera of every third of those with two off by 2 to 10 mm."""
+    random = np.random.default_rng([seed, 7])
+    frames = list(frames)
+    if len(frames) > 1 and random.random() < 1 / 3:
+        shift = random.normal(size=3)
+        shift *= random.uniform(0.002, 0.010) / np.linalg.norm(shift)
+        frames[1] = replace(frames[1], world_from_camera=transforms.make(None, shift) @ frames[1].world_from_camera)
+    return frames
+
+
+def shared_most(masks: list[NDArray[np.bool_]], made: Pile) -> int:
     """The true thing with most pixels in the masks; 0 for the table."""
     count = sum(np.bincount(truth[mask].clip(0), minlength=made.things + 1) for mask, truth in zip(masks, made.truth, strict=True))
     return int(np.argmax(count))

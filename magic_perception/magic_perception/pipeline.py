@@ -28,6 +28,7 @@ from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _fr
 from magic_perception.sight import agreement
 from magic_perception.smear import behind
 from magic_perception.solids import hull_of
+from magic_perception.surface_error import Departure, departure, likely
 
 #: Round an object in its picture, as a share of its longer side.
 MARGIN = 0.15
@@ -51,6 +52,7 @@ class Report:
     cameras: list[cameras.Disagreement] = field(default_factory=list)
     earlier: list[tuple[RgbdFrame, RgbdFrame]] = field(default_factory=list)
     evidence: dict[str, Evidence] = field(default_factory=dict)
+    departures: dict[str, Departure] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -189,7 +191,7 @@ def perceive(
                 report.notes.append(
                     f"something hangs above the table, with nothing below that carries it, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
                 )
-            report.evidence[item.id] = built.evidence
+            report.evidence[item.id], report.departures[item.id] = built.evidence, built.departed
             report.shapes[item.id], report.pixels[item.id] = built.solid.shape, built.pixels
             objects.append(item)
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
@@ -224,6 +226,7 @@ class _Built:
     picture: NDArray[np.uint8]
     cut_off: list[int | str]
     evidence: Evidence
+    departed: Departure
     hanging: bool
 
 
@@ -290,7 +293,9 @@ def _build(
     )
     best = int(np.argmax(counts[:now] if max(counts[:now]) else counts))
     mask, frame = labels[best] == label, looks[best].frame
-    return _Built(solid, points, colors, mask, frame.camera, counts[best], _about(mask, frame.color), cut, evidence, hanging)
+    departed = departure(solid.mesh, sights)
+    picture = _about(mask, frame.color)
+    return _Built(solid, points, colors, mask, frame.camera, counts[best], picture, cut, evidence, departed, hanging)
 
 
 def _about(mask: NDArray[np.bool_], color: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -331,6 +336,7 @@ def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObj
     return SceneObject(
         "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera, built.picture,
         world_from_box=pose, box_extents=local.extents, confidence=chance(built.evidence),
+        surface_error=likely(built.evidence, built.departed),
     )  # fmt: skip
 
 

@@ -130,21 +130,11 @@ def _middle(item: SceneObject) -> NDArray[np.float64]:
     return transforms.apply(item.world_from_object, item.mesh.bounds.mean(axis=0))
 
 
-def surface_error(true: SceneObject, seen: SceneObject, points: int = 1500) -> float:
+def surface_error(true: SceneObject, seen: SceneObject) -> float:
     """How far reconstruction and truth are apart, where they stand: root mean square distance, m, from points on each to the other."""
-    import trimesh
-    from open3d.core import Tensor
-    from open3d.t.geometry import RaycastingScene
+    from magic_perception.surface_error import distance
 
-    surfaces = [item.mesh.transformed(item.world_from_object) for item in (true, seen)]
-    squares = []
-    for here, there in (surfaces, surfaces[::-1]):
-        solid = trimesh.Trimesh(here.vertices, here.faces, process=False)
-        sample = trimesh.sample.sample_surface(solid, points, seed=0)[0]
-        scene = RaycastingScene()
-        scene.add_triangles(Tensor(there.vertices.astype(np.float32)), Tensor(there.faces.astype(np.uint32)))
-        squares.append(np.square(scene.compute_distance(Tensor(sample.astype(np.float32))).numpy()).mean())
-    return float(np.sqrt(np.mean(squares)))
+    return distance(*(item.mesh.transformed(item.world_from_object) for item in (true, seen)))
 
 
 def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, plan: MotionPlan, seed: int) -> Any:

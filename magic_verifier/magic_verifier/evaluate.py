@@ -276,7 +276,7 @@ def _judge(options: Options, case: Case, problem: _Problem | None, runs: list[_T
 
 
 def _seen(case: Case, problem: _Problem | None) -> list[dict[str, float]]:
-    """How sure perception was of each tool, how much of it was seen, and how far it is off (m)."""
+    """How sure perception was of each tool, how much of it was seen, and how far it is off (m) and was stated to be at most, five times of six."""
     if problem is None or problem.layout is None:
         return []
     true = dict(zip(case.tools, problem.layout.tools, strict=True))
@@ -285,6 +285,7 @@ def _seen(case: Case, problem: _Problem | None) -> list[dict[str, float]]:
             "confidence": round(float(tool.confidence), 3),
             "seen_share": round(float(tool.seen_share), 3),
             "surface_error": round(captured.surface_error(true[name], tool), 5),
+            "stated_error": round(float(tool.surface_error), 5),
         }
         for tool, name in zip(problem.tools, problem.names, strict=True)
     ]
@@ -541,6 +542,10 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
                     f"reconstructions of confidence {words}: surface error {middle:.1f} mm (the middle two thirds {low:.1f} to {high:.1f}) "
                     f"of {len(errors)}\n"
                 )
+        told = [s for c in done for s in c.get("seen", ()) if s["stated_error"] > 0]
+        if told:
+            below, middle = sum(s["surface_error"] <= s["stated_error"] for s in told), 1000 * np.median([s["stated_error"] for s in told])
+            text += f"{below} of {len(told)} surface errors are below what was stated (5 of 6 are to be), {middle:.1f} mm in the middle\n"
     (out / "summary.txt").write_text(text)
     if films:
         contact_sheet(out / "films", done, True, out / "successes.png")

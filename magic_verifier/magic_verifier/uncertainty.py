@@ -83,11 +83,14 @@ class Uncertainty:
     known: Eyes
     camera: Eyes
     seen_less: float
+    drawn_error: float
 
     def eyes(self, item: SceneObject) -> tuple[Eyes, float]:
         """What is known of an object, and by how much its widths are to be multiplied."""
         if item.source == "known":
             return self.known, 1.0
+        if item.surface_error > 0:
+            return self.camera, max(1.0, item.surface_error / self.drawn_error)
         sure = [float(np.clip(v, 0.0, 1.0)) if np.isfinite(v) else 0.0 for v in (item.confidence, item.seen_share)]
         return self.camera, 1.0 + self.seen_less * (1.0 - sure[0] * sure[1])
 
@@ -124,14 +127,18 @@ def _read(path: Path, _changed: int) -> Uncertainty:
         entry = entries(value, where, [f.name for f in fields(Eyes)])
         return Eyes(**{name: spread(entry[name], f"{where}.{name}") for name in entry})
 
-    names = [f.name for f in fields(Uncertainty) if f.name != "seen_less"]
+    by_sight = {"seen_less": (0.0, 100.0), "drawn_error": (1e-5, 0.1)}
+    names = [f.name for f in fields(Uncertainty) if f.name not in by_sight]
     top = entries(found, "", names)
     camera = dict(top["camera"]) if isinstance(top["camera"], dict) else {}
-    seen_less = camera.pop("seen_less", None)
-    if isinstance(seen_less, bool) or not isinstance(seen_less, (int, float)) or not 0 <= seen_less < 100:
-        raise MagicError(Code.BAD_REQUEST, f"camera.seen_less in {path.name}", str(seen_less), "a number, 0 or above, below 100")
+    told = {}
+    for name, (low, high) in by_sight.items():
+        value = camera.pop(name, None)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise MagicError(Code.BAD_REQUEST, f"camera.{name} in {path.name}", str(value), f"a number, {low:g} to {high:g}")
+        told[name] = float(value)
     plain = {name: spread(top[name], name) for name in names if name not in ("known", "camera")}
-    return Uncertainty(**plain, known=eyes(top["known"], "known"), camera=eyes(camera, "camera"), seen_less=float(seen_less))
+    return Uncertainty(**plain, known=eyes(top["known"], "known"), camera=eyes(camera, "camera"), **told)
 
 
 @dataclass(frozen=True)

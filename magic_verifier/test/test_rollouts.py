@@ -214,6 +214,9 @@ def test_what_was_seen_less_is_known_less():
     half = found.eyes(replace(tool, source="camera", confidence=0.5))
     assert half[1] == pytest.approx(2.0) and camera[1] == 1.0
     assert found.eyes(replace(tool, source="camera", confidence=float("nan")))[1] > half[1]
+    # What perception says of the surface goes before what it says of the volume: of a thin thing's confidence nothing follows.
+    stated = [found.eyes(replace(tool, source="camera", confidence=0.05, surface_error=error))[1] for error in (0.0005, 0.004, 0.008)]
+    assert stated[0] == 1.0 and stated[1] == pytest.approx(0.004 / found.drawn_error) and stated[2] == pytest.approx(2 * stated[1])
     eyes = found.eyes(target)
     spread = [np.std([uncertainty.draw(found, e, eyes, 0, k).tool_error.size for k in range(200)]) for e in (camera, half)]
     assert spread[1] == pytest.approx(2 * spread[0], rel=0.01)
@@ -262,6 +265,7 @@ def test_every_entry_of_the_parameter_file_gives_its_reason(tmp_path):
         (lambda f: f["known"]["size"].update(width="wide"), "known.size"),
         (lambda f: f.pop("lag"), "lag"),
         (lambda f: f["camera"].pop("seen_less"), "seen_less"),
+        (lambda f: f["camera"].update(drawn_error=0), "drawn_error"),
     ):
         changed = yaml.safe_load(uncertainty.FILE.read_text())
         change(changed)

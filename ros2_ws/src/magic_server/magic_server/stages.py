@@ -35,16 +35,19 @@ from magic_server.settings import Settings
 OBJECTS_LAG = 5.0
 #: Points of a contact that are nearer than this are the same, m: it went through messages, but nobody measured it anew.
 SAME_POINT = 1e-6
-#: A reconstruction below this confidence is hardly ever right (``magic_perception/README.md``).
-DOUBTFUL = 0.2
+#: A reconstruction whose surface may be off by more than this, m, is no longer what a hook, a handle or a hollow is judged by; where nobody says by how much,
+#: one below this confidence, which is hardly ever right (``magic_perception/README.md``).
+OFF, DOUBTFUL = 0.004, 0.2
 
 
 def doubt(item: SceneObject) -> str:
     """Why an object as it was reconstructed may not be what stands there; empty where it probably is."""
-    if item.source == SceneObject.KNOWN or item.confidence >= DOUBTFUL:
+    stated = item.surface_error > 0
+    if item.source == SceneObject.KNOWN or (item.surface_error <= OFF if stated else item.confidence >= DOUBTFUL):
         return ""
+    why = f"may be off by {1000 * item.surface_error:.1f} mm" if stated else f"confidence {item.confidence:.2f}"
     return (
-        f"{item.id} is a doubtful reconstruction (confidence {item.confidence:.2f}, {100 * item.seen_share:.0f} % of its surface seen): "
+        f"{item.id} is a doubtful reconstruction ({why}, {100 * item.seen_share:.0f} % of its surface seen): "
         "a hole or a hollow that no view shows is not in it; turn it, or look from another side"
     )
 

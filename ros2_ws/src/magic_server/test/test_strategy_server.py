@@ -24,12 +24,13 @@ from magic_core import conversions, naming, qos, transforms
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, VerifyMotion
+from magic_interfaces.msg import SceneObject
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, remote
 from magic_server.joints import JointStates
 from magic_server.permission import ARM_UNKNOWN
 from magic_server.remote import Token
-from magic_server.stages import Stages
+from magic_server.stages import Stages, doubt
 from magic_server.strategy_server import complaint_code
 from magic_server.testing import fakes
 from magic_server.testing.bench import DEADLINE, Bench
@@ -92,6 +93,9 @@ def test_what_fails_with_a_doubtful_reconstruction_says_so(bench):
     message = bench.run()[0].message
     assert "; object_1 is a doubtful reconstruction (confidence 0.03, 41 % of its surface seen)" in message
     assert "object_2 is" not in message
+    # What is said of the surface goes before.
+    assert not doubt(SceneObject(id="spoon", source="camera", confidence=0.03, surface_error=0.002))
+    assert "(may be off by 9.0 mm, " in doubt(SceneObject(id="cup", source="camera", confidence=0.9, surface_error=0.009))
 
 
 def test_nothing_unverified_is_published(bench):
