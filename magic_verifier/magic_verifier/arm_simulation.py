@@ -253,8 +253,8 @@ class ArmRun:
 
     def _touched(self) -> Patch | None:
         """Where both pads touch the tool; ``None`` where they do not hold it between them."""
-        touches = self.world.pressed(TOOL, FINGERS, SOFTNESS)
-        return patch_of(touches, self._arm.tcp(), "xy".index(self.robot.config.closing_axis), self._friction)
+        tcp, closing = self._arm.tcp(), "xy".index(self.robot.config.closing_axis)
+        return patch_of(self.world.pressed(TOOL, FINGERS, SOFTNESS, tcp[:3, closing]), tcp, closing, self._friction)
 
     def _take(self, patch: Patch) -> None:
         """The tool is held, as it is between the pads, or as it was before they closed on what was in them already."""

@@ -10,6 +10,7 @@ fills the gap: it asks, in a world of its own, how deep a posed body is in other
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Sequence
@@ -26,6 +27,8 @@ from magic_core.decomposition import extremes
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 
+#: Two pieces that touch are looked at on a grid of so many points each way where they face each other.
+FACING = 9
 #: Smallest and largest edge length in metres of a body's axis-aligned box that the solver can treat well.
 MIN_EXTENT = 0.002
 MAX_EXTENT = 5.0
@@ -176,6 +179,60 @@ def to_poses(stack: NDArray[np.float64]) -> list[Any]:
 def from_pose(pose: Any) -> NDArray[np.float64]:
     """sapien.Pose to a 4x4 float64 transform."""
     return np.asarray(pose.to_transformation_matrix(), dtype=float)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A convex piece in the world: corners (N, 3), and planes (M, 4) of unit normals outward, with normal @ x + offset <= 0 inside."""
+
+    corners: NDArray[np.float64]
+    planes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, body: Any, shape: Any) -> _Piece | None:
+        """A shape of a body where it is now; ``None`` for what is neither a convex mesh nor a box."""
+        physx = engine().physx
+        if isinstance(shape, physx.PhysxCollisionShapeBox):
+            corners = np.asarray(shape.half_size, dtype=float) * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        elif isinstance(shape, physx.PhysxCollisionShapeConvexMesh):
+            corners = np.asarray(shape.vertices, dtype=float) * np.asarray(shape.scale, dtype=float)
+        else:
+            return None
+        world_from_shape = from_pose(body.entity_pose * shape.local_pose)
+        planes = _planes(corners.tobytes())
+        normals = planes[:, :3] @ world_from_shape[:3, :3].T
+        offsets = planes[:, 3] - normals @ world_from_shape[:3, 3]
+        return cls(transforms.apply(world_from_shape, corners), np.column_stack([normals, offsets]))
+
+    def ends(self, points: NDArray[np.float64], along: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How far (P,) along a direction from each of the points (P, 3) its line enters and leaves; what it misses leaves before it enters."""
+        slope = self.planes[:, :3] @ along
+        height = points @ self.planes[:, :3].T + self.planes[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = -height / slope
+        flat = np.abs(slope) < 1e-9
+        enter = np.where(flat, np.where(height > 0, np.inf, -np.inf), np.where(slope < 0, at, -np.inf)).max(axis=1)
+        leave = np.where(flat, np.where(height > 0, -np.inf, np.inf), np.where(slope > 0, at, np.inf)).min(axis=1)
+        return enter, leave
+
+
+@lru_cache(maxsize=2048)
+def _planes(corners: bytes) -> NDArray[np.float64]:
+    return np.asarray(ConvexHull(np.frombuffer(corners).reshape(-1, 3)).equations)
+
+
+def _facing(upper: _Piece, lower: _Piece, along: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (P, 3) of the lower of two pieces under the upper one, on a grid across the direction up, and the gaps (P,) between them there."""
+    side = transforms.unit(np.cross(along, np.eye(3)[int(np.abs(along).argmin())]))
+    across = np.stack([side, np.cross(along, side)])
+    flat = [piece.corners @ across.T for piece in (upper, lower)]
+    low, high = np.maximum(*(f.min(axis=0) for f in flat)), np.minimum(*(f.max(axis=0) for f in flat))
+    if np.any(high < low):
+        return np.zeros((0, 3)), np.zeros(0)
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, FACING).T), axis=-1).reshape(-1, 2) @ across
+    (bottom, beyond), (before, top) = upper.ends(grid, along), lower.ends(grid, along)
+    both = (beyond > bottom) & (top > before)
+    return grid[both] + top[both, None] * along, (bottom - top)[both]
 
 
 class World:
@@ -446,25 +503,27 @@ class World:
                         )
         return result
 
-    def pressed(self, first: str, second: str, depth: float) -> list[Touch]:
-        """Where two bodies touch, one of which gives way by ``depth`` metres: the contact points of the last step whose separation is at most that
-        and, between those of a contact beyond it and those within, where it is that, without an impulse.
+    def pressed(self, first: str, second: str, depth: float, along: NDArray[np.float64]) -> list[Touch]:
+        """Where two bodies touch, one of which gives way by ``depth`` metres ``along`` a unit direction (3,): the contact points of the last step, and
+        what else of the pieces that touch is no farther apart along it, on a grid across it, without an impulse.
 
-        Two flat faces a little askew touch along an edge, and the engine tells the far ends of what faces each other besides.
+        Rigid faces a little askew touch along an edge, or at a corner, and nothing else of them is among the engine's points.
         """
-        result = []
-        for sign, pair in ((1.0, (first, second)), (-1.0, (second, first))):
+        result = self.touches(first, second, depth)
+        for pair in ((first, second), (second, first)):
             for contact in self._contacts().get(pair, ()):
-                points = [(np.asarray(p.position, dtype=float), float(p.separation), p) for p in contact.points]
-                within = [p for p in points if p[1] <= depth]
-                result += [
-                    Touch(at, sign * np.asarray(p.normal, float), apart, sign * np.asarray(p.impulse, float)) for at, apart, p in within
-                ]
-                for far, beyond, p in points:
-                    if beyond > depth:
-                        for at, apart, _ in within:
-                            edge = at + (depth - apart) / (beyond - apart) * (far - at)
-                            result.append(Touch(edge, sign * np.asarray(p.normal, dtype=float), depth, np.zeros(3)))
+                near = min(contact.points, key=lambda point: point.separation, default=None)
+                if near is None or near.separation > depth:
+                    continue
+                sign = 1.0 if pair == (first, second) else -1.0
+                normal = sign * np.asarray(near.normal, dtype=float)
+                # The normal is towards the first of the two.
+                pieces = [_Piece.of(body, shape) for body, shape in zip(contact.bodies, contact.shapes, strict=True)]
+                if any(piece is None for piece in pieces):
+                    continue
+                upper, lower = pieces if np.asarray(near.normal) @ along > 0 else pieces[::-1]
+                points, gaps = _facing(upper, lower, along)
+                result += [Touch(p, normal, float(gap), np.zeros(3)) for p, gap in zip(points, gaps, strict=True) if gap <= depth]
         return result
 
     def touching(self, first: str, second: str, within: float = 0.0) -> bool:

@@ -188,7 +188,9 @@ class LabWorld:
             if thing is None or thing.kind != DYNAMIC:
                 continue
             friction = (self._options.finger_friction + thing.friction) / 2  # of a pair, as the engine has it
-            patch = patch_of(self.engine.pressed(name, FINGERS, SOFTNESS), self.tcp(), self._closing_axis, friction)
+            tcp = self.tcp()
+            touches = self.engine.pressed(name, FINGERS, SOFTNESS, tcp[:3, self._closing_axis])
+            patch = patch_of(touches, tcp, self._closing_axis, friction)
             if patch is None:
                 continue
             body = self.engine.component(name)
