@@ -28,11 +28,12 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.contact import OPPOSED, Companion, Contact, ContactCandidate, turned_over
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh, concatenate
 from magic_core.motion import Phase, ToolMotion
 from magic_core.placement import Pairs, pairs_of, relative, together, waypoint_poses
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
-from magic_planner.collision import Body, grown, outer_points, solid_pieces
+from magic_planner.collision import Body, grown, hull, outer_points, solid_pieces
 from magic_planner.giving_way import GAP, give_way
 from magic_planner.sliding import lowest, slid_contacts
 
@@ -55,6 +56,9 @@ MARGIN = 0.0015
 #: The gap in metres that a tool keeps to a fixed target until it is let go, in order of trial: what cameras and hand do not know of
 #: where the tool is, two standard deviations, then what room there is.  It falls so far.
 GAPS = (0.006, 0.0045, 0.003, MARGIN)
+#: Room (m) with which a tool is slid over a fixed target, if there is so much, how far aside (m) from how it was shown that is looked for, by
+#: which steps (m), and on how many points of the tool's surface at how many poses it is measured.
+ROOM, ROOM_ASIDE, ROOM_STEPS, ROOM_POINTS, ROOM_POSES = 0.010, 0.02, (0.004, 0.002, 0.001), 3000, 9
 #: Where the tool turns between waypoints, what is so far from the contact (m) moves at the waypoint's speed.
 TURNING_ARM = 0.15
 #: What is no lack of room (m).
@@ -248,7 +252,8 @@ def drawn_in(
     strategy has no approach that ends in a contact, it comes back as it is.
 
     A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
-    there is room, so that a tool that is not quite where it was seen does not press on what cannot give way.
+    there is room, so that a tool that is not quite where it was seen does not press on what cannot give way.  The approach, on which a rod
+    passes through a handle, goes where there is most room about it.
     """
     waypoints = list(strategy.waypoints)
     meets = next((i for i, w in enumerate(waypoints) if w.phase != "approach"), 0)
@@ -275,7 +280,8 @@ def drawn_in(
                 for share in (*SHARES, 0.0):
                     changed = _scaled(seated, meets, share)
                     if not _touches_on(held, poses_of(changed, 1), wall):
-                        return changed
+                        middle = _with_room(changed, meets, tool, poses_of(changed, 0), target, world_from_contact)
+                        return changed if _touches_on(held, poses_of(middle, 1), wall) else middle
     fixed, wall = Body.from_object(target), roomy(MARGIN)
     for share in SHARES:
         changed = _scaled(strategy, meets, share)
@@ -292,6 +298,49 @@ def _seated(strategy: Strategy, gap: float, aside: float) -> Strategy:
         return replace(w, offset=np.array([x if w.phase == "approach" else max(x, gap), y + aside, z]))
 
     return replace(strategy, waypoints=tuple(moved(w) for w in strategy.waypoints))
+
+
+def _with_room(
+    strategy: Strategy,
+    meets: int,
+    tool: SceneObject,
+    poses: NDArray[np.float64],
+    target: SceneObject,
+    world_from_contact: NDArray[np.float64],
+) -> Strategy:
+    """The strategy, its approach shifted across the view direction to where the tool, at the poses (T, 4, 4) of it, is farthest from the target; no
+    farther than it takes for :data:`ROOM`.  Uphill from where it is, so that what goes round the target goes on round it."""
+    import trimesh
+    from open3d.core import Tensor
+    from open3d.t.geometry import RaycastingScene
+
+    def solid(item: SceneObject) -> Mesh:
+        return concatenate([Mesh(*hull(piece.vertices)) for piece in solid_pieces(item)])
+
+    wall = solid(target).transformed(target.world_from_object)
+    scene = RaycastingScene()
+    scene.add_triangles(Tensor(wall.vertices.astype(np.float32)), Tensor(wall.faces.astype(np.uint32)))
+    points = np.asarray(trimesh.sample.sample_surface(solid(tool).to_trimesh(), ROOM_POINTS, seed=0)[0])
+    some = poses[np.unique(np.linspace(0, len(poses) - 1, ROOM_POSES).round().astype(int))]
+    swept = np.concatenate([transforms.apply(pose, points) for pose in some])
+
+    def room(shift: NDArray[np.float64]) -> float:
+        there = swept + world_from_contact[:3, :2] @ shift
+        return float(scene.compute_distance(Tensor(there.astype(np.float32))).numpy().min())
+
+    angles = np.arange(8) * np.pi / 4
+    best, most = np.zeros(2), room(np.zeros(2))
+    for step in ROOM_STEPS:
+        while most < ROOM:
+            near = [best + step * np.array([np.cos(a), np.sin(a)]) for a in angles]
+            found = [room(shift) if np.linalg.norm(shift) <= ROOM_ASIDE else 0.0 for shift in near]
+            if max(found) < most + ROUNDING / 2:
+                break
+            best, most = near[int(np.argmax(found))], max(found)
+    waypoints = [
+        replace(w, offset=np.asarray(w.offset, dtype=float) + [*best, 0.0]) if i < meets else w for i, w in enumerate(strategy.waypoints)
+    ]
+    return replace(strategy, waypoints=tuple(waypoints))
 
 
 def _touches_on(body: Body, poses: NDArray[np.float64], other: Body) -> bool:
