@@ -56,6 +56,8 @@ MARGIN = 0.0015
 #: The gap in metres that a tool keeps to a fixed target until it is let go, in order of trial: what cameras and hand do not know of
 #: where the tool is, two standard deviations, then what room there is.  It falls so far.
 GAPS = (0.006, 0.0045, 0.003, MARGIN)
+#: Where there is no such place it is let go so much of the way from its approach to the contact, in order of trial.
+SHORT = (0.75, 0.5, 0.25, 0.0)
 #: Room (m) with which a tool is slid over a fixed target, if there is so much, how far aside (m) from how it was shown that is looked for, by
 #: which steps (m), and on how many points of the tool's surface at how many poses it is measured.
 ROOM, ROOM_ASIDE, ROOM_STEPS, ROOM_POINTS, ROOM_POSES = 0.010, 0.02, (0.004, 0.002, 0.001), 3000, 9
@@ -252,7 +254,8 @@ def drawn_in(
     strategy has no approach that ends in a contact, it comes back as it is.
 
     A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
-    there is room, so that a tool that is not quite where it was seen does not press on what cannot give way.  The approach, on which a rod
+    there is room, so that a tool that is not quite where it was seen does not press on what cannot give way; where there is none at the
+    contact, on the way to it.  The approach, on which a rod
     passes through a handle, goes where there is most room about it.
     """
     waypoints = list(strategy.waypoints)
@@ -282,6 +285,11 @@ def drawn_in(
                     if not _touches_on(held, poses_of(changed, 1), wall):
                         middle = _with_room(changed, meets, tool, poses_of(changed, 0), target, world_from_contact)
                         return changed if _touches_on(held, poses_of(middle, 1), wall) else middle
+        middle = _with_room(strategy, meets, tool, poses_of(strategy, 0), target, world_from_contact)
+        for gap, share in itertools.product(GAPS, SHORT):
+            changed = _stopped_short(middle, meets, share)
+            if not _touches_on(held, poses_of(changed, 1), roomy(gap - ROUNDING)):
+                return changed
     fixed, wall = Body.from_object(target), roomy(MARGIN)
     for share in SHARES:
         changed = _scaled(strategy, meets, share)
@@ -298,6 +306,15 @@ def _seated(strategy: Strategy, gap: float, aside: float) -> Strategy:
         return replace(w, offset=np.array([x if w.phase == "approach" else max(x, gap), y + aside, z]))
 
     return replace(strategy, waypoints=tuple(moved(w) for w in strategy.waypoints))
+
+
+def _stopped_short(strategy: Strategy, meets: int, share: float) -> Strategy:
+    """The strategy with its contact, and all that follows, at a share of the way across the view direction from the approach to the contact."""
+    waypoints = list(strategy.waypoints)
+    short = (1 - share) * (np.asarray(waypoints[meets - 1].offset, dtype=float) - np.asarray(waypoints[meets].offset, dtype=float))
+    for i in range(meets, len(waypoints)):
+        waypoints[i] = replace(waypoints[i], offset=np.asarray(waypoints[i].offset, dtype=float) + [*short[:2], 0.0])
+    return replace(strategy, waypoints=tuple(waypoints))
 
 
 def _with_room(

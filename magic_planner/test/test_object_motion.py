@@ -358,6 +358,22 @@ def test_a_tool_is_slid_over_a_fixed_target_where_there_is_most_room(radius, roo
         assert met[:2, 3] == pytest.approx([0.018, 0.0], abs=1e-9)
 
 
+def test_a_tool_that_cannot_be_let_go_at_the_contact_is_let_go_on_the_way_to_it():
+    """What was seen of a handle is 8 mm thicker at the contact than where that was found."""
+    tool, tool_contact = ring(0.02)
+    block = scenes.box([0.008, 0.03, 0.02], [0.016, 0, 0])
+    motion, rod = hung(scenes.item("tool", [*tool.pieces, block], tool.world_from_object, scenes.DOWN), tool_contact)
+    body = Body("tool", (*tool.pieces, block))
+    slide = motion.times <= motion.phases[0].end + 1e-9
+    for room, poses in ((0.0085, motion.world_from_tool[slide]), (0.0055, motion.world_from_tool)):
+        wall = Body.from_object(scenes.item("target", [scenes.cylinder(0.006 + room, 0.1)], rod.world_from_object))
+        for pose in poses:
+            body.move(pose)
+            assert not body.touches(wall)
+    met = transforms.inverse(rod.world_from_object) @ at(motion, motion.times[-1]) @ tool_contact.object_from_contact
+    assert 0.014 <= met[0, 3] - 0.006 < 0.018 and abs(met[1, 3]) < 0.003
+
+
 @pytest.mark.parametrize(("radius", "bump", "gap"), [(0.02, False, 0.006), (0.009, False, 0.003), (0.02, True, 0.006)])
 def test_a_tool_is_let_go_clear_of_a_fixed_target_as_far_as_there_is_room(radius, bump, gap):
     """A rod 12 mm thick has 3 mm to each side of it in the middle of a hole of 18 mm; a bump at the contact is stepped aside from."""
