@@ -80,6 +80,9 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         node = node_type()
         refuse_unknown_parameters(node)
         executor.add_node(node)
+        # What was imported and built is there to stay: the collector would walk through all of it, 0.15 s each time, in the middle of goals.
+        gc.collect()
+        gc.freeze()
         spinning = True
         # The wait is in C, and Python only runs a signal's handler between its own instructions: without
         # a limit a node without timers would never notice.
