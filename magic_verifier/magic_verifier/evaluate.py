@@ -421,7 +421,8 @@ def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path:
 
     tiles = []
     for case in [c for c in done if bool(c["success"]) is success][:most]:
-        picture = cv2.imread(str(folder / f"{_key(case['object'])}.png"))
+        film = folder / f"{_key(case['object'])}.png"
+        picture = cv2.imread(str(film)) if film.exists() else None  # OpenCV writes a warning for each that is not there
         if picture is None:
             continue
         label = np.full((22, picture.shape[1], 3), 255, np.uint8)

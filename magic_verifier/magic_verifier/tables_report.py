@@ -210,7 +210,7 @@ def _image(data: bytes, kind: str, caption: str) -> str:
 def _small(path: Path) -> bytes | None:
     import cv2
 
-    picture = cv2.imread(str(path))
+    picture = cv2.imread(str(path)) if path.exists() else None  # OpenCV writes a warning for each that is not there
     if picture is None:
         return None
     height = max(1, round(picture.shape[0] * PICTURE_WIDTH / picture.shape[1]))
