@@ -397,8 +397,9 @@ EDGE = 3
 BAR = 0.05
 #: The least hole between a handle and its body, m^2.
 HOLE = 6e-5
-#: A handle's bow is what stands off from the body farther than this share of how far it stands off at most.
-BOW = 0.4
+#: A handle's bow is what stands off from the body farther than this share of how far it stands off at most; of nine made mugs the surface is as near with 0.4,
+#: without it up to 5 mm farther off.
+BOW = 0.2
 
 
 def handle_of(

@@ -28,6 +28,7 @@ setup(
     install_requires=[
         "numpy<2",
         "opencv-python-headless",
+        "shapely",
         "trimesh",
         beside("magic_core"),
         beside("magic_bringup"),

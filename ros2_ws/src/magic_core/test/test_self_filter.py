@@ -75,7 +75,8 @@ def test_all_of_the_robot_is_cut_and_nothing_away_from_it(panda, shares, finger,
     depth = drawn_by_collision_shapes(robot, joints, LEFT)
     if np.isfinite(depth).any():
         margins, near = self_filter.margins, np.nanmin(depth)
-        reach = 2 * STEP + margins.edge + int(np.ceil(D435.fx * margins.space / near))
+        # The shapes are drawn at every STEP-th pixel; grown by a margin they are nearer by it.
+        reach = 3 * STEP + margins.edge + int(np.ceil(D435.fx * margins.space / (near - margins.space)))
         allowed = cv2.dilate(np.isfinite(depth).astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)).astype(bool)
         assert not np.any(cut.robot & ~allowed)
     else:
