@@ -26,7 +26,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", glob("config/*.yaml")),
     ],
-    install_requires=["numpy<2", "scipy", "mplib", "toppra", "open3d", "trimesh", beside("magic_core")],
+    install_requires=["numpy<2", "scipy", "mplib", "toppra", "trimesh", beside("magic_core")],
     extras_require={"xacro": ["xacro"], "alternatives": ["ssik"]},
     zip_safe=False,
     maintainer="MAGIC developers",

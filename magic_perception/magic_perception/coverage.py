@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from magic_core import shapes, transforms
 from magic_core.camera import RgbdFrame
 from magic_core.mesh import Mesh
+from magic_core.rendering import Raycaster
 from magic_core.scene import Scene, SceneObject
 from magic_core.sensor import D435, SMEARED, STATION, capture, looking_at, scene_raycaster
 from magic_perception.parameters import WORKSPACE, Parameters
@@ -49,8 +50,8 @@ def compared(item: SceneObject, truth: Mesh, count: int = 3000) -> tuple[float, 
     the 90th percentile of the distances of the reconstructed surface from the true one, m."""
     mesh = item.mesh.transformed(item.world_from_object)
     return (
-        float(np.mean(_distances(_surface(truth, count), mesh) < NEAR)),
-        float(np.percentile(_distances(_surface(mesh, count), truth), 90)),
+        float(np.mean(Raycaster([mesh]).distances(_surface(truth, count)) < NEAR)),
+        float(np.percentile(Raycaster([truth]).distances(_surface(mesh, count)), 90)),
     )
 
 
@@ -63,14 +64,6 @@ def _surface(mesh: Mesh, count: int) -> NDArray[np.float64]:
     u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face]
-
-
-def _distances(points: NDArray[np.float64], mesh: Mesh) -> NDArray[np.float32]:
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
 def _at(scene: Scene, mesh: Mesh) -> SceneObject | None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.mesh import Mesh
+from magic_core.rendering import Raycaster
 from magic_perception.confidence import ENDED, ROUND, TURNED, Evidence
 from magic_perception.sight import Sight, measured
 
@@ -191,13 +192,9 @@ def likely(evidence: Evidence, departed: Departure) -> float:
 def distance(one: Mesh, other: Mesh, points: int = 1500) -> float:
     """How far two surfaces are apart: root mean square distance, m, from points on each to the other."""
     import trimesh
-    from open3d.core import Tensor
-    from open3d.t.geometry import RaycastingScene
 
     squares = []
     for here, there in ((one, other), (other, one)):
         sample = trimesh.sample.sample_surface(trimesh.Trimesh(here.vertices, here.faces, process=False), points, seed=0)[0]
-        scene = RaycastingScene()
-        scene.add_triangles(Tensor(there.vertices.astype(np.float32)), Tensor(there.faces.astype(np.uint32)))
-        squares.append(np.square(scene.compute_distance(Tensor(sample.astype(np.float32))).numpy()).mean())
+        squares.append(np.square(Raycaster([there]).distances(sample)).mean())
     return float(np.sqrt(np.mean(squares)))

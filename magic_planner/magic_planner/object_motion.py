@@ -31,6 +31,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate
 from magic_core.motion import Phase, ToolMotion
 from magic_core.placement import Pairs, pairs_of, relative, together, waypoint_poses
+from magic_core.rendering import Raycaster
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
 from magic_planner.collision import Body, grown, hull, outer_points, solid_pieces
@@ -255,8 +256,7 @@ def drawn_in(
 
     A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
     there is room, so that a tool that is not quite where it was seen does not press on what cannot give way; where there is none at the
-    contact, on the way to it.  The approach, on which a rod
-    passes through a handle, goes where there is most room about it.
+    contact, on the way to it.  The approach, on which a rod passes through a handle, goes where there is most room about it.
     """
     waypoints = list(strategy.waypoints)
     meets = next((i for i, w in enumerate(waypoints) if w.phase != "approach"), 0)
@@ -328,22 +328,17 @@ def _with_room(
     """The strategy, its approach shifted across the view direction to where the tool, at the poses (T, 4, 4) of it, is farthest from the target; no
     farther than it takes for :data:`ROOM`.  Uphill from where it is, so that what goes round the target goes on round it."""
     import trimesh
-    from open3d.core import Tensor
-    from open3d.t.geometry import RaycastingScene
 
     def solid(item: SceneObject) -> Mesh:
         return concatenate([Mesh(*hull(piece.vertices)) for piece in solid_pieces(item)])
 
-    wall = solid(target).transformed(target.world_from_object)
-    scene = RaycastingScene()
-    scene.add_triangles(Tensor(wall.vertices.astype(np.float32)), Tensor(wall.faces.astype(np.uint32)))
+    wall = Raycaster([solid(target).transformed(target.world_from_object)])
     points = np.asarray(trimesh.sample.sample_surface(solid(tool).to_trimesh(), ROOM_POINTS, seed=0)[0])
     some = poses[np.unique(np.linspace(0, len(poses) - 1, ROOM_POSES).round().astype(int))]
     swept = np.concatenate([transforms.apply(pose, points) for pose in some])
 
     def room(shift: NDArray[np.float64]) -> float:
-        there = swept + world_from_contact[:3, :2] @ shift
-        return float(scene.compute_distance(Tensor(there.astype(np.float32))).numpy().min())
+        return float(wall.distances(swept + world_from_contact[:3, :2] @ shift).min())
 
     angles = np.arange(8) * np.pi / 4
     best, most = np.zeros(2), room(np.zeros(2))

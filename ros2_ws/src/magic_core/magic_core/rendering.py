@@ -89,6 +89,10 @@ class Raycaster:
         query = self._o3d.core.Tensor(np.asarray(point, dtype=np.float32)[None])
         return self._scene.compute_closest_points(query)["points"].numpy()[0].astype(np.float64)
 
+    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """How far points (N, 3) are from the meshes' surfaces, (N,), metres."""
+        return np.asarray(self._scene.compute_distance(self._o3d.core.Tensor(points.astype(np.float32))).numpy())
+
     def occluded(self, origins: NDArray[np.float64], direction: ArrayLike) -> NDArray[np.bool_]:
         """Whether anything lies on the way from points (N, 3) in one unit direction (3,): shadows."""
         rays = np.empty((len(origins), 6), dtype=np.float32)

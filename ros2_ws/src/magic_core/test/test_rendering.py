@@ -83,3 +83,8 @@ def test_ids_name_the_nearer_mesh_and_the_background_shows(sphere):
     assert cast.ids[20, 28] == 0
     assert cast.ids[0, 0] == -1
     assert shade(cast, background=(1, 2, 3))[0, 0].tolist() == [1, 2, 3]
+
+
+def test_distances_to_a_sphere_are_those_of_its_radius(sphere):
+    points = np.array([[0, 0, 0], [2 * RADIUS, 0, 0], [0, 0.5 * RADIUS, 0]])
+    np.testing.assert_allclose(Raycaster([sphere]).distances(points), [RADIUS, RADIUS, 0.5 * RADIUS], rtol=1e-2)
