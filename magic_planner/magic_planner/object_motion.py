@@ -337,18 +337,21 @@ def _with_room(
     some = poses[np.unique(np.linspace(0, len(poses) - 1, ROOM_POSES).round().astype(int))]
     swept = np.concatenate([transforms.apply(pose, points) for pose in some])
 
-    def room(shift: NDArray[np.float64]) -> float:
-        return float(wall.distances(swept + world_from_contact[:3, :2] @ shift).min())
+    def apart(shift: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float32]:
+        return wall.distances(points + world_from_contact[:3, :2] @ shift)
 
     angles = np.arange(8) * np.pi / 4
-    best, most = np.zeros(2), room(np.zeros(2))
+    best = np.zeros(2)
+    gaps = apart(best, swept)
     for step in ROOM_STEPS:
-        while most < ROOM:
-            near = [best + step * np.array([np.cos(a), np.sin(a)]) for a in angles]
-            found = [room(shift) if np.linalg.norm(shift) <= ROOM_ASIDE else 0.0 for shift in near]
-            if max(found) < most + ROUNDING / 2:
+        while gaps.min() < ROOM:
+            around = [best + step * np.array([np.cos(a), np.sin(a)]) for a in angles]
+            close = swept[gaps < gaps.min() + 2 * step]  # a step away no other point can be the nearest
+            found = [float(apart(shift, close).min()) if np.linalg.norm(shift) <= ROOM_ASIDE else 0.0 for shift in around]
+            if max(found) < gaps.min() + ROUNDING / 2:
                 break
-            best, most = near[int(np.argmax(found))], max(found)
+            best = around[int(np.argmax(found))]
+            gaps = apart(best, swept)
     waypoints = [
         replace(w, offset=np.asarray(w.offset, dtype=float) + [*best, 0.0]) if i < meets else w for i, w in enumerate(strategy.waypoints)
     ]
