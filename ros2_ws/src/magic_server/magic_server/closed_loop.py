@@ -37,6 +37,7 @@ from magic_core.scene import UNSEEN
 from magic_core.strategy import Strategy
 from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
 from magic_server import execution, in_hand, pipeline, scene_change, seen_goal
+from magic_server.after_task import After, points_of, thing
 from magic_server.arm import Arm
 from magic_server.held import Carried, Held, HeldStages
 from magic_server.joints import STANDSTILL
@@ -57,8 +58,6 @@ SLOWEST = 20.0
 SILENT = 1.0
 #: Failures after which the next candidate is tried, from the state as it is then.
 RETRIED = frozenset({Code.GRASP_FAILED, Code.GOAL_MISSED})
-#: What is seen is of the tool where more than this share of it is on the tool's surface.
-MOSTLY = 0.9
 #: Two contacts of one tool that are nearer than this are the same, m.
 SAME_CONTACT = 0.015
 #: The phases of a motion in which the tool is meant to touch the target.
@@ -85,20 +84,6 @@ class Off(Exception):
     def __init__(self, held: Held, deviation: in_hand.Deviation) -> None:
         super().__init__(str(deviation))
         self.held, self.deviation = held, deviation
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A tool by its id, its shape, and where it is: world_from_tool (4, 4)."""
-
-    id: str
-    shape: in_hand.Shape
-    world_from_tool: NDArray[np.float64]
-
-    def explains(self, item: SceneObject) -> bool:
-        """Whether an object that is seen is this tool, or a part of it, whatever its id."""
-        points = conversions.cloud_from_msg(item.cloud)[0]
-        return len(points) > 0 and float(np.mean(self.shape.distances(self.world_from_tool, points) < in_hand.CLOSE)) > MOSTLY
 
 
 @dataclass(frozen=True)
@@ -319,7 +304,7 @@ class ClosedLoop:
         hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
         expected = held.pose(hand)
         job = self.jobs[-1]
-        points = in_hand.clear_of(hand, self._points(scene, job))
+        points = in_hand.clear_of(hand, points_of(scene, job.claim.scene.objects, job.outcome.tool_id, self._limits.object_tolerance))
         spread = in_hand.LOOKED if held.looked else in_hand.GRASPED
         found = in_hand.locate(held.shape, expected, points, hand, self._closing, spread)
         if found is None:
@@ -348,18 +333,6 @@ class ClosedLoop:
     def _unseen(self, why: str) -> None:
         self._say(f"the tool in the hand was not seen ({why}): it is carried on as it was grasped")
         self.notes.append(f"the tool in the hand was not seen: {why}")
-
-    def _points(self, scene: SceneObjectArray, job: Job) -> NDArray[np.float64]:
-        """What cameras see and what is not one of the things that stand where they stood."""
-        stood = job.claim.scene.objects
-        points = [np.zeros((0, 3))]
-        for item in scene.objects:
-            if item.source != SceneObject.CAMERA or UNSEEN in item.cut_off:
-                continue
-            before = stood.get(item.id) if item.id != job.outcome.tool_id else None
-            if before is None or scene_change.gap(before, hull_of(item), True) > self._limits.object_tolerance:
-                points.append(conversions.cloud_from_msg(item.cloud)[0])
-        return np.concatenate(points)
 
     def _lies(self, item: SceneObject, job: Job) -> bool:
         """Whether an object is the tool, where it was before it was grasped, and seen there."""
@@ -488,12 +461,12 @@ class ClosedLoop:
     # ------------------------------------------------------------ the goal
 
     def _judge(self, job: Job) -> str:
-        """Look whether the goal is met, twice, so that what moves is seen to move, and on while what may come to rest is all that speaks against it; raises
-        GOAL_MISSED, GOAL_UNSEEN."""
+        """Look whether the goal is met, twice, so that what moves is seen to move, and on while what may come to rest is all that speaks against it, the tool is
+        not well enough seen, or one pair of looks alone says that it is missed; raises GOAL_MISSED, GOAL_UNSEEN."""
         settle, apart = seen_goal.patience(self._strategy, self._settings.accuracy)
         self._say("looking whether the goal is met")
         begin = self._now()
-        look = self._fresh(begin + max(settle, SETTLED))
+        look, missed = self._fresh(begin + max(settle, SETTLED)), False
         while True:
             first, look = look, None if look is None else self._fresh(_later(look, apart))
             if first is None or look is None:
@@ -501,81 +474,40 @@ class ClosedLoop:
                     Code.GOAL_UNSEEN, f"carried out, but no picture came within {self._settings.look_time:g} s that shows what came of it"
                 )
             seen = self._seen_goal(job, first, look)
-            if not seen.moving or self._now() >= begin + settle + seen_goal.CALMING:
+            again, missed = seen.moving or seen.unsure or (seen.met is False and not missed), seen.met is False
+            if seen.met or not again or self._now() >= begin + settle + seen_goal.CALMING:
                 break
-        if seen.met is None:
-            raise MagicError(Code.GOAL_UNSEEN, f"carried out, but whether the goal is met cannot be told by what is seen: {seen.message}")
-        if not seen.met:
+        if missed and not again:
             raise MagicError(Code.GOAL_MISSED, f"carried out, but the goal is not met by what is seen: {seen.message}")
+        if not seen.met:
+            raise MagicError(Code.GOAL_UNSEEN, f"carried out, but whether the goal is met cannot be told by what is seen: {seen.message}")
         return seen.message
 
     def _seen_goal(self, job: Job, first: SceneObjectArray, second: SceneObjectArray) -> seen_goal.SeenGoal:
-        """The goal asked of two looks after the motion."""
+        """The goal asked of two looks after the motion, for each place where the tool may be by the second, and where it was then by the first."""
         outcome = job.outcome
         names = {"tool": outcome.tool_id, "target": outcome.target_id}
         table = conversions.plane_from_msg(first.table)
-        looks = self._sight(job.stages.scene, False), self._sight(first, True), self._sight(second, True)
         let_go = None if self._carried is None else self._carried.let_go_at
         away = None if let_go is None else float(np.linalg.norm((self._server.hand() - let_go)[:3, 3]))
         hand = seen_goal.Hand(self._held is None, away, self._arm_surface())
         phases = [phase.name for phase in outcome.plan.phases]
-        return seen_goal.judge(self._strategy, names, phases, looks, table, hand, self._settings.accuracy)
+        scene = job.stages.scene
+        before = seen_goal.Sight({item.id: thing(item) for item in scene.objects}, conversions.time_from_msg(scene.header.stamp))
+        tolerance, accuracy = self._limits.object_tolerance, self._settings.accuracy
+        stood, ids = job.claim.scene.objects, (outcome.tool_id, outcome.target_id)
+        after = After(scene, stood, *ids, self._carried, self._held, self._closing, tolerance, accuracy)
+        firsts, seconds = (after.sights(look, self._server.hand) for look in (first, second))
+        found = []
+        for now in seconds:
+            looks = before, min(firsts, key=lambda sight: sight.apart(now, outcome.tool_id)), now
+            found.append(seen_goal.judge(self._strategy, names, phases, looks, table, hand, accuracy))
+        return seen_goal.SeenGoal.of_all(found)
 
     def _arm_surface(self) -> NDArray[np.float64]:
         """Points (N, 3) on arm and hand where the joints are now."""
         poses = self._server.robot.poses({name: joint.position for name, joint in self._server.joints.all().items()})
         return np.concatenate([transforms.apply(poses[link], points) for link, points in surfaces(self._server.robot).items()])
-
-    def _sight(self, scene: SceneObjectArray, after: bool) -> seen_goal.Sight:
-        """Things where they were seen.  After the motion the tool is where the hand has it, or where its shape is seen once that has let it go, and ids may
-        have been handed on: tool and target were near each other."""
-        stamp, known = conversions.time_from_msg(scene.header.stamp), self.jobs[-1].claim.scene.objects
-        # What is remembered from before the motion does not tell what came of it.
-        items = [item for item in scene.objects if not (after and UNSEEN in item.cut_off)]
-        held, tool = (self._held, self._placed(scene)) if after else (None, None)
-        if tool is not None:
-            items = [item for item in items if not tool.explains(item)]
-        if held is not None:
-            hand = self._server.hand(stamp)
-            items = [item for item in items if not held.sees(item, hand, known)]
-        things = {i.id: seen_goal.Thing.of(conversions.mesh_from_msg(i.mesh), conversions.pose_from_msg(i.pose)) for i in items}
-        if tool is not None:
-            things[tool.id] = seen_goal.Thing.of(tool.shape.mesh, tool.world_from_tool)
-        elif after and self._carried is not None and self._carried.held.tool.id not in things:
-            # Most of what is seen where the hand let it go, whatever its id.
-            place = self._tool_at(stamp)
-            assert place is not None  # as it was carried
-            near = [
-                i
-                for i in things.keys() - known.keys()
-                if scene_change.contained(scene_change.hull(things[i].points), place, scene_change.ABOUT)
-            ]
-            if near:
-                things[self._carried.held.tool.id] = things.pop(max(near, key=lambda i: float(np.prod(things[i].extents))))
-        target = self.jobs[-1].outcome.target_id
-        if after and target not in things and target in known:
-            there = self._sight(self.jobs[-1].stages.scene, False).things[target]
-            alike = [i for i in things.keys() - known.keys() if there.like(things[i], 2 * self._settings.accuracy)]
-            if len(alike) == 1:
-                things[target] = things.pop(alike[0])
-        return seen_goal.Sight(things, stamp)
-
-    def _placed(self, scene: SceneObjectArray) -> Placed | None:
-        """The tool in the hand, or where the hand has let it go its shape as it was seen before, laid on what is seen there; ``None``: it was never
-        taken up, or it cannot be told how it lies.
-
-        What is seen of a tool that hangs stops where it is near what holds it, what is seen there counts as that, and it has no more of its
-        hollows than shows now.
-        """
-        carried = self._carried
-        if self._held is not None:
-            hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
-            return Placed(self._held.tool.id, self._held.shape, self._held.pose(hand))
-        if carried is None or carried.let_go_at is None:
-            return None
-        expected, points = carried.held.pose(carried.let_go_at), self._points(scene, self.jobs[-1])
-        found = in_hand.locate(carried.held.shape, expected, points, carried.let_go_at, self._closing, in_hand.LET_GO)
-        return None if found is None else Placed(carried.held.tool.id, carried.held.shape, found.world_from_tool)
 
 
 @lru_cache(maxsize=2)

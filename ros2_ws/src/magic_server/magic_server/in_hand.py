@@ -133,10 +133,18 @@ def clear_of(hand: Array, points: Array) -> Array:
 
 
 def locate(shape: Shape, expected: Array, points: Array, hand: Array, closing: int, spread: Spread = GRASPED) -> Seen | None:
-    """The pose of a tool that is expected at ``expected`` (world_from_tool), by world points (N, 3) of which some are on it.
+    """The pose of a tool, where there is one that :func:`located` finds; ``None`` where too little of it is seen, or what is seen would be as likely with the
+    tool elsewhere."""
+    found = located(shape, expected, points, hand, closing, spread)
+    return found[0] if len(found) == 1 else None
+
+
+def located(shape: Shape, expected: Array, points: Array, hand: Array, closing: int, spread: Spread = GRASPED) -> list[Seen]:
+    """The poses of a tool that is expected at ``expected`` (world_from_tool), by world points (N, 3) of which some are on it: the most likely one first, and
+    those as likely that are :data:`APART` from the ones before.
 
     hand (4, 4): world_from_tcp, where the pads hold it, or did; closing: the axis of that frame, 0 or 1, along which they close.
-    ``None`` where too little of it is seen, or what is seen would be as likely with the tool elsewhere.
+    Empty where too little of it is seen.
     """
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -147,23 +155,25 @@ def locate(shape: Shape, expected: Array, points: Array, hand: Array, closing: i
     points = points[np.linalg.norm(points - middle, axis=1) < ball]
     points = points[:: max(1, len(points) // USED)]
     if len(points) < FEWEST:
-        return None
+        return []
     prior = _Prior.of(hand, closing, spread)
     along = expected[:3, int(np.argmax(mesh.extents))]
     turns = [sign * TURN * axis for axis in hand[:3, :3].T for sign in (1, -1)]
     starts = [transforms.from_rotvec(turn) for turn in ([0.0, 0.0, 0.0], *turns)]
     starts += [transforms.make(translation=shift * along) for shift in (SHIFT, -SHIFT)]
     tried = [_fitted(shape, expected, _about(middle, start), points, prior) for start in starts]
-    moved, against = min(tried, key=lambda fit: fit[1])
-    pose = moved @ expected
-    for other, more in tried:
-        if more < against + LIKELY and not Deviation.of(mesh, pose, other @ expected).within(*APART):
-            return None
-    distances = shape.distances(pose, points)
-    on = distances < CLOSE
-    if on.sum() < max(FEWEST, SHARE * len(points)):
-        return None
-    return Seen(pose, int(on.sum()), float(np.sqrt((distances[on] ** 2).mean())))
+    tried.sort(key=lambda fit: fit[1])
+    found: list[Seen] = []
+    for moved, against in tried:
+        pose = moved @ expected
+        if not against < tried[0][1] + LIKELY or any(Deviation.of(mesh, other.world_from_tool, pose).within(*APART) for other in found):
+            continue
+        distances = shape.distances(pose, points)
+        on = distances < CLOSE
+        if not found and on.sum() < max(FEWEST, SHARE * len(points)):
+            return []
+        found.append(Seen(pose, int(on.sum()), float(np.sqrt((distances[on] ** 2).mean()))))
+    return found
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,9 @@ The goal is the tree that simulation decides as well (:mod:`magic_core.goal`); h
 motion and in two looks after it.  An answer is yes, no, or that it cannot be told: where a thing is not seen, where it is
 nearer to a bound than its place is known, of how it is turned (the frame of a reconstructed thing is another one with each look), and of
 what was to be looked at earlier than the looks are: the end of a phase is asked of them where the tool does nothing after it.
-What touches what is told by how near their surfaces are, and where the hand is by the arm's joints.
+What touches what is told by how near their surfaces are, and where the hand is by the arm's joints.  Surfaces that are seen apart
+may touch all the same where not all of them is seen: a thing of which a part is seen goes on somewhere, and what is seen of one stops
+short of a fixture, to which perception counts what is as near to it as it may be wrong.
 
 What only a simulation can try (pushes, pulls to the side), and masses and impulses, no look tells; they were asked when the motion was
 verified.  In a plain 'all' they are left out, and the answer says so; below an 'any' or a 'not' they cannot be told.
@@ -46,17 +48,27 @@ ENDING = ("retreat",)
 APART = 5.0
 #: What a goal lets come to rest is looked at for so long, s: a simulation calms it, by itself a thing that hangs swings on.
 CALMING = 20.0
+#: What is seen of a thing that touches a fixture ends so far from it at most, m: points as near as perception's ``known_margin`` to a fixture are the
+#: fixture's, and lie apart.
+SHORT = 0.02
 
 
 @dataclass(frozen=True)
 class Thing:
-    """An object as it was seen: points (N, 3) on its surface and the middle (3,) of its box, in the world."""
+    """An object as it was seen: points (N, 3) on its surface and the middle (3,) of its box, in the world.
+
+    given: it is a fixture.  whole: all of its surface is there, of one that cameras see what they see.  span: where that is some part of it, all of it lies
+    within so many m of each of the points.
+    """
 
     points: Array
     middle: Array
+    given: bool = False
+    whole: bool = False
+    span: float | None = None
 
     @classmethod
-    def of(cls, mesh: Mesh, world_from_object: Array) -> Thing:
+    def of(cls, mesh: Mesh, world_from_object: Array, given: bool = False, whole: bool = False) -> Thing:
         """Of a mesh at a pose (4, 4)."""
         corners = transforms.apply(world_from_object, mesh.vertices)
         surface = mesh.vertices
@@ -64,7 +76,16 @@ class Thing:
             body = mesh.to_trimesh()
             count = min(MOST, int(np.ceil(body.area / SPACING**2)))
             surface = np.concatenate([surface, trimesh.sample.sample_surface(body, count, seed=0)[0]])
-        return cls(transforms.apply(world_from_object, surface), (corners.min(axis=0) + corners.max(axis=0)) / 2)
+        return cls(transforms.apply(world_from_object, surface), (corners.min(axis=0) + corners.max(axis=0)) / 2, given, whole or given)
+
+    def part(self, span: float) -> Thing:
+        """The same as some part of a thing that is ``span`` m from one end to the other."""
+        return replace(self, whole=False, span=span)
+
+    @property
+    def unseen(self) -> Array:
+        """(3,): how far its middle may be from that of all of it, along the world's axes, m."""
+        return np.zeros(3) if self.span is None else np.maximum(0.0, self.span - self.extents) / 2
 
     @property
     def extents(self) -> Array:
@@ -84,15 +105,37 @@ class Sight:
     things: Mapping[str, Thing]
     stamp: float
 
+    def apart(self, other: Sight, name: str) -> float:
+        """How far a thing is from where another look has it, m; inf where one has not."""
+        if name not in self.things or name not in other.things:
+            return math.inf
+        return float(np.linalg.norm(self.things[name].middle - other.things[name].middle))
+
 
 @dataclass(frozen=True)
 class SeenGoal:
     """met: whether the goal is met, ``None`` where it cannot be told; message: by what; moving: what the goal lets come to rest is seen to move, and nothing
-    else speaks against it: how it moves is why it cannot be told, or may be."""
+    else speaks against it: how it moves is why it cannot be told, or may be; unsure: where the tool is cannot be told by what is seen of it, which another
+    look may."""
 
     met: bool | None
     message: str
     moving: bool = False
+    unsure: bool = False
+
+    @classmethod
+    def of_all(cls, found: Sequence[SeenGoal]) -> SeenGoal:
+        """What holds wherever the tool may be, of answers for each of the poses in which it may be."""
+        first = found[0]
+        if len({one.met for one in found}) == 1:
+            return first
+        told = "; or: ".join(dict.fromkeys(one.message for one in found if one.met is not True))
+        return cls(
+            None,
+            f"what is seen of the tool goes with {len(found)} poses of it, in some of which {told}",
+            any(one.moving for one in found),
+            True,
+        )
 
 
 @dataclass(frozen=True)
@@ -141,13 +184,17 @@ def judge(
     found = asked.node(strategy.goal.tree, True)
     if found is None:
         return SeenGoal(None, "none of it shows")
+    tools = [sight.things[names["tool"]] for sight in looks[1:] if names["tool"] in sight.things]
+    unsure = found.truth is None and any(tool.span is not None for tool in tools)
     unasked = dict.fromkeys(asked.unasked) if found.truth else ()
     moving = False
     if not found.truth:
         calm = replace(asked, calm=True, unasked=[])
         rest = calm.node(strategy.goal.tree, True)
         moving = calm.restless and (rest is None or rest.truth is not False)
-    return SeenGoal(found.truth, "; ".join(filter(None, (found.text, f"not looked at: {', '.join(unasked)}" if unasked else ""))), moving)
+    return SeenGoal(
+        found.truth, "; ".join(filter(None, (found.text, f"not looked at: {', '.join(unasked)}" if unasked else ""))), moving, unsure
+    )
 
 
 @dataclass
@@ -256,7 +303,7 @@ class _Asked:
     def way(self, name: str) -> tuple[Array, float]:
         """How far a thing's middle has moved (3,), and how exactly that is known, m: of what is seen in part now, less so."""
         before, now = self.thing(name, self.before), self.thing(name, self.now)
-        return now.middle - before.middle, self.accuracy + float(np.abs(now.extents - before.extents).max()) / 2
+        return now.middle - before.middle, self.accuracy + float(max(np.abs(now.extents - before.extents).max() / 2, now.unseen.max()))
 
     def height(self, thing: Thing) -> float:
         """Of its middle above the table, m."""
@@ -300,18 +347,22 @@ class _Asked:
         now = self.thing(what, self.now)
         found = self.height(now)
         text = f"the {what} is {1000 * found:.0f} mm above the table, needed {1000 * height:g}"
-        return self.at_least(found, height, self.accuracy, text)
+        return self.at_least(found, height, self.accuracy + float(now.unseen[2]), text)
 
     def _inside(self, what: str, low: Any, high: Any, of: str) -> _Told:
-        place = self.thing(what, self.now).middle - (self.thing("target", self.before).middle if of == "start" else 0.0)
+        now = self.thing(what, self.now)
+        place = now.middle - (self.thing("target", self.before).middle if of == "start" else 0.0)
         room = float(np.minimum(place - np.asarray(low), np.asarray(high) - place).min())
         where = f"{1000 * abs(room):.0f} mm {'inside' if room > 0 else 'outside'} of the region"
-        return self.at_least(room, 0.0, self.accuracy, f"the {what} is {where}")
+        return self.at_least(room, 0.0, self.accuracy + float(now.unseen.max()), f"the {what} is {where}")
 
     def _at_rest(self, what: str, below: float, turning: float) -> _Told:
-        way = float(np.linalg.norm(self.thing(what, self.now).middle - self.thing(what, self.first).middle))
+        first, now = self.thing(what, self.first), self.thing(what, self.now)
+        way = float(np.linalg.norm(now.middle - first.middle))
         seconds = max(self.now.stamp - self.first.stamp, 1e-3)
-        return self.at_least(-way, -below * seconds, self.accuracy, f"the {what} moved {1000 * way:.0f} mm in {seconds:.1f} s")
+        parts = 0.0 if now.whole and first.whole else float(np.abs(now.extents - first.extents).max()) / 2
+        exact = self.accuracy + float(max(parts, now.unseen.max(), first.unseen.max()))
+        return self.at_least(-way, -below * seconds, exact, f"the {what} moved {1000 * way:.0f} mm in {seconds:.1f} s")
 
     def _released(self) -> _Told:
         return _Told(self.hand.released, "the tool was let go" if self.hand.released else "the tool is in the hand")
@@ -324,25 +375,32 @@ class _Asked:
         text = f"the hand is {1000 * self.hand.away:.0f} mm from where it let go, needed {1000 * by:g}"
         return _Told(self.hand.away >= by, text)
 
-    def gap(self, what: str, whom: str) -> float:
-        """How near the surfaces of two bodies are, m."""
+    def gap(self, what: str, whom: str) -> tuple[float, float]:
+        """How near the surfaces of two bodies are seen to come, and how near they may be at least, m."""
         thing = self.thing(what, self.now)
         if whom == "table":
-            return float((thing.points @ self.table[:3] + self.table[3]).min())
+            heights = thing.points @ self.table[:3] + self.table[3]
+            seen = max(0.0, float(heights.min()))
+            return seen, seen if thing.span is None else max(0.0, float(heights.max()) - thing.span)
         if whom in HAND:
             assert self.hand.points is not None
-            return float(cKDTree(self.hand.points).query(thing.points)[0].min())
-        return float(cKDTree(self.thing(whom, self.now).points).query(thing.points)[0].min())
+            other = Thing(self.hand.points, self.hand.points.mean(axis=0), whole=True)
+        else:
+            other = self.thing(whom, self.now)
+        seen = float(cKDTree(other.points).query(thing.points)[0].min())
+        short = SHORT if (thing.given and not other.whole) or (other.given and not thing.whole) else 0.0
+        return seen, max(0.0, min([seen - short, *(_nearest(a, b) for a, b in ((thing, other), (other, thing)) if a.span is not None)]))
 
     def _touching(self, what: str, whom: str) -> _Told:
         if whom in HAND and what == "tool" and not self.hand.released:
             return _Told(True, "the tool is in the hand")
         if whom in HAND and self.hand.points is None:
             return _Told(None, f"whether the hand touches the {what} is not seen")
-        gap = self.gap(what, whom)
+        gap, least = self.gap(what, whom)
         # Surfaces are known to the accuracy of both, and between their points is room.
-        truth = True if gap <= self.accuracy else (False if gap > 3 * self.accuracy else None)
-        return _Told(truth, f"the {what} is {1000 * max(gap, 0.0):.0f} mm from the {whom}")
+        truth = True if gap <= self.accuracy else (False if least > 3 * self.accuracy else None)
+        seen = f"what is seen of the {what}" if truth is None and least < gap else f"the {what}"
+        return _Told(truth, f"{seen} is {1000 * gap:.0f} mm from the {whom}")
 
     def _touching_only(self, what: str, whom: str) -> _Told:
         own = {self.names.get(what, what), self.names.get(whom, whom)}
@@ -361,3 +419,11 @@ class _Asked:
         if False in (touching.truth, only.truth):
             return _Told(False, touching.text if touching.truth is False else only.text)
         return _Told(None if None in (touching.truth, only.truth) else True, f"{touching.text}; {only.text}")
+
+
+def _nearest(part: Thing, other: Thing) -> float:
+    """How near another thing's surface comes at least to one of which a part is seen, m: all of that is within its span of each of its points."""
+    assert part.span is not None
+    ends = part.points[np.unique((part.points @ scene_change.DIRECTIONS.T).argmax(axis=0))]
+    farthest = np.max([np.linalg.norm(other.points - end, axis=1) for end in ends], axis=0)
+    return max(0.0, float(farthest.min()) - part.span)

@@ -8,7 +8,7 @@ import trimesh
 
 from magic_core import goal, transforms
 from magic_core.mesh import from_trimesh
-from magic_server.seen_goal import APART, Hand, Sight, Thing, judge, patience
+from magic_server.seen_goal import APART, Hand, SeenGoal, Sight, Thing, judge, patience
 from magic_server.testing import fakes
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -121,6 +121,50 @@ def test_what_touches_in_one_place_is_not_seen_apart():
     cup, rod = from_trimesh(trimesh.creation.annulus(0.04, 0.045, 0.1)), ROD.transformed(transforms.from_rpy(np.pi / 4, 0.0, 0.0))
     now = {"object_1": at(0.5, 0.0, 0.4, cup), "object_2": at(0.5, 0.045 + 0.006 * np.sqrt(2), 0.4, rod)}
     assert asked(tree({"touching": {"what": "tool", "whom": "target"}}), BESIDE, now, accuracy=0.002).met
+
+
+@pytest.mark.parametrize(
+    "gap, whole, span, met",
+    [
+        # What is seen of a thing ends 12 mm before a fixture that it touches; of one whose shape is laid on what is seen all is there.
+        (0.016, False, None, None),
+        (0.016, True, None, False),
+        (0.04, False, None, False),
+        # Some part of it: what is not seen may reach the rod, from a ring of 70 mm if all of that is no longer than 120 mm.
+        (0.04, False, 0.12, None),
+        (0.08, False, 0.12, False),
+    ],
+)
+def test_what_is_seen_apart_may_touch_where_not_all_of_it_is_seen(gap, whole, span, met):
+    """The rod is 12 mm thick and the ring hangs below it, 70 mm high."""
+    low = replace(at(0.5, 0.0, 0.394 - gap - 0.035, UPRIGHT), whole=whole, span=span)
+    now = {"object_1": low, "object_2": replace(STAND["object_2"], given=True, whole=True)}
+    found = asked(tree({"touching": {"what": "tool", "whom": "target"}}), BESIDE, now)
+    assert found.met is met, found.message
+    assert found.unsure == (met is None and span is not None)
+    assert found.message.startswith("what is seen of the tool is" if met is None else "the tool is")
+
+
+def test_of_a_part_that_is_seen_only_what_holds_of_all_of_it_is_told():
+    above = tree({"above": {"what": "tool", "height": 0.2}})
+    part = at(0.5, 0.0, 0.25, UPRIGHT)
+    assert asked(above, STAND, {"object_1": part}).met
+    found = asked(above, STAND, {"object_1": part.part(0.2)})
+    assert found.met is None and found.unsure and "known to 70 mm" in found.message
+    assert asked(above, STAND, {"object_1": at(0.5, 0.0, 0.05, UPRIGHT).part(0.2)}).met is False
+    rest = tree({"at_rest": {"what": "tool", "below": 0.02}})
+    assert asked(rest, STAND, {"object_1": part}, then={"object_1": replace(part, middle=part.middle + 0.03)}).met is False
+    assert asked(rest, STAND, {"object_1": part.part(0.2)}, then={"object_1": replace(part, middle=part.middle + 0.03)}).met is None
+    on = tree({"touching": {"what": "tool", "whom": "table"}})
+    for height, met in ((0.1, None), (0.3, False)):
+        assert asked(on, STAND, {"object_1": at(0.5, 0.0, height, UPRIGHT).part(0.2)}).met is met
+
+
+def test_what_holds_in_some_of_the_places_where_the_tool_may_be_is_not_told():
+    met, missed = SeenGoal(True, "it hangs"), SeenGoal(False, "it is 20 mm away")
+    assert SeenGoal.of_all([met, met]) is met and SeenGoal.of_all([missed, missed]) is missed
+    found = SeenGoal.of_all([met, missed])
+    assert found.met is None and found.unsure and found.message.endswith("goes with 2 poses of it, in some of which it is 20 mm away")
 
 
 def test_what_rolls_on_after_it_had_to_stand_is_not_waited_for():
