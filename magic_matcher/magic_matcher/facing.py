@@ -48,6 +48,8 @@ CLEARLY = 0.7
 #: A place belongs to a straight side no farther from it than this share of the size, whose normal is within this angle (rad) of its own and which
 #: is as long as the last share.
 BESIDE, SKEW, SHORTEST = 0.05, np.deg2rad(45.0), 0.1
+#: A side is no longer than so many times what it is where half as much is allowed to be left.
+CORNERED = 1.25
 #: Places at which stretches begin, and the lengths that are tried.
 _BEGIN, _LENGTHS = 180, 60
 
@@ -100,6 +102,46 @@ def straight_at(contour: Contour, point: NDArray[np.float64], normal: NDArray[np
         return None
     best = int(np.argmax(np.where(fits, stretches.normal @ normal, -1.0)))
     return Side(nearest[best], np.inf, float(stretches.length[best])), stretches.normal[best]
+
+
+@dataclass(frozen=True)
+class Ends:
+    """A place (2,) px on a straight side: how much of the side, px, is behind and ahead of it along the unit way (2,), its normal turned by +90 degrees."""
+
+    place: NDArray[np.float64]
+    along: NDArray[np.float64]
+    behind: float
+    ahead: float
+
+    def like(self, shown: Ends, mirrored: bool, scale: float) -> NDArray[np.float64]:
+        """The nearest place (2,) that has as much of the side to both hands as another place has, whose lengths are taken ``scale`` times;
+        where the side is shorter, the place that divides it in the same proportion.  mirrored: hands are changed."""
+        behind, ahead = (scale * length for length in ((shown.ahead, shown.behind) if mirrored else (shown.behind, shown.ahead)))
+        length = self.behind + self.ahead
+        low, high = (behind, length - ahead) if behind + ahead <= length else (behind * length / (behind + ahead),) * 2
+        return self.place + (float(np.clip(self.behind, low, high)) - self.behind) * self.along
+
+
+def ends(contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float64]) -> Ends | None:
+    """Where on the straight side of the outermost loop that it belongs to a place (2,) with an outward normal (2,) is; ``None`` where it is on none."""
+    outline = _Outline(contour)
+    even = max(RASTER, EVEN * outline.size)
+    found: list[Ends] = []
+    for allowed in (even, 2 * even):
+        stretches = outline.stretches(allowed)
+        along = np.column_stack([-stretches.normal[:, 1], stretches.normal[:, 0]])
+        off = point - stretches.middle
+        run = np.einsum("ni,ni->n", off, along)
+        fits = (np.abs(run) < stretches.length / 2) & (np.abs(np.einsum("ni,ni->n", off, stretches.normal)) < 3 * even)
+        fits &= (stretches.normal @ normal > ALIKE) & (stretches.length > SHORTEST * outline.size)
+        if not fits.any():
+            return None
+        best = int(np.argmax(np.where(fits, stretches.length, 0.0)))
+        half, at = float(stretches.length[best]) / 2, float(run[best])
+        found.append(Ends(stretches.middle[best] + at * along[best], along[best], half + at, half - at))
+    side, coarser = found
+    # A side ends at its corners; of a round outline the more is straight the less is asked.
+    return side if coarser.behind + coarser.ahead < CORNERED * (side.behind + side.ahead) else None
 
 
 @dataclass(frozen=True)

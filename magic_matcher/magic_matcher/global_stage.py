@@ -8,7 +8,7 @@ and then proposes contact points on any number of new tools.  Which there are sa
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,7 +28,8 @@ class Reference:
 
     pixel (2,) on the tool's contour in ``view``; normal (2,) unit, outward; concave: its
     sign; target_radius: radius in pixels of ``view`` of the object touched there (the
-    target's curvature at p_O), ``None`` where it is unknown; contour: of view.mask.
+    target's curvature at p_O), ``None`` where it is unknown; contour: of view.mask; let_go:
+    the tool stays at the target, held by it alone.
     """
 
     view: CanonicalView
@@ -38,6 +39,7 @@ class Reference:
     radius: float
     target_radius: float | None
     contour: Contour
+    let_go: bool = False
 
     def key(self) -> str:
         """A name for everything in here that shapes features, for caches."""
@@ -163,4 +165,5 @@ def from_strategy(strategy: Strategy) -> Reference:
     """The reference of a strategy: its tool's view and contact, and the target's radius at p_O where it is round there."""
     disc = strategy.target_contact.disc_radius
     radius = None if disc is None else disc / strategy.tool_view.metres_per_pixel
-    return make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
+    made = make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
+    return replace(made, let_go=strategy.releases)

@@ -24,6 +24,8 @@ from magic_matcher.contour import Contour, level_lines, resample
 TOLERANCE = 0.04
 #: At rest the way into the open points up at least so much (cosine).
 LIES = 0.3
+#: Directions in which pockets are looked for.
+DIRECTIONS = 72
 #: By so much (rad) a pull may be off to either side and still has to find the disc held, in steps in which a better pull is looked for, and
 #: the farthest that one is from the contact's own normal.
 ASTRAY, TURN_STEP, TURN_MOST = np.deg2rad(15.0), np.deg2rad(5.0), np.deg2rad(45.0)
@@ -205,6 +207,62 @@ def hold(contour: Contour, points: NDArray[np.float64], normals: NDArray[np.floa
         swing[part] = np.sort(depth, axis=1) / radius
         start[part] = np.where(lies, swing[part, 0] - (distance[rest] - distance[at]) / radius, -1.0)
     return Held(gap, drift, press, swing, start)
+
+
+@dataclass(frozen=True)
+class Pocket:
+    """Where a tool holds a disc: the disc's centre (2,), the unit way (2,) out, and the depth, radii, to the shallower side."""
+
+    centre: NDArray[np.float64]
+    out: NDArray[np.float64]
+    depth: float
+
+
+def pockets(contour: Contour, radius: float, curves: Curves, enough: float, hangs: bool = False) -> list[Pocket]:
+    """Where a disc of ``radius`` px is held ``enough`` radii deep, the deepest first, no two within a radius of each other.
+
+    Pressed into the tool along some direction, and :data:`ASTRAY` to either side of it, as :func:`steadied` asks; with ``hangs`` by a tool that
+    hangs from it, its centroid as far below as it gets.  curves: those of the disc's :func:`centres`.
+    """
+    found: list[Pocket] = []
+    tolerance = max(TOLERANCE * radius, 0.6)
+    for curve, free in curves:
+        found += _hung(contour, radius, curve, free, tolerance) if hangs else _pressed(radius, curve, free, tolerance, enough)
+    apart: list[Pocket] = []
+    for pocket in sorted(found, key=lambda p: -p.depth):
+        if pocket.depth >= enough and all(np.hypot(*(pocket.centre - other.centre)) > radius for other in apart):
+            apart.append(pocket)
+    return apart
+
+
+def _hung(contour: Contour, radius: float, curve: NDArray[np.float64], free: NDArray[np.float64], tolerance: float) -> list[Pocket]:
+    inward = contour.centroid - curve
+    distance = np.maximum(np.hypot(inward[:, 0], inward[:, 1]), 1e-9)
+    up = inward / distance[:, None]
+    rest, depth, lies = _settle(curve, free, up, np.arange(len(curve)), -distance[None].astype(np.float32), tolerance, True)
+    places, first = np.unique(rest[lies], return_index=True)
+    held = depth[lies].min(axis=1)[first] / radius
+    return [Pocket(curve[place], up[place], float(deep)) for place, deep in zip(places, held, strict=True)]
+
+
+def _pressed(radius: float, curve: NDArray[np.float64], free: NDArray[np.float64], tolerance: float, enough: float) -> list[Pocket]:
+    turns = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    directions = np.column_stack([np.cos(turns), np.sin(turns)])
+    heights = (directions @ (curve - curve.mean(axis=0)).T).astype(np.float32)
+    lowest = (heights <= np.roll(heights, 1, axis=1)) & (heights <= np.roll(heights, -1, axis=1)) & (directions @ free.T > LIES)
+    which, at = np.nonzero(lowest)
+    if not len(which):
+        return []
+    rest, depth, _ = _settle(curve, free, directions[which], at, heights[which], tolerance, False)
+    deep = depth.min(axis=1) / radius
+    side = round(ASTRAY * DIRECTIONS / (2 * np.pi))
+    found = []
+    for k in np.flatnonzero(deep >= enough):
+        here = np.hypot(*(curve[rest] - curve[rest[k]]).T) <= radius
+        astray = [deep[here & (which == (which[k] + turn) % DIRECTIONS)].max(initial=0.0) for turn in (-side, side)]
+        if min(astray) >= enough:
+            found.append(Pocket(curve[rest[k]], directions[which[k]], float(min(deep[k], *astray))))
+    return found
 
 
 def steadied(

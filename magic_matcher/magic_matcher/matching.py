@@ -449,7 +449,8 @@ class Matcher:
         scale = radius if use_target else reference.contour.size * reference.view.metres_per_pixel
         ratio = reference.radius * reference.view.metres_per_pixel / scale
         asked = demands(reference, self.backend.floor)
-        return _Task(reference, contact, prepared, asked, ratio, target, disc, use_target, top_k, heatmap)
+        side = None if np.isfinite(contact.radius) else facing.ends(reference.contour, reference.pixel, reference.normal)
+        return _Task(reference, contact, prepared, asked, ratio, target, disc, use_target, top_k, heatmap, side=side)
 
     def feature_of(self, strategy: Strategy, view: CanonicalView, direction: NDArray[np.float64]) -> Contact:
         """p_O' by analogy: the place on a target that looks most as the demonstrated one does at p_O, of those that face a picture direction (2,).
@@ -540,6 +541,11 @@ class Matcher:
                 found = look(tool.view, lesser(task.asked))
                 less += [] if found is None else [found]
             seen += sorted(less, key=lambda s: -s.candidates[0].score)
+        # Where what is seen of a tool is all of it, it is held by what no place looks like, too: between its parts.
+        whole = tool.mesh is not None and not task.further and (judged or 1.0 - tool.seen_share < enclosing.UNSEEN)
+        if whole and sum(len(s.candidates) for s in seen) < task.top_k:
+            between = [held for view in (*others, tool.view) if (held := self._between(task, tool, view)).candidates]
+            seen += sorted(between, key=lambda s: -s.candidates[0].score)
         if not seen:
             error = max(failures, key=lambda failure: failure[0])[1]
             raise _not_seen(task, tool, looked, error) or error
@@ -568,6 +574,40 @@ class Matcher:
         order = global_stage.suppress(points, np.array([c.score for c in candidates]), SAME_PLACE * contour.size, task.top_k)
         worst = max(refused, key=lambda r: r.similarity, default=None)
         return _Seen(view, [candidates[i] for i in order], worst, proposals.heatmap)
+
+    def _between(self, task: _Task, tool: Tool, view: CanonicalView) -> _Seen:
+        """The pockets of a view in which the target is held deep enough (:func:`magic_matcher.holding.pockets`).
+
+        The contact is on the disc, towards the tool: between the arms of a V there is nothing of the tool at that point.  Likeness is not asked, so
+        that they come after all places that have it.
+        """
+        hollow = lesser(task.asked).hollow
+        if task.disc is None or hollow is None:
+            return _Seen(view, [], None, None)
+        contour, radius = contours.extract(view.mask), task.disc / view.metres_per_pixel
+        curves = holding.centres(holding.room(contour, radius), radius)
+        scale = task.disc if task.use_target else contour.size * view.metres_per_pixel
+        s_curv = score.curvature_score(task.ratio, task.disc / scale)
+        candidates = []
+        for pocket in holding.pockets(contour, radius, curves, hollow, task.asked.hangs)[: task.top_k]:
+            if tool.hides(view, pocket.out):
+                continue
+            pixel = pocket.centre - radius * pocket.out
+            contact = Contact(pixel, pocket.out, task.disc, True, curvature.ALPHA * task.disc, contact_frame(view, pixel, pocket.out))
+            candidates.append(
+                ContactCandidate(
+                    tool_id=tool.id,
+                    tool=contact,
+                    target=task.target.contact if task.target is not None else None,
+                    rotation=global_stage.rotation_between(task.reference.normal, contact.normal, False),
+                    flipped=False,
+                    s_dino=0.0,
+                    s_curv=s_curv,
+                    score=score.combine(0.0, s_curv, self.weight),
+                    tool_from_reference=contact.object_from_contact @ transforms.inverse(task.reference_contact.object_from_contact),
+                )
+            )
+        return _Seen(view, candidates, None, None)
 
     def _joined(
         self, task: _Task, tool: Tool, view: CanonicalView, contour: Contour, candidates: list[ContactCandidate]
@@ -650,7 +690,7 @@ class Matcher:
         for (proposal, local), refusal in zip(pairs, refused, strict=True):
             if refusal is not None:
                 continue
-            contact = to_contact(view, local)
+            contact = to_contact(view, _in_proportion(task, view, contour, proposal, local))
             s_curv = score.curvature_score(task.ratio, contact.radius / scale, contact.concave == reference.concave)
             frame = turned_over(contact.object_from_contact) if proposal.flipped else contact.object_from_contact
             candidates.append(
@@ -672,7 +712,7 @@ class Matcher:
 @dataclass(frozen=True)
 class _Task:
     """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); disc: radius (m) of the disc that stands for the target, if one does;
-    further: the same for further contacts, by name."""
+    further: the same for further contacts, by name; side: where the reference is on its straight side, if it is on one."""
 
     reference: Reference
     reference_contact: Contact
@@ -685,6 +725,7 @@ class _Task:
     top_k: int
     heatmap: bool
     further: tuple[tuple[str, _Task], ...] = ()
+    side: facing.Ends | None = None
 
 
 @dataclass(frozen=True)
@@ -695,6 +736,18 @@ class _Seen:
     candidates: list[ContactCandidate]
     refusal: Refusal | None
     heatmap: NDArray[np.float32] | None
+
+
+def _in_proportion(task: _Task, view: CanonicalView, contour: Contour, proposal: Proposal, found: curvature.Estimate) -> curvature.Estimate:
+    """An estimate for a straight reference, moved along the straight side that it is on to where the reference is on its own: no place of a
+    straight side looks different from the next, so that the features find any of them."""
+    if task.side is None or task.further:
+        return found
+    side = facing.ends(contour, found.point, found.normal)
+    if side is None:
+        return found
+    scale = task.reference.view.metres_per_pixel / view.metres_per_pixel
+    return replace(found, point=side.like(task.side, proposal.flipped, scale))
 
 
 def _steadied(
@@ -764,8 +817,9 @@ def _on_surface(surface: Surface, view: CanonicalView, reference: Contact, candi
     def put(contact: Contact) -> Contact:
         frame = contact.object_from_contact.copy()
         depth = 0.0 if view.kind == "section" else surface.depth_of_edge(view, contact.pixel, contact.normal)
-        if depth is not None:
-            frame[:3, 3] += depth * view.direction
+        if depth is None:  # a pocket: the contact is between parts of the tool
+            depth = surface.depth_beside(view, contact.pixel)
+        frame[:3, 3] += depth * view.direction
         return replace(contact, object_from_contact=frame, surface=surface.principal_frame(frame))
 
     candidate = _with_companions(candidate, put)

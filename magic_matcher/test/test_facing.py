@@ -141,3 +141,27 @@ def test_beside_an_inner_corner_the_straight_side_is_found(turn, place, askew):
     assert normal @ shown(wanted) > np.cos(np.deg2rad(1.0))
     assert abs((side.point - point) @ normal) < 1.5 and side.radius == np.inf
     assert facing.straight_at(found, point, -shown(wanted)) is None
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("length", [80.0, 30.0])
+def test_a_place_on_a_straight_side_goes_to_where_another_is_on_its_own(length, mirrored):
+    """Met 5 mm from one end; shown with 35 and 10 mm to its hands: where the side is long enough with as much, else in that proportion."""
+    shape, normal = box(length, 20.0, 0.0)
+    along, middle = np.array([-normal[1], normal[0]]), np.full(2, (SIDE - 1) / 2)
+    place = middle + FINE * (10.0 * normal + (5.0 - length / 2) * along)
+    found = facing.ends(shape, place, normal)
+    assert [found.behind / FINE, found.ahead / FINE] == pytest.approx([5.0, length - 5.0], abs=3.0)
+
+    def shown(behind, ahead):
+        return facing.Ends(np.zeros(2), np.array([1.0, 0.0]), *((ahead, behind) if mirrored else (behind, ahead)))
+
+    moved = (found.like(shown(35.0, 10.0), mirrored, FINE) - middle) / FINE
+    assert moved @ along + length / 2 == pytest.approx(35.0 if length > 45 else length * 35 / 45, abs=2.0)
+    assert moved @ normal == pytest.approx(10.0, abs=1.0)
+    assert found.like(shown(4.0, 10.0), mirrored, FINE) == pytest.approx(place, abs=3.0)
+
+
+def test_a_round_side_has_no_ends():
+    shape = disc(30.0)
+    assert facing.ends(shape, shape.points[0], shape.normals[0]) is None

@@ -35,6 +35,38 @@ def test_an_inner_corner_holds_as_deep_as_its_arms_rise(corner, radius):
     assert held.press[0, 0] * radius > (170 - radius) / np.sqrt(2) - 5
 
 
+def wedge(half):
+    """Two arms of 200 px from (250, 250), that open downwards by twice ``half`` degrees."""
+    mask = np.zeros((500, 500), np.uint8)
+    for side in (-1, 1):
+        end = (round(250 + side * 200 * np.sin(np.deg2rad(half))), round(250 + 200 * np.cos(np.deg2rad(half))))
+        cv2.line(mask, (250, 250), end, 1, 16)
+    return contour.extract(mask > 0)
+
+
+@pytest.mark.parametrize(("radius", "hangs"), [(20.0, False), (40.0, False), (20.0, True)])
+def test_a_disc_lies_between_the_arms_of_a_v_far_from_its_corner(radius, hangs):
+    shape = wedge(25.0)
+    found = holding.pockets(shape, radius, holding.centres(holding.room(shape, radius), radius), 0.2, hangs)
+    # The arms' inner edges meet half their width over the sine further down.
+    centre = 250 + (radius + 8) / np.sin(np.deg2rad(25.0))
+    best = found[0]
+    assert best.centre == pytest.approx([249.5, centre], abs=4)
+    assert best.out @ [0, 1] > 0.99
+    assert all(np.hypot(*(a.centre - b.centre)) > radius for i, a in enumerate(found) for b in found[:i])
+
+
+def test_a_bar_and_a_disc_have_no_pockets():
+    bar, round_one = np.zeros((300, 300), bool), np.zeros((300, 300), np.uint8)
+    bar[140:160, 40:260] = True
+    cv2.circle(round_one, (150, 150), 90, 1, -1)
+    for mask in (bar, round_one > 0):
+        shape = contour.extract(mask)
+        curves = holding.centres(holding.room(shape, 25.0), 25.0)
+        assert not holding.pockets(shape, 25.0, curves, 0.1)
+        assert not holding.pockets(shape, 25.0, curves, 0.1, True)
+
+
 def stepped(shoulder):
     """A bar with a wide head: at (300, 200) the inner corner whose one arm is the bar, the other a shoulder of so many pixels."""
     mask = np.zeros((500, 500), bool)

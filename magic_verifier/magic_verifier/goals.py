@@ -355,7 +355,13 @@ class Watch:
 
     def judge(self, go_on: GoOn) -> Judgement:
         """After the last step; ``go_on`` steps the run further."""
-        self._go_on = go_on
+
+        def noting(seconds: float) -> None:
+            go_on(seconds - OBSERVE_EVERY)
+            self.asked.state.note()
+            go_on(OBSERVE_EVERY)
+
+        self._go_on = noting
         found = self.ask(self.tree)
         metrics = {name: value for name, value in self.metrics.items() if np.isfinite(value)}
         if found.truth:

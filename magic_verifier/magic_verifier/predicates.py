@@ -80,6 +80,7 @@ class Simulated:
         self._row = (TARGET, *beside)
         self._start = {name: run.world.pose(name) for name in (TOOL, *self._row)}
         self._start[TARGET] = run.setup.target.world_from_object  # the engine's own is rounded
+        self._before: tuple[float, dict[str, tuple[Array, Array]]] | None = None
 
     def row(self) -> tuple[str, ...]:
         return self._row
@@ -102,9 +103,22 @@ class Simulated:
     def table_height(self, point: Array) -> float:
         return self.run.setup.table_height(point)
 
-    def speeds(self, name: str) -> tuple[float, float]:
+    def note(self) -> None:
+        """Keep where things are, for :meth:`speeds` a moment later."""
         world = self.run.world
-        return float(np.linalg.norm(world.velocity(name))), float(np.linalg.norm(world.turning(name)))
+        moved = [name for name in (TOOL, *self._row) if self._moved_by_physics(name)]
+        self._before = self.run.time, {name: (world.centre_of_mass(name), world.pose(name)) for name in moved}
+
+    def speeds(self, name: str) -> tuple[float, float]:
+        """No faster than things moved since :meth:`note`: of what is held between contacts that press against each other the engine tells a velocity
+        (0.5 rad/s of a V on a rod) with which it does not move."""
+        world = self.run.world
+        speed, turning = float(np.linalg.norm(world.velocity(name))), float(np.linalg.norm(world.turning(name)))
+        if self._before is not None and name in self._before[1] and (seconds := self.run.time - self._before[0]) > 0:
+            centre, pose = self._before[1][name]
+            speed = min(speed, float(np.linalg.norm(world.centre_of_mass(name) - centre)) / seconds)
+            turning = min(turning, transforms.rotation_angle(pose, world.pose(name)) / seconds)
+        return speed, turning
 
     def touched_by(self, name: str) -> tuple[str, ...]:
         return self.run.world.touched_by(name, TOUCH)

@@ -71,6 +71,23 @@ def test_an_evaluation_is_written_and_goes_on_where_it_stopped(tmp_path):
     assert error.value.code == Code.BAD_REQUEST
 
 
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        # Between the arms of a V there is no place that looks like the corner of a hook.
+        (Options("hooking", "fg_no_selection", set="alphabet"), "capital:V cylinder:0.035"),
+        # On the rod the engine tells a velocity of a V that does not move: it never came to rest.
+        (Options("hanging", set="alphabet"), "capital:V"),
+        # Met 58 mm from one end of a bar, a row of cylinders passed that end.
+        (Options("sweeping"), "plain_bar:70007"),
+    ],
+)
+def test_what_geometry_allows_is_done(options, name):
+    (case,) = [case for case in all_cases(options) if case.name == name]
+    found = ev.run_case(options, case)
+    assert found["success"], found["candidates"]
+
+
 def test_a_folder_without_meshes_is_refused(tmp_path):
     with pytest.raises(MagicError) as error:
         all_cases(replace(OPTIONS, objects=str(tmp_path)))

@@ -79,6 +79,15 @@ class Surface:
             return float(pieces[np.argmin(np.abs(pieces))])
         return None
 
+    def depth_beside(self, view: CanonicalView, pixel: ArrayLike) -> float:
+        """How far behind the view's plane, m, the surface lies that is nearest to the plane's point at a pixel (2,), where nothing is in sight itself."""
+        point = view.points(np.asarray(pixel))
+        nearest = self._caster.nearest(point)
+        there = view.pixels(nearest)
+        way = np.asarray(pixel) - there
+        depth = self.depth_of_edge(view, there, way / max(float(np.linalg.norm(way)), 1e-9))
+        return float((nearest - point) @ view.direction) if depth is None else depth
+
     def principal_frame(self, object_from_contact: NDArray[np.float64]) -> PrincipalFrame | None:
         """The surface at a contact's frame (4, 4), whose origin is on the surface or near it; ``None`` where no patch is explained.
 

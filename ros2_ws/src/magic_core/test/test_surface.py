@@ -87,3 +87,14 @@ def test_the_side_of_a_plate_is_flat_and_its_edge_lies_in_its_middle():
 def test_what_no_line_of_sight_meets_has_no_depth():
     view = canonical_view(SPHERE, (0, 0, -1), (0, 1, 0), "top")
     assert Surface(SPHERE).depth_of_edge(view, (2.0, 2.0), (1.0, 0.0)) is None
+
+
+def test_what_has_nothing_in_sight_is_as_deep_as_what_is_next_to_it():
+    """Between two bars at other depths: as deep as the nearer one's middle."""
+    near = trimesh.creation.box(extents=[0.02, 0.1, 0.01], transform=trimesh.transformations.translation_matrix([0.04, 0, 0.013]))
+    far = trimesh.creation.box(extents=[0.02, 0.1, 0.01], transform=trimesh.transformations.translation_matrix([-0.06, 0, -0.02]))
+    both = from_trimesh(trimesh.util.concatenate([near, far]))
+    view = canonical_view(both, (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), "top")
+    pixel = view.pixels(np.array([0.02, 0.0, 0.0]))
+    height = (view.points(pixel) + Surface(both).depth_beside(view, pixel) * view.direction)[2]
+    assert height == pytest.approx(0.013, abs=0.001)
