@@ -584,8 +584,8 @@ class DepthSegmenter:
         # What is too small for a thing and hangs together with one in the mask belongs to it: depth is not to be trusted there.
         labels = [_fill(image, mask) for image, mask in zip(_sizeable(labels, looks, parameters), found.masks, strict=True)]
         labels = _with_depth(labels, looks, parameters)
-        for image, known_pixels in zip(labels, found.fixed, strict=True):
-            image[known_pixels] = -1
+        for image, mask, fixed, looked in zip(labels, found.masks, found.fixed, looks, strict=True):
+            image[fixed | _beside(fixed, mask & (image == 0) & ~np.isfinite(looked.frame.depth))] = -1
         labels = _behind_one(_attached(labels, looks, parameters), looks, parameters)
         return [_on_surfaces(image, looked) for image, looked in zip(labels, looks, strict=True)]
 
@@ -644,6 +644,16 @@ def _fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.
     result = labels.copy()
     result[cut][missing] = np.where((distance[missing] <= reach) & labelled[regions[missing]], table[index[missing]], 0)
     return result
+
+
+def _beside(fixed: NDArray[np.bool_], blank: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What of ``blank`` (H, W), which colour alone tells from the table, hangs together with a fixture: beside it stereo has a shadow, and what is seen there
+    is of something behind, nobody knows of what.  It is no more the end of that than the fixture is."""
+    if not (fixed.any() and blank.any()):
+        return np.zeros_like(blank)
+    regions = cv2.connectedComponents(blank.view(np.uint8), connectivity=8)[1]
+    touched = np.unique(regions[cv2.dilate(fixed.view(np.uint8), np.ones((3, 3), np.uint8)) > 0])
+    return blank & np.isin(regions, touched)
 
 
 def _attached(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:

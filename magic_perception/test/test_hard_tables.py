@@ -13,11 +13,13 @@ import pytest
 import scenes
 import trimesh
 
-from magic_core import sensor, transforms
+from magic_core import sensor, shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
+from magic_perception.averaging import average
 from magic_perception.parameters import Parameters
+from magic_perception.pipeline import perceive
 from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces, _one_face, _with_depth
 
 RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
@@ -187,3 +189,23 @@ def test_a_face_that_the_picture_ends_is_one_with_what_lies_in_its_plane(behind,
     frame = RgbdFrame(np.zeros((*labels.shape, 3), np.uint8), depth, Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0), np.eye(4), "camera")
     look = Looked(frame, depth, depth, np.ones(labels.shape, bool), np.full_like(depth, 0.001), np.array([0.0, -1.0, 0.0]))
     assert _one_face(look, labels, 1, 2) == one
+
+
+def test_beside_a_post_a_cup_does_not_end():
+    """One camera has a post before the cup, and beside the post stereo has no depth: half the cup is colour alone there, which is neither cup nor table."""
+    post = shapes.make("rod", 0, radius=0.006, height=0.38, length=0.19, foot=0.05)
+    post = replace(post.as_object("post", transforms.make(translation=[0.56, 0.0, -post.mesh.bounds[0, 2]])), source="known")
+    cup = scenes.placed(shapes.make("mug", 89).mesh, 0.446, 0.272, 1.025)
+    caster = sensor.scene_raycaster([cup, post.mesh.transformed(post.world_from_object)])
+    frames = [
+        average([sensor.capture([], sensor.D435, pose, [k, n], camera=name, raycaster=caster) for n in range(3)])
+        for k, (name, pose) in enumerate(sensor.STATION.items())
+    ]
+    looks = [evaluate.looked_at(frame, PARAMETERS) for frame in frames]
+    labels = DepthSegmenter().segment(looks, (post.mesh.transformed(post.world_from_object),), PARAMETERS)[1]
+    mine = caster.perspective(sensor.D435, sensor.STATION["right"])[0].ids == 1
+    blank = mine & ~np.isfinite(frames[1].depth)
+    assert np.mean(blank[mine]) > 0.2 and np.mean(labels[blank] != 0) > 0.9
+    found = next(item for item in perceive(frames, (post,), PARAMETERS).objects if item.source == "camera")
+    assert found.surface_error < 0.004
+    assert found.mesh.transformed(found.world_from_object).bounds == pytest.approx(cup.bounds, abs=0.004)
