@@ -69,8 +69,8 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
 @dataclass(frozen=True)
 class Laid:
     """A lying thing: its height map, the outlines of its parts, and whether it is flat, then ``thickness`` metres thick; else top and bottom
-    (rows, columns) of its relief over the cells of the map, m, the bottom that of a thin thing; ``hollow``: it is seen to be hollow from above, and
-    does not go down to the table everywhere."""
+    (rows, columns) of its relief over the cells of the map, m; ``hollow``: it is seen to be hollow from above, and its bottom is that of a thin thing, else
+    the table or the height below which cameras see past."""
 
     grid: Grid
     parts: list[Polygon]
@@ -83,7 +83,11 @@ class Laid:
 
 def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
     """What a lying thing is like, seen from above.  Raises ``RECONSTRUCTION_FAILED`` where nothing is left of its outline."""
-    grid = height_map(surfaces(sights, 2)[0], parameters.resolution)
+    points = surfaces(sights, 2)[0]
+    points = points[~_passed(points, sights, noise)]
+    if len(points) < 20:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "points of one object that no camera sees past", len(points), "at least 20")
+    grid = height_map(points, parameters.resolution)
     occupied = np.isfinite(grid.top)
     inner = cv2.erode(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
     # Heights along the middle lines: the round edge of a wire does not make it a relief.
@@ -103,51 +107,98 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
         near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
         field = cv2.GaussianBlur(field * near, (0, 0), 0.8)
     else:
-        columns = [np.concatenate([centres, np.nan_to_num(grid.top)[..., None]], axis=-1)]
-        # The top of each cell must be seen; two pixels of grace for errors of height and calibration.
-        seen = np.ones(occupied.shape, bool)
-        for sight in sights:
-            wide = Sight(
-                sight.intrinsics,
-                sight.table_from_camera,
-                cv2.dilate(sight.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0,
-                sight.hidden,
-                sight.depth,
-                sight.heights,
-                sight.sigma,
-            )
-            seen &= wide.sample(columns[0])[0] > 0.3
-        field = polygons.smooth_field(occupied & seen, 1.8)
-    parts = [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > 4e-5]
+        # Smooth over 3 mm, over the thing's own cells only.
+        weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
+        smooth = cv2.GaussianBlur(np.where(occupied, grid.top, 0).astype(np.float32), (0, 0), 2.0) / np.maximum(weight, 1e-6)
+        top = nearest(smooth.astype(np.float32), occupied)
+        depression = _filled(np.where(occupied, top, 0)) - top
+        hollow = bool(np.count_nonzero((depression > max(0.004, 3 * noise)) & inner) * grid.cell**2 > 1.5e-4)
+        field, foot = polygons.smooth_field(occupied, 1.8), np.zeros_like(top)
+        if not hollow:  # what is hollow does not go down to the table
+            kept, foot = _upheld(sights, grid, top, noise)
+            trimmed = polygons.smooth_field(kept, 1.8)
+            if len(_parts(trimmed, grid)) <= len(_parts(field, grid)):  # what a thing hangs together by is no smear
+                field = trimmed
+    parts = _parts(field, grid)
     if not parts:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
     parts = [p for p in parts if p.area > 0.08 * parts[0].area]
     if flat:
         return Laid(grid, parts, True, thickness, False, grid.top, grid.top)
-    # Smooth over 3 mm, over the thing's own cells only.
-    weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
-    smooth = cv2.GaussianBlur(np.where(occupied, grid.top, 0).astype(np.float32), (0, 0), 2.0) / np.maximum(weight, 1e-6)
-    top = nearest(smooth.astype(np.float32), occupied)
-    depression = _filled(np.where(occupied, top, 0)) - top
-    hollow = (depression > max(0.004, 3 * noise)) & inner
     spread = int(np.ceil(parameters.wall / grid.cell / 2))
     # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
     reach = 2 * int(0.012 / grid.cell) + 1
     width = 2 * grid.cell * cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
     bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
-    return Laid(grid, parts, False, thickness, bool(hollow.sum() * grid.cell**2 > 1.5e-4), top, np.clip(bottom, 0, top - 0.001))
+    return Laid(grid, parts, False, thickness, hollow, top, np.clip(bottom if hollow else foot, 0, top - 0.001))
+
+
+#: What is smaller, m^2, is no part of a thing.
+LEAST = 4e-5
+#: A column is looked at in so many places for each metre of it.
+PLACES = 400
+#: What a ray comes down from by more than this, m, and three times the noise, it passes through.
+PAST = 0.005
+#: The share of a column that cameras see empty from which nothing stands there.
+EMPTY = 0.4
+#: Smear of depth carries a thing so far; in its corners, into which a disc of that radius does not reach, farther, m.
+FRINGE, SMEAR, CORNER = 0.004, 0.012, 0.06
+
+
+def _passed(points: NDArray[np.float64], sights: list[Sight], noise: float) -> NDArray[np.bool_]:
+    """Which of points (..., 3) some camera sees past: beside the thing, or what lies behind."""
+    result = np.zeros(points.shape[:-1], bool)
+    for sight in sights:
+        result |= sight.look_up(points, sight.reached) < points[..., 2] - max(PAST, 3 * noise)
+    return result
+
+
+def _upheld(sights: list[Sight], grid: Grid, top: NDArray[np.float32], noise: float) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Columns from the table up to ``top`` (rows, columns), m, held against what the cameras saw beside and through them: which of them are filled, and
+    from what height on, m.
+
+    Smear of depth, and the heights given to pixels without, fill the corners of a thing in the air; there some camera sees the table below, or another
+    what is behind.
+    """
+    occupied, centres = np.isfinite(grid.top), grid.centres()
+    shares = np.linspace(0, 1, 2 + int(PLACES * float(top[occupied].max())))
+    empty = np.stack([_passed(np.concatenate([centres, (share * top)[..., None]], axis=-1), sights, noise) for share in shares])
+    loose = occupied & (empty.mean(axis=0) > EMPTY)
+    # What lies farther from the rest, and in no corner of it, stands off the table by itself, such as a thin handle.
+    rest = occupied & ~loose
+    away = _away(rest) * grid.cell
+    corner = _closed(rest, CORNER / grid.cell) & (away < SMEAR)
+    loose &= _away(loose & ~corner & (away > FRINGE)) * grid.cell > FRINGE
+    kept = occupied & ~loose
+    return kept, nearest(top * shares[np.argmin(empty, axis=0)].astype(np.float32), kept)
+
+
+def _away(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How far each cell is from those of a mask, cells."""
+    return cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5) if mask.any() else np.full(mask.shape, np.inf, np.float32)
+
+
+def _closed(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """A mask with what a disc of so many cells cannot reach from outside: morphological closing."""
+    margin = int(radius) + 2
+    near = _away(np.pad(mask, margin)) <= radius
+    return (_away(~near) > radius)[margin:-margin, margin:-margin]
+
+
+def _parts(field: NDArray[np.float32], grid: Grid) -> list[Polygon]:
+    """The outlines of what a field over the map holds, the largest first."""
+    return [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > LEAST]
 
 
 def build_lying(laid: Laid) -> Reconstruction:
-    """A thing that lies: carved where it is flat, else a height field down to the table, or a shell where it is seen to be hollow."""
+    """A thing that lies: carved where it is flat, else a height field, or a shell where it is seen to be hollow."""
     if laid.flat:
         return extruded(laid.parts, laid.thickness, "flat")
-    bottom = laid.bottom if laid.hollow else np.zeros_like(laid.top)
     meshes, pieces = [], []
     for part in laid.parts:
-        meshes.append(relief(part, laid.grid, laid.top, bottom))
-        pieces += relief_pieces(part, laid.grid, laid.top, bottom)
+        meshes.append(relief(part, laid.grid, laid.top, laid.bottom))
+        pieces += relief_pieces(part, laid.grid, laid.top, laid.bottom)
     return Reconstruction(concatenate(meshes), tuple(pieces), "shell" if laid.hollow else "height field")
 
 

@@ -8,7 +8,7 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
   measured thickness, falls into the thing's mask in every camera.  For a prism this is its visual hull; it takes its
   sharpness from the colour image, not from depth, and a hole through which the table is seen stays open;
 * a bowl with a handle that lies on its back (a spoon, a ladle) becomes a wall about a hollow, whose rim and profile are fitted;
-* other things that lie become a height field on the table, or, where they are seen to be hollow from above, a shell;
+* other things that lie become a height field, filled down to where no camera sees past any more, or, where they are seen to be hollow from above, a shell;
 * things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where cameras
   look into it, with the handle carved in its own upright plane in the same way as a flat thing;
 * bowls and dishes become a body of revolution as well, from their rim, their inside and what shows of their outside;
@@ -89,7 +89,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         laid = lay(sights, noise, parameters)
     except MagicError:
         return _freest([], sights, noise)
-    scoop = build_scoop(laid, sights, noise, parameters)
+    scoop = build_scoop(laid, sights, noise, parameters) if laid.hollow else None
     for score, solid in _agreeing(scoop, sights, 0.0):
         if score > _WELL:
             return solid

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh
+from magic_perception.smear import LOW, REACH
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,26 @@ class Sight:
         u, v, _, count = self._pixels(points)
         found = cv2.remap(picture, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
         return found.ravel()[:count].reshape(points.shape[:-1])
+
+    @cached_property
+    def reached(self) -> NDArray[np.float32]:
+        """A picture (H, W) of the height down to which each pixel's ray surely goes on, m: to the table beside the mask, in it to the greatest height
+        measured around; nowhere, infinite, where something else may hide the thing or depth is missing.
+
+        What is raised beside the mask farther than smear reaches is taken for a part of the thing that colour has lost.
+        """
+        result = np.where(self.hidden, np.float32(np.inf), np.float32(-np.inf))
+        x, y, w, h = cv2.boundingRect(self.mask.view(np.uint8))
+        reach = round(REACH * self.intrinsics.fx / 615)
+        pad = 6 * reach
+        cut = (slice(max(y - pad, 0), y + h + pad), slice(max(x - pad, 0), x + w + pad))
+        mask, heights = self.mask[cut], self.heights[cut]
+        raised = ~mask & (np.nan_to_num(heights) > LOW)
+        far = raised & (cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3) > reach)
+        thing = mask | (raised & (cv2.dilate(far.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0))
+        known = np.where(thing & np.isfinite(heights), heights, np.float32(np.inf))
+        result[cut][thing] = cv2.dilate(known, np.ones((3, 3), np.uint8))[thing]
+        return result
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Column and row (..., 2) at which points (..., 3) are seen, also outside of the picture; -1e4 behind the camera."""
