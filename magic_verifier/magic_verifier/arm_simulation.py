@@ -54,10 +54,12 @@ ASLEEP = 0.15
 
 @dataclass(frozen=True)
 class Held:
-    """A tool in the hand: the moment of the trajectory in s, tool_from_tcp (4, 4), metres between the fingers, where the pads touch it."""
+    """A tool in the hand: the moment of the trajectory in s, tool_from_tcp (4, 4) now and as the pads took it, metres between the
+    fingers, where the pads touch it."""
 
     time: float
     tool_from_tcp: NDArray[np.float64]
+    taken: NDArray[np.float64]
     width: float
     patch: Patch
 
@@ -184,7 +186,8 @@ class ArmRun:
         """The tool in the hand at this moment, to begin another run from; ``None`` where it is not."""
         if self._patch is None or self._open_again:
             return None
-        return Held(self.time, self._tool_from_tcp(), self._arm.width(), self._patch)
+        taken = transforms.inverse(self._from_reference.to_transformation_matrix())
+        return Held(self.time, self._tool_from_tcp(), taken, self._arm.width(), self._patch)
 
     def joints(self) -> NDArray[np.float64]:
         """(J + 2,): the arm's joints in rad (m), then the fingers in m."""

@@ -28,10 +28,10 @@ FILE = Path(__file__).with_name("uncertainty.yaml")
 KINDS = ("normal", "factor", "uniform")
 #: Normals are cut at so many widths.
 CUT = 2.0
-#: Waves that make up a smooth error of a surface, and their lengths in parts of the object's largest extent: longer ones are in
-#: place and size already, shorter ones are lumps, which the smoothing of a reconstruction takes out.
+#: Waves that make up a smooth error of a surface, and the shortest, m, but no longer than this part of the object's largest extent, which is the longest: whatever
+#: the size of a thing, the errors of a reconstruction agree over some 20 to 50 mm and no farther (24 tools of 80 to 420 mm); longer ones are in place and size.
 WAVES = 3
-WAVE_LENGTHS = (0.4, 1.0)
+SHORTEST, SHORTEST_PART = 0.05, 0.4
 #: A wall keeps at least this share of its thickness.
 THINNEST = 0.4
 
@@ -144,12 +144,13 @@ def _read(path: Path, _changed: int) -> Uncertainty:
 @dataclass(frozen=True)
 class ShapeError:
     """What is wrong with an object's shape: size (3,) m of its extents, thickness m of its walls, and waves that shift its surface:
-    amplitudes (K, 3) m, wave vectors (K, 3) in parts of its largest extent, phases (K,)."""
+    amplitudes (K, 3) m, directions (K, 3), how long they are (K,) between the shortest, 0, and the longest that there are, 1, phases (K,)."""
 
     size: Array
     thickness: float
     amplitudes: Array
-    vectors: Array
+    directions: Array
+    lengths: Array
     phases: Array
 
     def applied(self, body: Body) -> Body:
@@ -159,6 +160,8 @@ class ShapeError:
         middle, extent = (low + high) / 2, high - low
         scale = np.clip(1 + self.size / np.maximum(extent, 1e-6), 0.5, 1.5)
         largest = max(float(extent.max()), 1e-6)
+        shortest = min(SHORTEST, SHORTEST_PART * largest)
+        waves = 2 * np.pi * self.directions / (shortest * (largest / shortest) ** self.lengths)[:, None]
         hulls: list[Array] = list(body.hulls)
         balls: list[tuple[Array, float] | None] = list(body.balls)
         for index, ball in enumerate(body.balls):
@@ -170,7 +173,7 @@ class ShapeError:
         for count in {len(hull) for hull, ball in zip(hulls, balls, strict=True) if ball is None}:
             some = [i for i, (hull, ball) in enumerate(zip(hulls, balls, strict=True)) if ball is None and len(hull) == count]
             points = middle + scale * (_thicker(np.stack([hulls[i] for i in some]), self.thickness) - middle)
-            angles = 2 * np.pi * (points - middle) @ self.vectors.T / largest + self.phases
+            angles = (points - middle) @ waves.T + self.phases
             for i, moved in zip(some, points + np.sin(angles) @ self.amplitudes, strict=True):
                 hulls[i] = moved
         return replace(body, hulls=tuple(hulls), mesh=None, known_balls=tuple(balls))
@@ -242,9 +245,9 @@ def draw(uncertainty: Uncertainty, tool: tuple[Eyes, float], target: tuple[Eyes,
         sigma = abs(eyes.pieces.width) * wider * np.sqrt(2 / WAVES)
         directions = rng.normal(size=(WAVES, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        vectors = directions / rng.uniform(*WAVE_LENGTHS, (WAVES, 1))
+        lengths = rng.uniform(0.0, 1.0, WAVES)
         amplitudes = sigma * rng.choice([-1.0, 1.0], (WAVES, 3))
-        return ShapeError(size, thickness, amplitudes, vectors, rng.uniform(0, 2 * np.pi, WAVES))
+        return ShapeError(size, thickness, amplitudes, directions, lengths, rng.uniform(0, 2 * np.pi, WAVES))
 
     eyes, wider = target
     held = transforms.from_rotvec(uncertainty.held_turn.draw(rng, 3), uncertainty.held_place.draw(rng, 3))

@@ -389,7 +389,7 @@ def rollout(
     stop = stop or _Never()
     strategy, plan, limits = task.strategy, task.plan, task.limits
     drawn = task.drawn(index)
-    recorder = held = None
+    recorder = held = taken_anew = None
     run: Any = None
     metrics: dict[str, float] = {}
     grasped = 0.0
@@ -403,8 +403,8 @@ def rollout(
         limits = limits if drawn is None else limits.yielding()
         if plan.variant == "arm":
             if drawn is not None and _grasp_is_drawn(task):
-                grasped = _take_hold(task, drawn, limits, stop)
-            run = _arm_run(task, setup, drawn)
+                grasped, taken_anew = _take_hold(task, drawn, limits, stop)
+            run = _arm_run(task, setup, drawn, taken_anew)
         elif drawn is None:
             run = FloatingRun(setup, plan)
         else:
@@ -482,9 +482,9 @@ def _grasp_is_drawn(task: Task) -> bool:
     return motion is not None and motion.grasp_time > 0 and task.eyes[0][0] == task.uncertainty.camera
 
 
-def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> float:
+def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> tuple[float, Any]:
     """The grasp of a drawn rollout, the tool on the table as far off as it is drawn to be in the hand and shaped as drawn
-    (:func:`standing`); simulated seconds.
+    (:func:`standing`): simulated seconds, and how the pads have it.
 
     What is seen of a lying thing is its top: how steep its sides are, between which the fingers close, is the reconstruction's guess.
     Steps are short, as closing fingers bear no longer ones.  Raises as the run does.
@@ -501,7 +501,14 @@ def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Any) -> float:
         run.advance()
         if run.world.steps % CHECK_EVERY == 0:
             stop.check(float(run.world.time))
-    return float(run.world.time)
+    return float(run.world.time), run.held()
+
+
+def along_table(moved: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A small displacement (4, 4) in two: along the plane whose normal is ``up`` and about it, and the rest, a height and a tilt."""
+    shift, turn = moved[:3, 3], Rotation.from_matrix(moved[:3, :3]).as_rotvec()
+    height, angle = (shift @ up) * up, (turn @ up) * up
+    return transforms.from_rotvec(angle, shift - height), transforms.from_rotvec(turn - angle, height)
 
 
 def standing(drawn: Body, seen: Body, tool_from_held: NDArray[np.float64], table: NDArray[np.float64]) -> Body:
@@ -511,8 +518,8 @@ def standing(drawn: Body, seen: Body, tool_from_held: NDArray[np.float64], table
     the table, over the lower half of the tool; without that mugs toppled that stood as they were seen to stand.
     """
     up, pose = table[:3], seen.world_from_object
-    turn, shift = pose[:3, :3], pose[:3, :3] @ tool_from_held[:3, 3]
-    angle = float(up @ turn @ Rotation.from_matrix(tool_from_held[:3, :3]).as_rotvec())
+    turn = pose[:3, :3]
+    moved, _ = along_table(tool_from_held, turn.T @ up)
     heights = [transforms.apply(pose, hull) @ up + table[3] for hull in seen.hulls]
     highest = max(float(h.max()) for h in heights)
     hulls = list(drawn.hulls)
@@ -521,8 +528,7 @@ def standing(drawn: Body, seen: Body, tool_from_held: NDArray[np.float64], table
             kept = np.clip(1 - before / max(0.5 * highest, 1e-6), 0.0, 1.0)
             after = transforms.apply(pose, hulls[index]) @ up + table[3]
             hulls[index] = hulls[index] + (kept * (before - after))[:, None] * (up @ turn)
-    about = transforms.make(translation=pose[:3, 3] + shift - (shift @ up) * up) @ transforms.from_rotvec(angle * up)
-    return replace(drawn, hulls=tuple(hulls), world_from_object=about @ transforms.make(turn))
+    return replace(drawn, hulls=tuple(hulls), world_from_object=pose @ moved)
 
 
 def _drawn_options(task: Task, drawn: Draw) -> Any:
@@ -534,7 +540,8 @@ def _drawn_options(task: Task, drawn: Draw) -> Any:
     )
 
 
-def _arm_run(task: Task, setup: Setup, drawn: Draw | None) -> Any:
+def _arm_run(task: Task, setup: Setup, drawn: Draw | None, taken_anew: Any = None) -> Any:
+    """The arm's run under a draw; ``taken_anew``: how the drawn grasp has the tool, ``None`` where none is drawn."""
     from magic_verifier.arm_simulation import ArmRun
     from magic_verifier.articulation import ArmOptions
 
@@ -543,7 +550,14 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None) -> Any:
     options = _drawn_options(task, drawn)
     if options.past is not None:  # what contacts alone have taken hold of has no state that could be begun from
         return ArmRun(setup, task.plan, options, task.limits, task.robot, None, drawn.lag)
-    held = replace(task.held, tool_from_tcp=transforms.inverse(drawn.tool_from_held) @ task.held.tool_from_tcp)
+    if taken_anew is None:
+        held = replace(task.held, tool_from_tcp=transforms.inverse(drawn.tool_from_held) @ task.held.tool_from_tcp)
+    else:
+        # Fingers that close turn a tool until its sides lie along the pads, whatever way they were seen to go.  A tool on the table was
+        # off along it alone: the rest of what is drawn comes now.  On the way it creeps as it did in the scene as given.
+        _, off_it = along_table(drawn.tool_from_held, task.setup.tool.world_from_object[:3, :3].T @ setup.table[:3])
+        crept = transforms.inverse(task.held.taken) @ task.held.tool_from_tcp
+        held = replace(taken_anew, time=task.held.time, tool_from_tcp=transforms.inverse(off_it) @ taken_anew.taken @ crept)
     return ArmRun(setup, task.plan, options, task.limits, task.robot, held, drawn.lag)
 
 

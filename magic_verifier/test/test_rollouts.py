@@ -224,7 +224,7 @@ def test_what_was_seen_less_is_known_less():
 
 def test_a_shape_error_does_what_it_says():
     cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.004)], dtype=float)
-    plain = {"amplitudes": np.zeros((3, 3)), "vectors": np.ones((3, 3)), "phases": np.zeros(3)}
+    plain = {"amplitudes": np.zeros((3, 3)), "directions": np.eye(3), "lengths": np.ones(3), "phases": np.zeros(3)}
     body = Body("plate", (cube, cube + [0.1, 0, 0]), np.eye(4))
     thicker = ShapeError(np.zeros(3), 0.001, **plain).applied(body)
     assert np.ptp(thicker.hulls[0], axis=0) == pytest.approx([0.101, 0.101, 0.005], abs=1e-9)
@@ -236,6 +236,19 @@ def test_a_shape_error_does_what_it_says():
     ]
     zero = [replace(w, size=np.zeros(3), thickness=0.0).applied(body).corners - body.corners for w in waves]
     assert np.std(np.concatenate(zero)) == pytest.approx(0.0012, rel=0.15), "the width of the pieces' places"
+
+
+def test_errors_of_a_large_thing_are_no_smoother_than_those_of_a_small_one():
+    """A bowl of 0.1 m is off in its shape whatever the handle's length; waves that grew with a spoon of 0.4 m displaced it as a whole."""
+    spread = {}
+    for length in (0.1, 0.4):
+        bowl = np.array([[x, y, 0.0] for x in np.linspace(0, 0.1, 11) for y in (0, 0.05)])
+        body = Body("spoon", (bowl, bowl + [length - 0.1, 0, 0]), np.eye(4))
+        eyes = uncertainty.read().camera, 1.0
+        errors = [uncertainty.draw(uncertainty.read(), eyes, eyes, 3, k).tool_error for k in range(150)]
+        moved = [replace(e, size=np.zeros(3), thickness=0.0).applied(body).hulls[0] - bowl for e in errors]
+        spread[length] = np.sqrt(np.mean([np.var(m[:, 2]) for m in moved]))
+    assert spread[0.4] > 0.6 * spread[0.1] > 0.0005
 
 
 def test_fixed_targets_are_displaced_and_free_ones_stay_on_the_table():
@@ -311,7 +324,7 @@ def test_the_parameter_that_separates_is_named():
 def test_a_hand_gives_way_to_the_table_by_what_the_tool_is_thicker(thicker):
     strategy, tool, target, plan = scenes.hooking("L")
     setup = make_setup(tool, target, (), scenes.TABLE, strategy.physics, DEFAULTS["fg"])
-    error = ShapeError(np.zeros(3), thicker, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
+    error = ShapeError(np.zeros(3), thicker, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
     changed = replace(setup, tool=error.applied(setup.tool))
 
     def deepest(run):

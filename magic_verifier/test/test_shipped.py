@@ -103,9 +103,25 @@ def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
     grasp = verification.BEFORE_GRASP + verification.AFTER_GRASP
     assert grasp < again.simulated - known.simulated < grasp + 1.5, "the fingers close as well"
 
+    # Fingers turn what lies askew until it is nearly along them, and it goes on as they have it; a height is not theirs to mend.
+    drawing, begin, begun = uncertainty.draw, verification._arm_run, []
+
+    def begins(task, *given):
+        begun.append((task.held, begin(task, *given)))
+        return begun[-1][1]
+
+    up = tool.world_from_object[:3, :3].T @ [0.0, 0.0, 1.0]
+    askew = transforms.from_rotvec(0.2 * up, 0.002 * up)
+    monkeypatch.setattr(verification, "_arm_run", begins)
+    monkeypatch.setattr(uncertainty, "draw", lambda *given: replace(drawing(*given), tool_from_held=askew))
+    drawn_rollout(seen)
+    held, run = begun[-1]
+    off = transforms.inverse(held.tool_from_tcp) @ run.held().tool_from_tcp
+    assert transforms.rotation_angle(np.eye(4), off) < 0.12
+    assert abs(off[:3, 3] @ held.tool_from_tcp[:3, :3].T @ up) > 0.0015
+
     # Where it truly lies so far off that the fingers close beside it, a hand that is taken for full would carry it all the same.
     aside = transforms.make(translation=[0.0, 0.5, 0.0])
-    drawing = uncertainty.draw
     monkeypatch.setattr(uncertainty, "draw", lambda *given: replace(drawing(*given), tool_from_held=aside))
     failed = drawn_rollout(seen)
     assert failed.judgement.code == Code.GRASP_SLIPPED and failed.judgement.cause == "the gripper closed on nothing"
