@@ -251,8 +251,8 @@ def drawn_in(
 
     A ring that is lowered over a target has less room than a hook that comes from the open side.  Offsets across the view
     direction are scaled, of the approach's waypoints from that of the contact, of the retreat's from that of the goal; the
-    largest of :data:`SHARES` counts at which the approach keeps :data:`MARGIN` clear of the target.  Where none does, or the
-    strategy has no approach that ends in a contact, it comes back as it is.
+    largest of :data:`SHARES` counts at which the approach keeps :data:`MARGIN` clear of the target; where none does, the approach goes to where
+    there is most room beside the contact.  Where that is not clear either, or the strategy has no approach that ends in a contact, it comes back as it is.
 
     A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
     there is room, so that a tool that is not quite where it was seen does not press on what cannot give way; where there is none at the
@@ -295,7 +295,10 @@ def drawn_in(
         changed = _scaled(strategy, meets, share)
         if not _touches_on(held, poses_of(changed, 0), fixed if share == 1 else wall):
             return changed
-    return strategy
+    # In a hole that is hardly wider than the target only its middle is clear.
+    closest = _scaled(strategy, meets, SHARES[-1])
+    middle = _with_room(closest, meets, tool, poses_of(closest, 0), target, world_from_contact)
+    return strategy if _touches_on(held, poses_of(middle, 0), fixed) else middle
 
 
 def _seated(strategy: Strategy, gap: float, aside: float) -> Strategy:

@@ -76,6 +76,8 @@ def test_an_evaluation_is_written_and_goes_on_where_it_stopped(tmp_path):
     [
         # Between the arms of a V there is no place that looks like the corner of a hook.
         (Options("hooking", "fg_no_selection", set="alphabet"), "capital:V cylinder:0.035"),
+        # A ring hardly wider than the cylinder was lowered on to it, where only its middle is clear.
+        (Options("hooking", "fg_no_selection", set="alphabet"), "capital:Q cylinder:0.03"),
         # On the rod the engine tells a velocity of a V that does not move: it never came to rest.
         (Options("hanging", set="alphabet"), "capital:V"),
         # Met 58 mm from one end of a bar, a row of cylinders passed that end.
