@@ -72,7 +72,16 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     agreeing: list[tuple[float, Reconstruction]] = []
     standing: Mesh | None = None
     if stands:
-        turned = build_round(sights, points, eyes, height, noise, parameters)
+        # What is drawn at random tells its axis; where it came out badly it is drawn anew.
+        for draw in range(DRAWS):
+            drawn = build_round(sights, points, eyes, height, noise, replace(parameters, seed=parameters.seed + draw))
+            if drawn is None:
+                break
+            drawn = replace(drawn, fit=agreement(drawn.mesh, sights))
+            if turned is None or drawn.fit.score > turned.fit.score:
+                turned = drawn
+            if turned.fit.score > _WELL:
+                break
         if turned is not None:
             standing = turned.mesh
             agreeing += _agreeing(turned, sights, 0.8)
@@ -102,6 +111,8 @@ _FREE = 0.15
 _LEAST = {"box": 0.9, "rounded box": 0.9, "cylinder": 0.8}
 #: From this score on a solid agrees so well with what was seen that no other is looked for.
 _WELL = 0.86
+#: A round body is drawn so often at most.
+DRAWS = 3
 #: A solid is clearly better than another by so much of the score.
 _CLEARLY = 0.05
 

@@ -349,6 +349,9 @@ def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_
         part = labels[window] == i
         heights = looked.raw[window][part]
         heights = heights[np.isfinite(heights)]
+        # The fewer that are raised one by one are smear of the hole's rim: they tell nothing of its floor.
+        high = heights > max(parameters.min_height, 4.0 * float(np.median(looked.sigma[window][part])))
+        heights = heights[~high] if 2 * np.count_nonzero(high) <= len(heights) else heights
         if area < 12 or other[window][part].mean() > 0.7:
             result[window] |= part
         elif len(heights) > 15:

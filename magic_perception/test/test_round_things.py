@@ -153,6 +153,14 @@ def test_a_handle_partly_behind_its_body_stays_open(seed, yaw, names):
     assert item.mesh.to_trimesh().euler_number == 0  # one handle, one loop, nothing apart
 
 
+@pytest.mark.parametrize("yaw", [0.25 * np.pi, 0.75 * np.pi])
+def test_the_hole_of_a_broad_handle_is_open_where_smear_leaves_little_of_it(yaw):
+    mug = shapes.make("mug", 0, handle_reach=0.038, profile="tapered", height=0.1, radius=0.045, bulge=0.1, handle_breadth=0.016)
+    item, shape = seen(scenes.placed(mug.mesh, 0.5, 0.0, yaw).painted((170, 40, 40)), ("left", "right"))
+    assert shape == "round with handle"
+    assert item.mesh.to_trimesh().euler_number == 0
+
+
 def test_the_widest_handle_is_one_where_no_camera_sees_through_it():
     # Of made mugs that stand off farthest, a bar and its hole together are as wide as their handle.
     off = [float(np.ptp(mug.mesh.vertices[:, 0]) - np.ptp(mug.mesh.vertices[:, 1])) for mug in shapes.mug_set()]
