@@ -1,7 +1,7 @@
 """Parts of one thing that depth or a seam has parted, told by how they lie on it in the pictures: a handle, the rim of a mouth.
 
 Where a mug lies on its side its handle meets it at two ends that depth loses, or lies on the table beside it; its mouth, seen aslant, is a strip a few pixels
-wide whose depth is torn from the outside's.
+wide whose depth is torn from the outside's; a bent wire has the table's depth between a plate and a hook that keep their own.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_perception import smear
 
 if TYPE_CHECKING:
     from magic_perception.segmentation import Looked
@@ -25,6 +26,8 @@ GAP, LIFTED, COLOR, BESIDE = 0.020, 0.012, 0.06, 7
 PART, LOOP = 0.2, 0.5
 #: A hole of so many pixels, of whose rim either has such a share, closes a loop; a strip is so wide at most, as a mean, at a focal length of 615.
 HOLE, RIM, STRIP = 10, 0.2, 4.0
+#: Of the pixels at which two parts meet in a bar such a share has no depth of its own.
+LOST = 0.5
 #: A place is seen to be empty where a picture shows neither there and depth goes on behind it by so many metres; between two things most places are.
 EMPTY, FREE = 0.004, 0.3
 
@@ -32,8 +35,8 @@ EMPTY, FREE = 0.004, 0.3
 def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.int64]:
     """For each label (top + 1,) the one it belongs to, itself mostly: a smaller one of the same colour that touches a larger one in every picture which shows it.
 
-    It belongs to the other where it hangs in the air, carried by nothing; where both enclose a hole, as a handle does with its mug, or it is a strip along the
-    other's edge, and no camera sees between them.
+    It belongs to the other where it hangs in the air, carried by nothing; where they meet in a thin bar that has lost its depth; or where both enclose a hole,
+    as a handle does with its mug, or it is a strip along the other's edge, and no camera sees between them.
     """
     top = max((int(image.max()) for image in labels), default=0)
     owner = np.arange(top + 1)
@@ -49,7 +52,7 @@ def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.i
 
     for label in range(top, 0, -1):
         for other in sorted(_beside(labels, label), key=lambda i: -sizes[i]):
-            if sizes[label] >= LOOP * sizes[other]:
+            if (sizes[other], -other) < (sizes[label], -label):
                 continue
             one, two = part(label), part(other)
             if min(len(one.points), len(two.points)) < 20 or float(np.linalg.norm(one.shade - two.shade)) > COLOR:
@@ -57,10 +60,14 @@ def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.i
             ways, gap = _ways(one, two)
             if gap > GAP:
                 continue
-            small = sizes[label] < PART * sizes.max() and sizes[label] < PART * sizes[other]
-            if (small and _hangs(one, two)) or (
-                (_loop(labels, label, other) or (small and _strip(labels, looks, label, other)))
-                and not _seen_between(ways, labels, looks, (label, other))
+            half, small = sizes[label] < LOOP * sizes[other], sizes[label] < PART * sizes.max() and sizes[label] < PART * sizes[other]
+            if (
+                (small and _hangs(one, two))
+                or _bar(labels, looks, label, other)
+                or (
+                    ((half and _loop(labels, label, other)) or (small and _strip(labels, looks, label, other)))
+                    and not _seen_between(ways, labels, looks, (label, other))
+                )
             ):
                 owner[label] = other
                 break
@@ -154,6 +161,39 @@ def _strip(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, oth
         if np.count_nonzero(own) > STRIP * look.frame.intrinsics.fx / 615 * along:
             return False
     return True
+
+
+def _bar(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, other: int) -> bool:
+    """Whether two labels meet in a picture in a thin bar that has lost its depth there, and what of them has its own is near each other: there each pixel has
+    the label of the nearest that has depth, and nothing in space parts them."""
+    from scipy.spatial import cKDTree
+
+    met = False
+    told: tuple[list[NDArray[np.float32]], ...] = ([], [])
+    for image, look in zip(labels, looks, strict=True):
+        cut = _around(np.where(image == other, label, image), label, 2)
+        if cut is None:
+            continue
+        parts = tuple(image[cut] == i for i in (label, other))
+        both = parts[0] | parts[1]
+        heights = look.heights[cut]
+        lost = both & (~np.isfinite(heights) | smear.behind(both, heights))
+        for points, part in zip(told, parts, strict=True):
+            rows, columns = np.nonzero(part & ~lost)
+            step = max(1, len(rows) // 4000)
+            points.append(look.points(rows[::step] + cut[0].start, columns[::step] + cut[1].start))
+        seam = (cv2.dilate(parts[0].view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & parts[1]
+        if not seam.any() or float(lost[seam].mean()) < LOST:
+            continue
+        width = smear.BAR * look.frame.intrinsics.fx / 615
+        within = cv2.distanceTransform(np.pad(both, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+        near = cv2.distanceTransform((~seam).view(np.uint8), cv2.DIST_L2, 3) <= width
+        # One of them is thin all about the seam: two bodies that meet with their corners are no bar.
+        met |= min(float(within[near & part].max()) for part in parts) <= width / 2
+    if not met:
+        return False
+    one, two = (np.concatenate(points) for points in told)
+    return len(one) > 0 and len(two) > 0 and float(cKDTree(two).query(one)[0].min()) <= GAP
 
 
 def _ways(part: _Part, other: _Part) -> tuple[NDArray[np.float32], float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
@@ -66,6 +68,30 @@ def test_a_handle_that_lies_on_the_table_belongs_to_its_body(names):
 )
 def test_a_neighbour_is_a_thing_of_its_own(meshes):
     assert told(meshes) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("width", "lost", "owner"),
+    [
+        pytest.param(0.008, 0.015, 1, id="a thin bar without depth where the labels meet"),
+        pytest.param(0.008, 0.0, 2, id="depth tells where the second begins"),
+        pytest.param(0.008, 0.035, 2, id="what has depth is far from each other"),
+        pytest.param(0.040, 0.015, 2, id="no thin bar"),
+    ],
+)
+def test_a_bar_that_has_lost_its_depth_where_it_meets_a_thing_belongs_to_it(width, lost, owner):
+    rod = scenes.placed(mesh(trimesh.creation.box([0.07, width, 0.008]), BLUE), 0.46 - 0.035, 0.0)
+    looks, labels = [], []
+    for i, name in enumerate(("left", "right")):
+        frame, ids = scenes.capture([block(), rod], name, seed=i)
+        seen, image = look(frame, PLANE, np.eye(4), Parameters()), (ids + 1).astype(np.int32)
+        near = seen.points(*np.mgrid[: image.shape[0], : image.shape[1]])[..., 0]
+        # Each pixel without depth has the label of the nearest that has it.
+        image[(image == 2) & (near > 0.46 - max(lost, 0.015) / 2)] = 1
+        blank = (ids == 1) & (near > 0.46 - lost)
+        looks.append(look(replace(frame, depth=np.where(blank, np.nan, frame.depth).astype(np.float32)), PLANE, np.eye(4), Parameters()))
+        labels.append(image)
+    assert attached.owners(labels, looks)[2] == owner
 
 
 @pytest.mark.parametrize(("width", "owner"), [(3, 1), (12, 2)])
