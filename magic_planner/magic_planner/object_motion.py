@@ -41,8 +41,11 @@ from magic_planner.sliding import lowest, slid_contacts
 #: Largest step between two samples: metres, radians.
 STEP_LENGTH = 0.005
 STEP_ANGLE = np.deg2rad(2.0)
-#: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up.
-TABLE_CLEARANCE, LOW_SHARE = 0.001, 0.2
+#: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up; and of a target that the
+#: tool is to go beneath: gap and lip together have to stay well below its middle, or it is driven along before the lip.
+TABLE_CLEARANCE, LOW_SHARE, BENEATH_SHARE = 0.001, 0.2, 0.05
+#: A tool is beneath its target where its side at the contact faces up by at least so much (cosine).
+BENEATH = 0.7
 #: By so much (rad) a tool is turned out of the attitude in which its contact was seen, where it would pass over its target in that.
 LEVELLED = np.deg2rad(45.0)
 #: How quickly the tool takes up and loses its speed between waypoints, m/s^2.
@@ -110,7 +113,8 @@ def plan_tool_motion(
     target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
     tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
     world_from_contact = world_from_target @ target_from_contact
-    clearance = _above_table(target, plane, gap)
+    beneath = _goes_beneath(strategy, world_from_contact, plane)
+    clearance = _above_table(target, plane, gap, BENEATH_SHARE if beneath else LOW_SHARE)
     if not candidate.companions:
         tool_from_contact = _not_over(tool, tool_from_contact, target, world_from_contact, plane, clearance)
     pairs = further_pairs(strategy, candidate, reflection, tool_from_contact)
@@ -124,7 +128,8 @@ def plan_tool_motion(
     else:
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
     world_from_meeting = world_from_contact @ contacts
-    frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, gap)
+    room = min(gap, clearance) if beneath else gap
+    frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, room)
     world_from_tool = world_from_meeting @ transforms.inverse(frames)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool), clearance)
     start = Body(tool.id, solid_pieces(tool))
@@ -148,12 +153,20 @@ def plan_tool_motion(
     return ToolMotion(times, world_from_tool, phases, marks)
 
 
-def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float) -> float:
+def _goes_beneath(strategy: Strategy, world_from_contact: NDArray[np.float64], plane: NDArray[np.float64]) -> bool:
+    """Whether a demonstrated motion turns the contact, met from the side, until the tool is beneath the target: a scoop."""
+    if strategy.mode != "retarget":
+        return False
+    normals = (world_from_contact @ demonstrated_motion(strategy)[1])[:, :3, 0]
+    return bool(normals[0] @ plane[:3] < BENEATH < normals[-1] @ plane[:3])
+
+
+def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float, share: float) -> float:
     """The gap (m) that a tool keeps to the table: as to obstacles, for a tool that has turned a little in the gripper would scrape along it
-    with the far end of a long handle, but so small that a low target is met all the same."""
+    with the far end of a long handle, but no more than a share of the target's height, so that a low target is met all the same."""
     pieces = np.concatenate([piece.vertices for piece in solid_pieces(target)])
     height = float((transforms.apply(target.world_from_object, pieces) @ plane[:3] + plane[3]).max())
-    return max(TABLE_CLEARANCE, min(gap, LOW_SHARE * height))
+    return max(TABLE_CLEARANCE, min(gap, share * height))
 
 
 def _not_over(

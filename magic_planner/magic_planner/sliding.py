@@ -22,7 +22,7 @@ from magic_planner.giving_way import GAP, averaged, hits, way_along
 
 Array = NDArray[np.float64]
 #: Step along the outline and the furthest that a contact slides, metres.
-STEP = 0.002
+STEP = 0.0005
 FURTHEST = 0.3
 #: The outline is followed as long as it is seen from the contact's normal at 60 degrees or less.
 STEEPEST = 1.75
@@ -33,7 +33,7 @@ REACH = 0.02
 #: What the table may lack of its clearance, metres, after a slide: no more than rounding.
 LITTLE = 1e-9
 #: Least way of the contact, metres, over which a slide begins and ends.
-SMOOTHING = 0.03
+SMOOTHING = 0.015
 
 
 def slid_contacts(

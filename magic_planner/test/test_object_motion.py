@@ -144,6 +144,26 @@ def test_a_tool_in_a_gripper_keeps_off_the_table_as_off_other_things_and_meets_a
     assert lowest == pytest.approx(above, abs=1e-6)
 
 
+@pytest.mark.parametrize(("turn", "above"), [(90, 0.002), (30, 0.004)])
+def test_a_tool_that_goes_beneath_its_target_keeps_closer_to_the_table(turn, above):
+    """A scoop: gap and lip together have to stay well below the target's middle, 20 mm above the table here."""
+    tall, tool_contact = scenes.hook(thickness=0.08)
+    target, target_contact = scenes.standing_cylinder(0.02)
+    times = np.linspace(0, 2, 9)
+    poses = [
+        target_contact.object_from_contact
+        @ transforms.from_rpy(0, -np.deg2rad(turn) * share, 0, [0.05 * (1 - share), 0, 0])
+        @ OPPOSED
+        @ transforms.inverse(tool_contact.object_from_contact)
+        for share in times / 2
+    ]
+    strategy = scenes.pulling(waypoints=(), mode="retarget", times=times, target_from_tool=np.stack(poses))
+    motion = plan_tool_motion(strategy, tall, target, scenes.candidate(tall, tool_contact, target_contact), "keep", TABLE, gap=0.004)
+    vertices = np.concatenate([p.vertices for p in tall.pieces])
+    lowest = min(transforms.apply(pose, vertices)[:, 2].min() for pose in motion.world_from_tool)
+    assert lowest == pytest.approx(above, abs=1e-6)
+
+
 @pytest.mark.parametrize(("askew", "height", "flat"), [(20, 0.03, True), (20, 0.3, False), (40, 0.03, True), (60, 0.03, False)])
 def test_a_tool_seen_a_little_askew_is_led_flat_where_it_would_pass_over_a_low_target(askew, height, flat):
     strategy, _tool, _, _ = setup()
