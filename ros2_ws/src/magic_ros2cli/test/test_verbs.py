@@ -166,8 +166,9 @@ def test_topic_echo(small: Follow) -> None:
 
 def test_topic_hz(small: Follow) -> None:
     hz = Follow(*ROS2, "topic", "hz", "/image")
-    text = hz.until(r"average rate: [\d.]+\n\tmin: [\d.]+s max: [\d.]+s std dev: [\d.]+s window: \d+\n")
-    assert float(re.search(r"average rate: ([\d.]+)", text)[1]) == pytest.approx(20, rel=0.3)
+    # On a busy machine the first second may bring what was late; the window grows over the later ones.
+    text = hz.until(r"(average rate: [\d.]+\n\tmin: [\d.]+s max: [\d.]+s std dev: [\d.]+s window: \d+\n){4}")
+    assert float(re.findall(r"average rate: ([\d.]+)", text)[-1]) == pytest.approx(20, rel=0.3)
     assert hz.end() == signal.SIGINT and "Traceback" not in hz.text
 
 
