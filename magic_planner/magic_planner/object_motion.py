@@ -113,7 +113,8 @@ def plan_tool_motion(
     target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
     tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
     world_from_contact = world_from_target @ target_from_contact
-    beneath = _goes_beneath(strategy, world_from_contact, plane)
+    shown = demonstrated_motion(strategy) if strategy.mode == "retarget" else None
+    beneath = shown is not None and _ends_beneath(world_from_contact @ shown[1], plane)
     clearance = _above_table(target, plane, gap, BENEATH_SHARE if beneath else LOW_SHARE)
     if not candidate.companions:
         tool_from_contact = _not_over(tool, tool_from_contact, target, world_from_contact, plane, clearance)
@@ -123,8 +124,8 @@ def plan_tool_motion(
         waypoint_motion(strategy, pairs)  # what is wrong with the waypoints is said before they are changed
         strategy = drawn_in(strategy, tool, target, world_from_contact, transforms.inverse(tool_from_contact), pairs)
         times, contacts, phases = waypoint_motion(strategy, pairs)
-    elif strategy.mode == "retarget":
-        times, contacts, phases = demonstrated_motion(strategy)
+    elif shown is not None:
+        times, contacts, phases = shown
     else:
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
     world_from_meeting = world_from_contact @ contacts
@@ -153,12 +154,10 @@ def plan_tool_motion(
     return ToolMotion(times, world_from_tool, phases, marks)
 
 
-def _goes_beneath(strategy: Strategy, world_from_contact: NDArray[np.float64], plane: NDArray[np.float64]) -> bool:
-    """Whether a demonstrated motion turns the contact, met from the side, until the tool is beneath the target: a scoop."""
-    if strategy.mode != "retarget":
-        return False
-    normals = (world_from_contact @ demonstrated_motion(strategy)[1])[:, :3, 0]
-    return bool(normals[0] @ plane[:3] < BENEATH < normals[-1] @ plane[:3])
+def _ends_beneath(world_from_meeting: NDArray[np.float64], plane: NDArray[np.float64]) -> bool:
+    """Whether a motion of the contact (T, 4, 4) turns the tool, which meets its target from the side, until it is beneath: a scoop."""
+    up = world_from_meeting[[0, -1], :3, 0] @ plane[:3]
+    return bool(up[0] < BENEATH < up[1])
 
 
 def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float, share: float) -> float:
