@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,8 @@ BACKGROUND = (244, 245, 247)
 LIGHT = np.array([-0.35, -0.45, 1.0])
 #: Frames are cast at this multiple of their size and scaled down.
 OVERSAMPLING = 1.25
+#: Pixels for a letter of the caption, on the average of English sentences.
+LETTER = 7.5
 
 
 def _painted(item: SceneObject, color: tuple[int, int, int], world_from_object: NDArray[np.float64]) -> Mesh:
@@ -159,8 +163,10 @@ def film_strip(
     rows = [np.concatenate(pictures[i : i + columns], axis=1) for i in range(0, len(pictures), columns)]
     strip = np.concatenate(rows, axis=0)
     if caption:
-        bar = np.full((26, strip.shape[1], 3), 255, np.uint8)
-        cv2.putText(bar, caption[: strip.shape[1] // 7], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 45), 1, cv2.LINE_AA)
+        lines = textwrap.wrap(caption, max(1, int((strip.shape[1] - 16) / LETTER)))
+        bar = np.full((8 + 18 * len(lines), strip.shape[1], 3), 255, np.uint8)
+        for k, line in enumerate(lines):
+            cv2.putText(bar, line, (8, 18 + 18 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 45), 1, cv2.LINE_AA)
         strip = np.concatenate([strip, bar], axis=0)
     return np.ascontiguousarray(strip)
 

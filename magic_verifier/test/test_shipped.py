@@ -75,6 +75,11 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     film = film_strip(first.recording, tool, target, obstacles, scenes.TABLE, frames=2, columns=2, size=(160, 120))
     assert film.shape[2] == 3
     assert film.std() > 10
+    words = film_strip(
+        first.recording, tool, target, obstacles, scenes.TABLE, frames=2, columns=2, size=(160, 120), caption="the goal is reached: " * 8
+    )
+    written = words[len(film) :]
+    assert len(written) > 60 and written.min() < 100 and written[:, -8:].min() == 255  # all of it, on lines within the picture
 
 
 def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):

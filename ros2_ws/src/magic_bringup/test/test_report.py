@@ -40,7 +40,7 @@ def full(folder, tmp_path, variant="arm"):
             reflection="keep",
             stage="verify",
             code=int(code),
-            message="why <b>so</b>",
+            message="why <b>so</b>" + ", and at what length a verdict of the engine says so" * 6,
             rollouts=9,
         )
         for code in (Code.DRIFT, Code.OK)
@@ -135,6 +135,7 @@ for(let a=e.parentElement;a&&a!==d.body;a=a.parentElement)inside=inside||f.conte
 if(inside){boxes++;continue}
 if(r.right>d.documentElement.clientWidth+0.5||r.left<-0.5)out.push(e.tagName+'.'+e.className)}
 o.textContent='measured '+JSON.stringify([d.documentElement.scrollWidth,d.documentElement.clientWidth,out,boxes,d.querySelectorAll('img').length,
+[...d.querySelectorAll('th')].filter(e=>e.getBoundingClientRect().height>40).map(e=>e.textContent),
 [...d.querySelectorAll('img')].filter(i=>!i.naturalWidth).length])}</script></body>"""
 
 
@@ -146,9 +147,9 @@ def test_a_browser_shows_the_page_no_wider_than_its_window(folder, tmp_path, wid
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--virtual-time-budget=10000", "--dump-dom")
     where = (f"--user-data-dir={tmp_path / 'profile'}", f"file://{tmp_path / 'frame.html'}")
     shown = subprocess.run([CHROMIUM, *options, *where], capture_output=True, text=True, timeout=120, check=True).stdout
-    page_width, window, outside, scrolled, images, broken = json.loads(re.search(r"measured (\[.*\])<", shown)[1])
+    page_width, window, outside, scrolled, images, broken_heads, broken = json.loads(re.search(r"measured (\[.*\])<", shown)[1])
     assert width - 20 <= window <= width and page_width <= window and outside == []
-    assert images >= 9 and broken == 0 and scrolled > 0
+    assert images >= 9 and broken == 0 and broken_heads == [] and scrolled > 0
 
 
 def test_the_page_says_when_by_what_and_what_its_words_mean(folder, tmp_path):
