@@ -24,7 +24,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,9 @@ from magic_core.shapes.fixtures import pose_data
 from magic_core.strategy import MODES, Goal, Physics, Strategy, load, save
 from magic_verifier import track
 from magic_verifier.track import Track
+
+if TYPE_CHECKING:  # physics is loaded when the arguments are known to be right
+    from magic_verifier.learning import Demonstration, Learned
 
 Array = NDArray[np.float64]
 COLOR, DEPTH, INFO = "color/image_raw", "aligned_depth_to_color/image_raw", "aligned_depth_to_color/camera_info"
@@ -468,41 +471,33 @@ def _failed(out: Path) -> Path:
     return out.with_name(f"{out.name}.failed")
 
 
-def _learn(given: argparse.Namespace) -> int:
+def demonstrated(given: argparse.Namespace) -> Demonstration:
+    """What the bag shows: the scene before anything moved, and the tool's motion from then on; says what it finds.
+
+    Raises ``BAD_REQUEST``, ``STALE_DATA`` and what :mod:`magic_verifier.track` refuses of a motion.
+    """
     from magic_core import conversions
     from magic_perception.pipeline import perceive
-    from magic_verifier.learning import Demonstration, Task, advice, learn
+    from magic_verifier.learning import Demonstration
 
-    goal, values = goal_of(given)
-    check_given(given)
     topic = TOOL_POSE if given.tool_pose is None else "/" + given.tool_pose.lstrip("/")
     bag = Recorded(given.bag)
     frames = frames_of(bag, given.world)
     seen = max(frame.stamp for frame in frames)
     bare = given.track or (given.tool_pose is None and given.tool_frame is None and topic not in bag.topics)
     what = "the tool's own track" if bare else f"frame {given.tool_frame}" if given.tool_frame else topic
-    times = poses = None
     if not bare:
-        times, poses = track_of(bag, given.world, topic, given.tool_frame or "", since=min(frame.stamp for frame in frames))
-        if not times[0] - APART <= seen <= times[-1]:
-            raise MagicError(
-                Code.STALE_DATA,
-                "the tool's track begins after the pictures, s",
-                round(times[0] - seen, 2),
-                f"at most {APART:g}, and ends after them",
-            )
-        track.check_still(what, times, poses, min(frame.stamp for frame in frames), max(seen, times[0]))
+        times, poses = _reported(given, bag, what, topic, min(frame.stamp for frame in frames), seen)
     known = conversions.scene_from_msg(bag.of("/known_objects")[-1]).objects if "/known_objects" in bag.topics else ()
     scene = perceive(frames, tuple(known))
     print(f"objects: {', '.join(item.id for item in scene.objects)}")
     for note in scene.notes:
         print(f"note: {note}")
-    if times is None:
+    if bare:
         taken = given.tool or left_first(scene, later_frames(bag, given.world))
         tool, target = choose(scene, taken, given.target, scene.find(taken).world_from_object[:3, 3])
     else:
-        first = transforms.interpolate(times, poses, [seen])[0]
-        tool, target = choose(scene, given.tool, given.target, first[:3, 3])
+        tool, target = choose(scene, given.tool, given.target, transforms.interpolate(times, poses, [seen])[0][:3, 3])
     for item in (tool, target):
         if item.cut_off:
             raise MagicError(
@@ -511,14 +506,13 @@ def _learn(given: argparse.Namespace) -> int:
                 ", ".join(item.cut_off),
                 "tool and target in full view, apart",
             )
-    fixed = given.fixed_target or target.source != "camera"
+    fixed = _is_fixed(given, target)
     if fixed and given.goal in ("hook", "scoop"):
         raise MagicError(Code.BAD_REQUEST, f"target of --goal {given.goal}", f"{target.id} is a known fixture", "a target that can move")
-    if times is None:
+    if bare:
         times, poses = followed(bag, given.world, tool, scene.table)
-        first = transforms.interpolate(times, poses, [seen])[0]
     # What is tracked is fixed to the tool, wherever on it.
-    later = times > seen
+    first, later = transforms.interpolate(times, poses, [seen])[0], times > seen
     times = np.concatenate([[seen], times[later]])
     world_from_tool = np.concatenate([[first], poses[later]]) @ (transforms.inverse(first) @ tool.world_from_object)
     track.check_above(what, tool.mesh, times, world_from_tool, scene.table)
@@ -527,24 +521,31 @@ def _learn(given: argparse.Namespace) -> int:
         f"tool: {tool.id}, target: {target.id}{' (fixed)' if fixed else ''}, {len(times)} poses over {times[-1] - times[0]:.1f} s, "
         + (f"seen there in {told} depth pictures" if told else "compared with no later picture: there is none")
     )
-    demonstration = Demonstration(
-        tool, target, tuple(o for o in scene.objects if o.id not in (tool.id, target.id)), scene.table, times, world_from_tool
-    )
-    task = Task(
-        given.out.absolute().name,
-        goal,
-        Physics(given.friction, given.tool_density, given.target_density, fixed),
-        given.releases,
-        given.view,
-        given.mode,
-        given.description,
-        simulatable=given.goal != "none",
-        values=values if goal is None else {},
-    )
-    learned = learn(demonstration, task)
-    # Where its target stood, so that it can be evaluated; fixtures are known to the scene, not to the strategy.
-    alone = not demonstration.obstacles
-    strategy = replace(learned.strategy, environment={"world_from_target": pose_data(target.world_from_object)} if alone else {})
+    others = tuple(item for item in scene.objects if item.id not in (tool.id, target.id))
+    return Demonstration(tool, target, others, scene.table, times, world_from_tool)
+
+
+def _is_fixed(given: argparse.Namespace, target: SceneObject) -> bool:
+    return given.fixed_target or target.source != "camera"
+
+
+def _reported(given: argparse.Namespace, bag: Recorded, what: str, topic: str, begin: float, seen: float) -> tuple[Array, Array]:
+    """The recorded track of a frame that is fixed to the tool: times (T,) s and poses (T, 4, 4), at rest while the pictures of ``begin``
+    to ``seen`` were taken."""
+    times, poses = track_of(bag, given.world, topic, given.tool_frame or "", since=begin)
+    if not times[0] - APART <= seen <= times[-1]:
+        raise MagicError(
+            Code.STALE_DATA,
+            "the tool's track begins after the pictures, s",
+            round(times[0] - seen, 2),
+            f"at most {APART:g}, and ends after them",
+        )
+    track.check_still(what, times, poses, begin, max(seen, times[0]))
+    return times, poses
+
+
+def _say(learned: Learned, strategy: Strategy) -> None:
+    """What was learned, in words."""
     if learned.changed is not None:
         print("what the demonstration changes, replayed:")
         print("\n".join(f"  {line}" for line in learned.changed.words()))
@@ -563,24 +564,56 @@ def _learn(given: argparse.Namespace) -> int:
     for waypoint in strategy.waypoints:
         offset = " ".join(f"{1000 * x:7.1f}" for x in waypoint.offset)
         print(f"  {waypoint.phase:9} {waypoint.name:12} {offset} mm{f' of {waypoint.contact}' if waypoint.contact else ''}")
-    verdict = learned.verdict
-    if verdict is None:
+    if learned.verdict is None:
         print("not tried in simulation: it cannot judge this goal")
     else:
-        print(f"tried with the demonstrated objects: {verdict.code.name}, {verdict.message}")
-    if verdict is not None and not verdict.success:
-        for line in advice(learned):
-            print(line)
-        if not given.keep_failed:
-            print(f"no strategy was written (--keep-failed leaves it as {_failed(given.out)})")
-            return 1
-        marked = f"FAILED ITS OWN TRIAL ({verdict.code.name}: {verdict.message}). {strategy.description}".strip()
-        write(replace(strategy, description=marked), _failed(given.out.absolute()))
-        print(f"strategy that failed, to look at: {_failed(given.out)}")
+        print(f"tried with the demonstrated objects: {learned.verdict.code.name}, {learned.verdict.message}")
+
+
+def _keep(learned: Learned, strategy: Strategy, given: argparse.Namespace) -> int:
+    """Write the strategy, or what failed its own trial where that is asked for; the exit status."""
+    from magic_verifier.learning import advice
+
+    verdict = learned.verdict
+    if verdict is None or verdict.success:
+        write(strategy, given.out.absolute())
+        print(f"strategy: {given.out}, picture: {given.out / 'contacts.png'}")
+        return 0
+    for line in advice(learned):
+        print(line)
+    if not given.keep_failed:
+        print(f"no strategy was written (--keep-failed leaves it as {_failed(given.out)})")
         return 1
-    write(strategy, given.out.absolute())
-    print(f"strategy: {given.out}, picture: {given.out / 'contacts.png'}")
-    return 0
+    marked = f"FAILED ITS OWN TRIAL ({verdict.code.name}: {verdict.message}). {strategy.description}".strip()
+    write(replace(strategy, description=marked), _failed(given.out.absolute()))
+    print(f"strategy that failed, to look at: {_failed(given.out)}")
+    return 1
+
+
+def _learn(given: argparse.Namespace) -> int:
+    from magic_verifier.learning import Task, learn
+
+    goal, values = goal_of(given)
+    check_given(given)
+    demonstration = demonstrated(given)
+    target = demonstration.target
+    task = Task(
+        given.out.absolute().name,
+        goal,
+        Physics(given.friction, given.tool_density, given.target_density, _is_fixed(given, target)),
+        given.releases,
+        given.view,
+        given.mode,
+        given.description,
+        simulatable=given.goal != "none",
+        values=values if goal is None else {},
+    )
+    learned = learn(demonstration, task)
+    # Where its target stood, so that it can be evaluated; fixtures are known to the scene, not to the strategy.
+    alone = not demonstration.obstacles
+    strategy = replace(learned.strategy, environment={"world_from_target": pose_data(target.world_from_object)} if alone else {})
+    _say(learned, strategy)
+    return _keep(learned, strategy, given)
 
 
 def write(strategy: Strategy, out: Path) -> None:
