@@ -221,14 +221,19 @@ class ArmPlanner:
         chosen: list[Array] = []  # grasps of the attempts before, in order
         spare: list[Branch] = []  # those that close where one of these does, only from another side
         tried = 0
-        for lot in itertools.chain(lots, [None]):
+        for number, lot in enumerate(itertools.chain(lots, [None])):
+            quick = 0
             if lot is None:
                 branches = spare
             else:
                 budget.check("task")
+                if number:  # what cannot be picked up is not followed; the best few are left to be looked at when their turn comes
+                    lot = self.hand.reached(request, lot, failures)
                 feedback("task", f"following the task with {len(lot)} grasps")
-                branches = self.task.branches(request, lot, failures)
+                branches = self.task.branches(request, lot, failures) if lot else []
             for grasp, ways in self.task.clear(request, branches, failures):
+                if quick >= self.settings.quick_tries:
+                    break
                 frame = grasp.tool_from_tcp
                 if lot is not None and any(_same_place(frame, other, robot.closing) for other in chosen):
                     spare += [branch for branch in branches if branch.grasp is grasp]
@@ -245,7 +250,9 @@ class ArmPlanner:
                             plan = self._bearable(request.tool, choice.grasping, tool_from_contact, plan)
                     except StageError as failure:
                         failures.add(failure.stage, failure.error)
-                        if failure.stage == "approach" and failure.error.code == Code.PATH_IN_COLLISION:
+                        if failure.stage in ("task", "approach"):
+                            tried, quick = tried - 1, quick + 1
+                        if failure.stage == "approach":
                             break  # the same hand comes to the same grasp in its other ways
                         continue
                     chosen.append(frame)

@@ -20,6 +20,8 @@ from magic_planner.robot import Robot
 Array = NDArray[np.float64]
 #: How many of the motion's poses the hand's height over the table, and its way through other things' points, are looked at.
 HEIGHTS, PASSES = 10, 7
+#: How many times as many grasps are looked at in the closer of the two looks.
+CLOSER = 4
 #: Points on each other thing for the first test of the hand.
 POINTS = 200
 
@@ -40,9 +42,10 @@ class GraspChoice:
 
     def lots(self) -> Iterator[list[Grasp]]:
         """Grasps whose open hand is clear of everything and whose grip holds the tool at least at rest, in lots of no more than the
-        settings' sizes; raises NO_GRASP where there is none."""
+        settings' sizes: those of a quick look, and where none of them serves those of a closer one; raises NO_GRASP where there is none."""
         problem: MagicError | None = None
-        for finer in (1, 4):  # a tool that seems to have no grasp is looked at more closely before that is said
+        held = False
+        for finer, sizes in ((1, self.settings.lots), (CLOSER, self.settings.closer)):
             self.request.budget.check("grasp")
             try:
                 grasps = self._proposed(finer)
@@ -56,24 +59,22 @@ class GraspChoice:
                 self.robot, grasps, self.request.tool, self._checks(), blocked, self.request.budget, self.settings.standoff / 2
             )
             shares: list[Array] = []
-            held = False
-            for size in self.settings.lots:
+            for size in sizes:
                 if lot := list(itertools.islice(free, size)):
                     shares.append(self._at_rest(lot))
                     if kept := [grasp for grasp, share in zip(lot, shares[-1], strict=True) if share <= 1]:
                         held = True
                         yield kept
-            if held:
-                return
             if shares:
                 every = np.concatenate(shares)
-                raise MagicError(
+                problem = MagicError(
                     Code.NO_GRASP,
                     f"stage grasp: margin of grip: {100 * every.min():.0f} % of what pads pressed with {self.grasping.grip_force:g} N hold, "
                     f"at rest, in the best of {len(every)} grasps of {self.request.tool.id}",
                     f"{100 * (1 - every.min()):.0f} % left",
                     "0 % or more",
                 )
+                continue
             name = max(blocked, key=lambda k: blocked[k])
             problem = MagicError(
                 Code.NO_GRASP,
@@ -81,12 +82,20 @@ class GraspChoice:
                 f"hand and {name} in collision for {blocked[name]} of them",
                 "an open hand clear of everything",
             )
-        assert problem is not None
-        raise problem
+        if not held:
+            assert problem is not None
+            raise problem
 
     def _proposed(self, finer: int) -> list[Grasp]:
         request, settings = self.request, self.grasping
-        closer = replace(settings, samples=settings.samples * finer, pairs=settings.pairs * finer, angles=settings.angles + 8 * (finer > 1))
+        closer = replace(
+            settings,
+            samples=settings.samples * finer,
+            pairs=settings.pairs * finer,
+            enough=settings.enough * finer,
+            looked=settings.looked * finer,
+            angles=settings.angles * (2 if finer > 1 else 1),
+        )
         given = (self.robot, request.tool, self.tool_from_contact, request.plane, self.poses, closer, request.seed)
         return propose(*given, self.static, self.swept, request.budget)
 

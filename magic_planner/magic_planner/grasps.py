@@ -33,7 +33,8 @@ LEVEL = 0.17
 class GraspSettings:
     """agreement: least cosine between the inward normal at one finger and the outward normal at the other.
     samples: surface points tried.  pairs: antipodal pairs kept of them.
-    angles: approach directions about the closing axis.  poses: hand poses tested in one lot.  looked: hand poses whose pads are
+    angles: approach directions about the closing axis.  poses: hand poses tested in one lot, enough: how many of them have to be clear
+    for no further lot to be tested.  looked: hand poses whose pads are
     looked at.  standoff: metres of straight way to the grasp.  clearance: metres kept between hand and table.
     margin: metres left on each side of the object in the open hand.  away: metres
     around the contact in which no finger is placed.  force (N, what the contact pushes with) and density (kg/m^3) of the slip
@@ -43,6 +44,7 @@ class GraspSettings:
     samples: int = 500
     pairs: int = 300
     poses: int = 1500
+    enough: int = 100
     looked: int = 240
     standoff: float = 0.08
     angles: int = 16
@@ -270,7 +272,7 @@ class _Proposal:
             lot = lot[~in_the_way(robot, frames[lot], np.zeros((0, 3)), own, settings.standoff)]
             alone += len(lot)
             kept.append(lot[~in_the_way(robot, frames[lot], self.static, self.swept, settings.standoff)])
-            if sum(len(k) for k in kept) >= 100:
+            if sum(len(k) for k in kept) >= settings.enough:
                 break
         keep = np.concatenate(kept)
         if not len(keep):

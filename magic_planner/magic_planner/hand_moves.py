@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_planner.request import ArmSettings, Branch, Request, StageError
+from magic_planner.grasps import Grasp
+from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
 from magic_planner.workspace import Workspace
 
 Array = NDArray[np.float64]
@@ -32,6 +34,15 @@ class HandMoves:
         paths, stopped, _ = self.robot.chain.track(np.repeat(targets[:, None], len(q), axis=1), q, jump=self.settings.jump)
         return [paths[:, n] if stopped[n] == parts else None for n in range(len(q))]
 
+    def reached(self, request: Request, grasps: Sequence[Grasp], failures: Failures) -> list[Grasp]:
+        """Those grasps to which the hand can be brought where the tool lies, all looked at together."""
+        tips = request.tool.world_from_object @ np.stack([grasp.tool_from_tcp for grasp in grasps])
+        index, _ = self.robot.inverse(tips, request.start[None])
+        kept = set(index.tolist())
+        if len(kept) < len(grasps):
+            failures.add("approach", _out_of_reach(request))
+        return [grasp for n, grasp in enumerate(grasps) if n in kept]
+
     def pick(self, request: Request, branch: Branch) -> tuple[Array, Array, Array]:
         """Joint paths of coming to the grasp (n, J), the grasp itself (J,) and the lift (m, J)."""
         robot, settings = self.robot, self.settings
@@ -39,10 +50,7 @@ class HandMoves:
         tip = request.tool.world_from_object @ branch.grasp.tool_from_tcp
         _, solutions = robot.inverse(tip[None], np.stack([branch.path[0], request.start]), seeds=16)
         if not len(solutions):
-            raise StageError(
-                "approach",
-                MagicError(Code.NO_IK, f"the grasp of {request.tool.id} where it lies", "out of reach", "a tool that the arm can reach"),
-            )
+            raise StageError("approach", _out_of_reach(request))
         # The posture nearest to both neighbours costs the least motion.
         far = np.abs(solutions - branch.path[0]).max(axis=1) + np.abs(solutions - request.start).max(axis=1)
         problem: StageError | None = None
@@ -151,3 +159,7 @@ class HandMoves:
             )
         assert problem is not None
         raise problem
+
+
+def _out_of_reach(request: Request) -> MagicError:
+    return MagicError(Code.NO_IK, f"the grasp of {request.tool.id} where it lies", "out of reach", "a tool that the arm can reach")

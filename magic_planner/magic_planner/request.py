@@ -26,7 +26,8 @@ STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", 
 @dataclass(frozen=True)
 class ArmSettings:
     """key_length, key_angle: spacing of the poses at which grasps are compared.  lots: how many are compared at once, the best ones
-    first.  tries: complete plans tried.  standoff: metres before the grasp from which the hand comes straight.
+    first; closer: the same where none of these serves and more are looked for.  tries: plans that may fail after the hand has come to
+    its grasp; quick_tries: those that may fail before, by arm and tool along the task or on the way to the grasp, of each lot.  standoff: metres before the grasp from which the hand comes straight.
     lift, retreat: metres.  room: metres about a tool that is
     carried, and about all that the empty hand passes.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
     neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path (it
@@ -36,7 +37,9 @@ class ArmSettings:
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
     lots: tuple[int, ...] = (12, 28, 40, 40)
+    closer: tuple[int, ...] = (40, 120, 320)
     tries: int = 10
+    quick_tries: int = 40
     standoff: float = 0.08
     lift: float = 0.06
     retreat: float = 0.16

@@ -132,6 +132,41 @@ def test_another_attempt_is_another_grasp(arm, solved):
     assert np.linalg.norm(a[:3, 3] - b[:3, 3]) > 0.014 or transforms.rotation_angle(a, b) > np.deg2rad(19)
 
 
+def test_where_no_grasp_of_the_quick_look_serves_more_are_looked_for(arm, solved, monkeypatch):
+    given, _ = solved
+    asked = []
+    follow = arm.task.branches
+
+    def branches(request, grasps, failures):
+        asked.append(len(grasps))
+        if len(asked) > len(arm.settings.lots):
+            return follow(request, grasps, failures)
+        failures.add("task", MagicError(Code.NO_IK, "every grasp of the quick look", "out of reach", "others"))
+        return []
+
+    monkeypatch.setattr(arm.task, "branches", branches)
+    assert arm.plan(*given).arm_motion is not None
+    assert len(asked) == len(arm.settings.lots) + 1
+
+
+def test_what_fails_before_the_tool_is_lifted_uses_up_no_try(arm, solved, monkeypatch):
+    """Each is found in a few milliseconds, and of a tool that the forearm meets with one grasp it is met with most."""
+    given, plan = solved
+    failed = []
+    check = arm.task.check
+
+    def met(request, branch):
+        if len(failed) < 2 * arm.settings.tries:
+            failed.append(branch)
+            raise StageError("task", MagicError(Code.PATH_IN_COLLISION, "forearm and tool", "in collision", "a clear path"))
+        check(request, branch)
+
+    monkeypatch.setattr(arm.task, "check", met)
+    other = arm.plan(*given)
+    assert len(failed) == 2 * arm.settings.tries
+    assert not np.array_equal(other.arm_motion.tool_from_tcp, plan.arm_motion.tool_from_tcp)
+
+
 def test_a_releasing_strategy_lets_go_and_backs_off(arm):
     strategy = scenes.pulling()
     waypoints = (*strategy.waypoints[:3], Waypoint("let go", np.zeros(3), "release"))

@@ -49,7 +49,7 @@ FATAL = frozenset(
 )
 
 #: Failures of planning after which the next attempt would fail in the same way.
-EXHAUSTED = frozenset({Code.NO_GRASP, Code.BAD_MESH, Code.BAD_MOTION, Code.INTERNAL})
+EXHAUSTED = frozenset({Code.NO_GRASP, Code.NO_IK, Code.PATH_IN_COLLISION, Code.BAD_MESH, Code.BAD_MOTION, Code.INTERNAL})
 
 
 class HopelessError(MagicError):

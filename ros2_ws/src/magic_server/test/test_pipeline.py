@@ -83,10 +83,10 @@ def test_reflections_only_for_mirrored_matches():
 
 
 def test_grasps_come_in_rounds_and_only_for_the_arm():
-    script = Script([candidate(), candidate()], plan=lambda t: Code.NO_IK)
+    script = Script([candidate(), candidate()], plan=lambda t: Code.NO_PATH)
     execute(script, variant="arm")
     assert tried(script) == [(0, "keep", 0), (1, "keep", 0), (0, "keep", 1), (1, "keep", 1)]
-    script = Script([candidate()], plan=lambda t: Code.NO_IK)
+    script = Script([candidate()], plan=lambda t: Code.NO_PATH)
     execute(script, variant="fg")
     assert tried(script) == [(0, "keep", 0)]
 
@@ -97,8 +97,9 @@ def test_a_slipped_grasp_is_followed_by_the_next_grasp_of_the_same_contact():
     assert tried(script) == [(0, "keep", 0), (0, "keep", 1), (1, "keep", 0), (1, "keep", 1)]
 
 
-def test_no_further_attempt_where_none_can_help():
-    script = Script([candidate()], plan=lambda t: Code.NO_GRASP)
+@pytest.mark.parametrize("code", [Code.NO_GRASP, Code.NO_IK, Code.PATH_IN_COLLISION])
+def test_no_further_attempt_where_none_can_help(code):
+    script = Script([candidate()], plan=lambda t: code)
     execute(script, variant="arm", attempts=5)
     assert tried(script) == [(0, "keep", 0)]
 
@@ -198,7 +199,7 @@ def test_progress_names_stage_and_reasons_so_far():
     "scores, code, expected",
     [
         # Of like score: every contact first, then the second grasps.
-        ((1.0, 0.9, 0.8), Code.NO_IK, [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]),
+        ((1.0, 0.9, 0.8), Code.NO_PATH, [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]),
         # A far better contact gets its second grasp before far worse ones are tried.
         ((0.72, 0.19, 0.15), Code.LOST_CONTACT, [(0, 0), (0, 1), (1, 0), (2, 0), (1, 1), (2, 1)]),
         ((1.0, 0.9), Code.GRASP_SLIPPED, [(0, 0), (0, 1), (1, 0), (1, 1)]),
@@ -250,7 +251,7 @@ def test_to_look_ahead_changes_nothing():
         for _ in range(2):
             following = looked.foreseen(*entry)
         for agenda in (looked, plain):
-            agenda.failed(*entry, Code.NO_IK)
+            agenda.failed(*entry, Code.NO_PATH)
         assert following == (looked._heap[0][-1] if looked._heap else None)
     assert plain.next() is None
 
@@ -262,7 +263,7 @@ def test_what_was_tried_before_is_left_out():
     order = []
     while (entry := agenda.next()) is not None:
         order.append((entry[1].index, entry[1].attempt))
-        agenda.failed(*entry, Code.NO_IK)
+        agenda.failed(*entry, Code.NO_PATH)
     assert order == [(1, 1), (2, 0), (2, 1)]
     outcome = execute(Script([candidate()]), spent=lambda c: 9)
     assert (outcome.code, outcome.message) == (Code.NO_CANDIDATE_SUCCEEDED, "each of 1 candidates has been tried before")
@@ -280,7 +281,7 @@ def test_runs_of_one_goal_are_told_together():
 def test_agenda_is_empty_in_the_end():
     agenda = Agenda([candidate()], ("keep",), 1)
     turn, trial = agenda.next()
-    agenda.failed(turn, trial, Code.NO_IK)
+    agenda.failed(turn, trial, Code.NO_PATH)
     assert agenda.next() is None
 
 
