@@ -327,7 +327,7 @@ class Task:
 
     ``eyes``: how well tool and target are known, and by how much these widths are to be multiplied; ``start``: the moment of the
     motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``longer``: how many times as long their
-    steps are.
+    steps are; ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
     """
 
     strategy: Strategy
@@ -342,6 +342,7 @@ class Task:
     start: float = 0.0
     held: Any = None
     longer: float = 1.0
+    shares: tuple[NDArray[np.float64], ...] | None = None
 
     def drawn(self, index: int) -> Draw | None:
         """The draw of a rollout; ``None`` for the first one."""
@@ -349,7 +350,7 @@ class Task:
 
     def under(self, drawn: Draw) -> Setup:
         """The scene of a drawn rollout."""
-        setup = uncertainty.applied(drawn, self.setup)
+        setup = uncertainty.applied(drawn, self.setup, self.shares)
         settings = replace(setup.settings, frequency=setup.settings.frequency / self.longer)
         if self.plan.variant == "arm":
             # The engine solves a step in as many parts as there are iterations.  Pads hardly give: at longer parts the load on a grip
@@ -768,7 +769,10 @@ def make_task(
     start = _start(strategy, setup, plan)
     hard = arm_options is not None and arm_options.past is not None  # what contacts alone hold hangs on how long a step is
     longer = 1.0 if hard else _longer(setup, plan, start)
-    return Task(strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, start, longer=longer)
+    shares = uncertainty.shares(tool, eyes[0][1], setup.tool.hulls)
+    return Task(
+        strategy, setup, plan, limits or Limits(), int(seed), spreads, eyes, arm_options, robot, start, longer=longer, shares=shares
+    )
 
 
 def verify(

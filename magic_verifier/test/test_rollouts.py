@@ -238,6 +238,32 @@ def test_a_shape_error_does_what_it_says():
     assert np.std(np.concatenate(zero)) == pytest.approx(0.0012, rel=0.15), "the width of the pieces' places"
 
 
+def test_where_a_camera_saw_a_surface_it_is_known_best():
+    """The back of a cup that nobody saw made the rim, which both cameras saw to a millimetre, corrugated by three: drawn fingers slipped off it."""
+    spreads = uncertainty.read()
+    strategy, tool, target, *obstacles, plan = scenes.hooking("L")
+    top = tool.mesh.bounds[1, 2]
+    seen = np.array([v for v in transforms.apply(tool.world_from_object, tool.mesh.vertices) if v[2] > top - 1e-3])
+    middle = seen[:, 0].mean()
+    off = replace(tool, source="camera", surface_error=3 * spreads.drawn_error)
+
+    def shifts(points):
+        item = replace(off, points=points, colors=np.zeros((len(points), 3), np.uint8))
+        task = verification.make_task(strategy, item, target, tuple(obstacles), scenes.TABLE, plan)
+        errors = [replace(task.drawn(k).tool_error, size=np.zeros(3), thickness=0.0) for k in range(1, 150)]
+        moved = [error.applied(task.setup.tool, task.shares).corners - task.setup.tool.corners for error in errors]
+        return np.sqrt(np.mean(np.square(moved), axis=(0, 2))), task.setup.tool.corners
+
+    wide, corners = shifts(np.zeros((0, 3)))
+    assert wide == pytest.approx(3 * spreads.camera.pieces.width, rel=0.25)
+    half = seen[seen[:, 0] < middle]
+    narrow, _ = shifts(half)
+    away = np.min(np.linalg.norm(corners[:, None] - transforms.apply(transforms.inverse(tool.world_from_object), half), axis=-1), axis=1)
+    near, far = away < uncertainty.SEEN, away > uncertainty.UNSEEN
+    assert near.any() and far.any()
+    assert narrow[near] == pytest.approx(wide[near] / 3) and narrow[far] == pytest.approx(wide[far])
+
+
 def test_errors_of_a_large_thing_are_no_smoother_than_those_of_a_small_one():
     """A bowl of 0.1 m is off in its shape whatever the handle's length; waves that grew with a spoon of 0.4 m displaced it as a whole."""
     spread = {}

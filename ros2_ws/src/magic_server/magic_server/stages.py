@@ -404,7 +404,8 @@ class Stages:
         timeout = min(timeout, server.settings.verify)
         goal = VerifyMotion.Goal(
             strategy=request.strategy,
-            tool=light(self._tool_of(trial), cloud=False, surface=True),
+            # Where points were seen of it, its surface is known best.
+            tool=light(self._tool_of(trial), cloud=True, surface=True),
             target=light(self._find(matches.target_id), cloud=False, surface=True),
             # Obstacles are simulated by their pieces; their surface is for the film alone.
             obstacles=[light(o, cloud=False, surface=False) for o in self._obstacles(trial, matches)],

@@ -47,7 +47,9 @@ from magic_server.outlet import Motion, Outlet
 from magic_server.permission import RECORDED, Claim, Limits, Look, NotYet, Verdict, World
 from magic_server.publication import Publication
 from magic_server.remote import SEND_GOAL, RemoteAction, RemoteService, Token, servers_of
+from magic_server.scene_change import Changed
 from magic_server.stages import Stages, complaint_code, hull_of, mark_of
+from magic_server.watch import Bounds
 
 #: Whose explanation is looked for when no objects come, besides that of those who publish objects: the node of this name beside this one.
 PERCEPTION = "perception"
@@ -463,14 +465,30 @@ class StrategyServer(LifecycleNode):
                 spent=spent,
             ).execute()
 
-        outcome = work(request, stages, strategy.reflections)
-        fill(result, outcome)
-        # First what somebody waits for, then the pictures.
-        if outcome.code == Code.OK:
+        bounds = Bounds(0, self._loop.replans, time.monotonic() + request.timeout)
+        tried: list[pipeline.Outcome] = []
+        changes: list[str] = []
+        while True:
+            left = max(1.0, min(request.timeout, bounds.end - time.monotonic()))
+            outcome = work(replace(request, timeout=left), stages, strategy.reflections)
+            tried.append(outcome)
+            fill(result, pipeline.joined(tried, outcome))
+            result.notes = list(changes)
+            # First what somebody waits for, then the pictures.
+            if outcome.code != Code.OK:
+                result.message = "; planned again from there: ".join([*changes, outcome.message])
+                break
             # What physics has not passed moves the arm only where goal and server both say so; it is published nowhere.
             waived = goal.allow_unverified and self.settings.execute_unverified
             claim = self._claim(outcome, stages, waived)
-            published = outcome.verified and self._publish(claim, token, result)
+            try:
+                published = outcome.verified and self._publish(claim, token, result, bounds)
+            except Changed as change:
+                # No arm has moved yet: what has come meanwhile is planned with.
+                changes.append(f"{change.code.name}: {change.message}")
+                notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; planning again from the scene as it is", ()))
+                stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures)
+                continue
             if self._arm is not None and (published or (waived and not outcome.verified)) and outcome.plan.variant == MotionPlan.ARM:
                 loop = ClosedLoop(
                     self,
@@ -497,8 +515,9 @@ class StrategyServer(LifecycleNode):
                         )
                     ),
                 )
-                self._carry_out(loop, result)
+                self._carry_out(loop, result, tried[:-1])
                 outcome, stages = loop.jobs[-1].outcome, loop.jobs[-1].stages
+            break
         self._show(stages, outcome)
         if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()
@@ -569,14 +588,23 @@ class StrategyServer(LifecycleNode):
                     raise
             token.wait(lambda: False, min(deadline, time.monotonic() + ASKING_PERIOD))
 
-    def _publish(self, claim: Claim, token: Token, result: RunStrategy.Result) -> bool:
-        """Publish a verified motion, if that is allowed, and write into the result how that went."""
+    def _publish(self, claim: Claim, token: Token, result: RunStrategy.Result, bounds: Bounds) -> bool:
+        """Publish a verified motion, if that is allowed, and write into the result how that went; raises :class:`Changed` where the scene is another one by
+        then and may be looked at and planned with once more."""
         sentence, metrics = pipeline.split_metrics(result.message)
         try:
-            result.notes = list(self._when_allowed(lambda: self.publication.offer(claim), token))
+            notes = self._when_allowed(lambda: self.publication.offer(claim), token)
             # Who has told the server that all is recorded need not be told in each sentence.
-            sentence = "; ".join([sentence, *(n for n in result.notes if n != RECORDED or not self.settings.recorded)])
+            sentence = "; ".join([sentence, *(n for n in notes if n != RECORDED or not self.settings.recorded)])
+            result.notes = [*result.notes, *notes]
         except Exception as error:
+            if isinstance(error, Changed):
+                try:
+                    bounds.elsewhere(error, error.code, time.monotonic())
+                except MagicError as over:
+                    error = over
+                else:
+                    raise
             result.code, message = describe(self, error)
             sentence = f"verified ({sentence}), but not published: {message}"
             result.verified = False
@@ -611,8 +639,8 @@ class StrategyServer(LifecycleNode):
             )
         )
 
-    def _carry_out(self, loop: ClosedLoop, result: RunStrategy.Result) -> None:
-        """Have arm and gripper do what was planned, and write into the result how that went."""
+    def _carry_out(self, loop: ClosedLoop, result: RunStrategy.Result, before: Sequence[pipeline.Outcome]) -> None:
+        """Have arm and gripper do what was planned, and write into the result how that went; ``before``: what was planned for scenes that did not last."""
         first = loop.jobs[0].outcome
         kind = "verified" if first.verified else "UNVERIFIED"
         self.get_logger().warning(f"the arm is about to move, if it may: carrying out the {kind} plan")
@@ -625,7 +653,7 @@ class StrategyServer(LifecycleNode):
         finally:
             self._moves = False
         last = loop.jobs[-1].outcome
-        fill(result, pipeline.joined(loop.tried, last))
+        fill(result, pipeline.joined([*before, *loop.tried], last))
         result.notes = [*notes, *loop.notes]
         result.executed = loop.executed
         sentence, metrics = pipeline.split_metrics(last.message)
