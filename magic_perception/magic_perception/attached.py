@@ -96,9 +96,13 @@ class _Part:
             points.append(look.points(*where))
             heights.append(look.heights[where])
             colors.append(look.frame.color[where])
-        rgb = np.concatenate(colors).astype(np.float32)
-        shade = np.median(rgb / np.maximum(rgb.sum(axis=1, keepdims=True), 1), axis=0) if len(rgb) else np.full(3, np.inf, np.float32)
-        return cls(np.concatenate(points), np.concatenate(heights), shade)
+        return cls(np.concatenate(points), np.concatenate(heights), shade(np.concatenate(colors)))
+
+
+def shade(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The middle chromaticity (3,) of colours (N, 3), infinite of none."""
+    rgb = colors.astype(np.float32)
+    return np.median(rgb / np.maximum(rgb.sum(axis=1, keepdims=True), 1), axis=0) if len(rgb) else np.full(3, np.inf, np.float32)
 
 
 def _around(image: NDArray[np.int32], label: int, margin: int) -> tuple[slice, slice] | None:

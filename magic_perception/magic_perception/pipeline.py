@@ -11,27 +11,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core import transforms
+from magic_core import scene, transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import FIXTURE, PICTURE, REGION, UNSEEN, Scene, SceneObject
 from magic_core.views import find_view
-from magic_perception import cameras, clusters, keyframes
+from magic_perception import attached, cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
 from magic_perception.glass import once, unmeasured
 from magic_perception.hidden import ROBOT, hangs, mostly_held, parted, veil
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
+from magic_perception.room import bordered, room
 from magic_perception.seen import cut_off, joined, witnessed
 from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
 from magic_perception.sight import agreement
 from magic_perception.smear import behind
-from magic_perception.solids import hull_of
+from magic_perception.solids import hangs_together, hull_of
 from magic_perception.surface_error import Departure, departure, likely
 
 #: Round an object in its picture, as a share of its longer side.
 MARGIN = 0.15
+#: Behind others a thing may go on by this, m, and is told whole; and by the second where some camera has the thing itself before it.
+BEHIND, AROUND = 0.015, 0.03
+#: Between parts of one solid that are farther from each other, m, is one that nobody saw.
+GAP = 0.006
 
 
 @dataclass
@@ -165,6 +170,7 @@ def perceive(
             return error
 
     with report.stage("meshes"):
+        before = [image.copy() for image in labels]
         numbers = list(range(1, max((int(image.max()) for image in labels), default=0) + 1))
         solids: list[_Built] = []
         ids: dict[int | str, str] = {}
@@ -177,12 +183,14 @@ def perceive(
                 solids.append(built)
                 ids[label] = f"object_{len(solids)}"
                 report.numbers[ids[label]] = label
+        hidden = each(lambda built: _hidden(built, solids, looks, before, fixtures, world_from_table), solids, parameters.workers)
 
     with report.stage("views"):
         objects = []
-        for built, item in zip(solids, each(lambda b: _as_object(b, world_from_table), solids, parameters.workers), strict=True):
+        made = each(lambda built: _as_object(built, world_from_table), solids, parameters.workers)
+        for built, names, item in zip(solids, hidden, made, strict=True):
             # What hides a thing and was left out itself is as nameless as a fixture.
-            by = tuple(dict.fromkeys(by if isinstance(by, str) else ids.get(by, FIXTURE) for by in built.cut_off))
+            by = tuple(dict.fromkeys(by if isinstance(by, str) else ids.get(by, FIXTURE) for by in names))
             item = replace(
                 item, id=f"object_{len(objects) + 1}", cut_off=by, seen_share=built.evidence.witnessed.seen, hanging=built.hanging
             )
@@ -215,8 +223,10 @@ def _at_rest(labels: NDArray[np.int32], hanging: set[int]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class _Built:
-    """A solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, its pixels there, and the picture (h, w, 3) about it."""
+    """The label of a thing, its solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, its pixels there,
+    and the picture (h, w, 3) about it."""
 
+    label: int
     solid: Reconstruction
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
@@ -224,7 +234,6 @@ class _Built:
     camera: str
     pixels: int
     picture: NDArray[np.uint8]
-    cut_off: list[int | str]
     evidence: Evidence
     departed: Departure
     hanging: bool
@@ -295,7 +304,43 @@ def _build(
     mask, frame = labels[best] == label, looks[best].frame
     departed = departure(solid.mesh, sights)
     picture = _about(mask, frame.color)
-    return _Built(solid, points, colors, mask, frame.camera, counts[best], picture, cut, evidence, departed, hanging)
+    return _Built(label, solid, points, colors, mask, frame.camera, counts[best], picture, evidence, departed, hanging)
+
+
+def _hidden(
+    built: _Built,
+    solids: list[_Built],
+    looks: list[Looked],
+    labels: list[NDArray[np.int32]],
+    fixtures: tuple[Mesh, ...],
+    world_from_table: NDArray[np.float64],
+) -> list[int | str]:
+    """What keeps a part of a thing out of sight, once it is known where other things are: that something ends its outline in a picture does not say so, and that nothing
+    does does not say that there is none, as of what is thin.
+
+    It may go on behind others where no camera looks: so far that it matters, or not.  What may be the rest of it, of its colour and beside it, leaves it cut off, and
+    so do parts that nothing joins.
+    """
+    cut = built.evidence.cut
+    if built.hanging or not bordered(labels, built.label) or any(by in (PICTURE, REGION, scene.ROBOT, UNSEEN) for by in cut):
+        return cut
+    table_from_world = transforms.inverse(world_from_table)
+    others = [other.solid.mesh for other in solids if other is not built] + [mesh.transformed(table_from_world) for mesh in fixtures]
+    left = room(built.solid.mesh, looks, labels, built.label, others, world_from_table, BEHIND)
+    if left.behind > BEHIND:
+        return list(dict.fromkeys([*cut, *(by if by > 0 else FIXTURE for by in left.by)]))
+    whole = left.around < AROUND and hangs_together(built.solid.mesh, GAP)
+    return [] if whole and not any(_one_thing(built, other) for other in solids if other is not built) else cut
+
+
+def _one_thing(one: _Built, other: _Built) -> bool:
+    """Whether two things may be parts of one: of one colour, and near each other."""
+    from scipy.spatial import cKDTree
+
+    if np.linalg.norm(attached.shade(one.colors) - attached.shade(other.colors)) > attached.COLOR:
+        return False
+    few, many = (built.points[:: max(1, len(built.points) // 2000)] for built in (one, other))
+    return bool(cKDTree(many).query(few, distance_upper_bound=attached.GAP)[0].min() < attached.GAP)
 
 
 def _about(mask: NDArray[np.bool_], color: NDArray[np.uint8]) -> NDArray[np.uint8]:

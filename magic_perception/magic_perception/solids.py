@@ -42,6 +42,24 @@ def hull_of(points: NDArray[np.float64]) -> Mesh | None:
     return Mesh(vertices, faces)
 
 
+def hangs_together(mesh: Mesh, gap: float) -> bool:
+    """Whether no part of a mesh is farther than ``gap`` metres from all others, from vertex to vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(mesh.vertices)
+    near = tree.query_pairs(1e-6, output_type="ndarray")  # corners that faces do not share
+    a, b = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], near]).T
+    n = len(mesh.vertices)
+    count, part = connected_components(coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n)), directed=False)
+    if count == 1:
+        return True
+    pairs = tree.query_pairs(gap, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs), np.int8), (part[pairs[:, 0]], part[pairs[:, 1]])), shape=(count, count))
+    return connected_components(links, directed=False)[0] == 1
+
+
 #: How far what a quick hull (manifold3d) fills may be from what Qhull says, over half of its surface, m: the rounding of both, with room.
 _QUICK = 1e-6
 

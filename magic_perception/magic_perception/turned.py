@@ -324,7 +324,7 @@ def build_round(
     if len(out) > 20:
         out = _standing_off(out, body)
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
-        if np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010 and len(out) > 0.02 * len(points):
+        if len(out) > 0.02 * len(points) and np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010:
             handle = handle_of(sights, out, body, parameters)
             if handle is None and len(out) > 0.15 * len(points):
                 return None

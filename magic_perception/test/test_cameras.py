@@ -5,15 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+import trimesh
 
 from magic_core import sensor, shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
+from magic_core.mesh import Mesh, concatenate
+from magic_core.scene import SceneObject
+from magic_core.views import find_view
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.seen import joined
 from magic_perception.segmentation import Looked
+from magic_perception.solids import hangs_together
+from magic_perception.surface_error import distance
 from magic_perception.table import camera_over_table, table_in_view
 
 REGION = Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5))
@@ -189,6 +194,66 @@ def test_what_hides_a_thing_is_named_unless_another_camera_looks_behind_it():
     assert [o.cut_off for o in both.objects] == [(), ()]
 
 
+def lying(family, seed, yaw, x, y):
+    """A procedural object on the table, turned, with the middle of its box there."""
+    mesh = shapes.make(family, seed).mesh.transformed(transforms.from_rpy(0, 0, yaw))
+    middle = mesh.bounds.mean(axis=0)
+    return mesh.transformed(transforms.make(translation=[x - middle[0], y - middle[1], -mesh.bounds[0, 2]]))
+
+
+def tin(radius, height, x, y):
+    cylinder = trimesh.creation.cylinder(radius, height, sections=48)
+    return scenes.placed(Mesh(cylinder.vertices, cylinder.faces).painted((60, 140, 70)), x, y)
+
+
+def before_the_station(thing, before, seed, names=("left", "right"), model=None, fixture=False):
+    """What is told of a thing, and what stands before it, which may be a known fixture."""
+    caster = sensor.scene_raycaster([thing, before])
+    frames = [
+        sensor.capture([], sensor.D435, sensor.STATION[name], [seed, i], model=model, camera=name, raycaster=caster)
+        for i, name in enumerate(names)
+    ]
+    known = (SceneObject("post", before, (before,), np.eye(4), find_view(before, (before,)), source="known"),) if fixture else ()
+    found = [item for item in perceive(frames, known, Parameters(region_low=(0.0, -0.7, -0.05))).objects if item.source == "camera"]
+    middle = thing.bounds.mean(axis=0)[:2]
+    return min(found, key=lambda item: np.linalg.norm(item.world_from_box[:2, 3] - middle)), found
+
+
+@pytest.mark.parametrize(
+    ("thing", "before", "seed", "fixture"),
+    [
+        (("l_hook", 88, -0.275, 0.55, -0.107), (0.027, 0.049, 0.707, -0.027), 88, False),
+        (("caliper", 107, 0.157, 0.505, 0.03), (0.027, 0.115, 0.582, 0.133), 107, False),
+        (("mug", 14, 2.927, 0.516, 0.116), (0.007, 0.346, 0.586, 0.111), 14, True),
+    ],
+    ids=["hook", "caliper", "cup behind a post"],
+)
+def test_a_thing_is_whole_where_what_stands_before_it_leaves_no_room_for_more(thing, before, seed, fixture):
+    """In each picture a strip of it is hidden, in both the same corner: a few millimetres."""
+    thing, before = lying(*thing), tin(*before)
+    item, _ = before_the_station(thing, before, seed, fixture=fixture)
+    assert item.cut_off == ()
+    found = item.mesh.transformed(item.world_from_object)
+    assert distance(thing, found) < 0.003
+
+
+def test_a_wire_that_goes_on_behind_a_tin_is_cut_off():
+    """What is thin has a short outline where it ends."""
+    hanger = lying("hanger", 7, -1.830, 0.495, -0.094)
+    item, found = before_the_station(hanger, tin(0.037, 0.126, 0.4, -0.205), 7, ("left",), sensor.SMEARED)
+    front = max(found, key=lambda other: other.box_extents[2])
+    assert item.box_extents.max() < hanger.extents.max() - 0.03 and item.cut_off == (front.id,)
+
+
+@pytest.mark.parametrize(("color", "cut"), [((120, 60, 50), True), ((60, 90, 150), False)], ids=["one colour", "two colours"])
+def test_what_may_be_the_rest_of_a_thing_leaves_it_cut_off(color, cut):
+    """Two bars in one line, or one: between them is no room for more, and a tin is before that."""
+    bars = [slab([0.02, 0.14, 0.016], [0.55, y, 0.008], paint) for y, paint in ((-0.077, (120, 60, 50)), (0.077, color))]
+    _, found = before_the_station(concatenate(bars), tin(0.04, 0.15, 0.606, 0.0), 3)
+    front = max(found, key=lambda item: item.box_extents[2])
+    assert [item.cut_off for item in found if item is not front] == [(front.id,) if cut else ()] * 2
+
+
 @pytest.mark.parametrize(("color", "count"), [((120, 60, 50), 1), ((60, 90, 150), 2)], ids=["part", "other colour"])
 def test_what_hangs_beside_a_thing_of_its_colour_is_its_part(color, count):
     body = slab([0.08, 0.08, 0.10], [0.55, 0, 0.05], (120, 60, 50))
@@ -224,3 +289,10 @@ def test_confidence_falls_with_what_was_seen(pair):
     good = {o.id: o.confidence for o in perceive(pair, parameters=REGION).objects}
     apart = {o.id: o.confidence for o in perceive(moved(pair, transforms.make(translation=[0.0065, 0.004, 0])), parameters=REGION).objects}
     assert all(apart[name] < good[name] for name in good)
+
+
+def test_a_thing_whose_parts_nothing_joins_is_not_whole():
+    bar, rest = (slab([0.1, 0.02, 0.016], [x, 0, 0.008], (120, 60, 50)) for x in (0.0, 0.13))
+    assert not hangs_together(concatenate([bar, rest]), 0.006)
+    near = slab([0.1, 0.02, 0.016], [0.104, 0, 0.008], (120, 60, 50))
+    assert hangs_together(bar, 0.006) and hangs_together(concatenate([bar, near]), 0.006)

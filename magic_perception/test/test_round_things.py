@@ -227,3 +227,17 @@ def test_a_hollow_is_held_against_all_that_is_seen_in_it():
         lump = np.where(np.hypot(x, y) < 0.014, top - 30 * (x**2 + y**2), z)
         full = transforms.apply(bowl.table_from_bowl, np.column_stack([x, y, np.maximum(z, lump)]))
         assert not holds(full), top
+
+
+def test_specks_about_a_stick_are_no_handle():
+    """What stands off a round body in clusters too small to tell anything: nothing is left of it, and nothing is asked of that."""
+    hook = shapes.make("s_hook", 1129).mesh.transformed(transforms.from_rpy(0, 0, 2.939))
+    middle = hook.bounds.mean(axis=0)
+    hook = hook.transformed(transforms.make(translation=[0.454 - middle[0], 0.04 - middle[1], -hook.bounds[0, 2]]))
+    stick = trimesh.creation.cylinder(0.0086, 0.2622, sections=48)
+    caster = sensor.scene_raycaster([hook, scenes.placed(Mesh(stick.vertices, stick.faces).painted((60, 90, 160)), 0.51, 0.026)])
+    frames = [
+        sensor.capture([], sensor.D435, pose, [1129, i], camera=name, raycaster=caster)
+        for i, (name, pose) in enumerate(sensor.STATION.items())
+    ]
+    assert len(perceive(frames, parameters=Parameters(region_low=(0.0, -0.7, -0.05))).objects) == 2
