@@ -122,14 +122,15 @@ class TaskPath:
         return [(moved, coarse_to_fine(np.flatnonzero(after == moved))) for moved in (False, True)]
 
     def _met_key(self, request: Request, branch: Branch, orders: list[tuple[bool, list[int]]]) -> int | None:
-        """A key pose at which the arm without the tool meets something; it goes to the front of its order, for where one branch
-        fails others fail too."""
+        """A key pose at which the arm without the tool meets something; it goes to the front of its order, and that before the other
+        one, for where one branch fails others fail too."""
         self.space.empty(request)
-        for moved, order in orders:
+        for which, (moved, order) in enumerate(orders):
             self.space.ignore_target(request, moved)
             for place, key in enumerate(order):
                 if self.robot.collides(branch.path[key]):
                     order.insert(0, order.pop(place))
+                    orders.insert(0, orders.pop(which))
                     return key
         self.space.ignore_target(request, False)
         return None

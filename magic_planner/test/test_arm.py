@@ -20,8 +20,9 @@ from magic_planner.collision import Body, grown, roomy_shell, shell
 from magic_planner.free_motion import LONGEST
 from magic_planner.margins import margins
 from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
-from magic_planner.request import StageError
+from magic_planner.request import ArmSettings, StageError
 from magic_planner.schedule import slowed
+from magic_planner.task_path import TaskPath
 
 
 def problem(at=(0.6, 0.0), **changes):
@@ -441,6 +442,27 @@ def test_grasps_that_cannot_hold_the_tool_at_rest_are_not_planned_with(arm):
         arm.plan(heavy, *rest, feedback=lambda stage, message: heard.append(stage))
     assert caught.value.code == Code.NO_GRASP and "at rest" in caught.value.message and "margin of grip" in caught.value.message
     assert set(heard) == {"grasp"}
+
+
+@pytest.mark.parametrize("there", [2, 5])
+def test_where_one_way_to_follow_the_task_meets_something_the_next_is_looked_at_first(there):
+    """Be it before or after the target is met."""
+    asked = []
+
+    def collides(q):
+        asked.append(int(q[0]))
+        return asked[-1] == there
+
+    space = SimpleNamespace(
+        robot=SimpleNamespace(collides=collides), empty=lambda request: None, ignore_target=lambda request, ignored: None
+    )
+    orders = [(False, [0, 2, 1, 3]), (True, [4, 6, 5, 7])]
+    task, branch = TaskPath(space, ArmSettings()), SimpleNamespace(path=np.arange(8.0)[:, None])
+    assert task._met_key(None, branch, orders) == there
+    asked.clear()
+    assert task._met_key(None, branch, orders) == there
+    assert asked == [there]
+    assert sorted(key for _, order in orders for key in order) == list(range(8))
 
 
 def in_hand(solved, arm, after, shift=(0.0, 0.0, 0.0)):
