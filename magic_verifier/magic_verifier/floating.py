@@ -201,11 +201,16 @@ def speed(motion: ToolMotion, tool: Body, start: float = 0.0) -> float:
     times, poses = times[used], motion.world_from_tool[used]
     if len(times) < 2:
         return 0.0
+    return float((_ways(poses, tool) / np.diff(times)).max())
+
+
+def _ways(poses: NDArray[np.float64], tool: Body) -> NDArray[np.float64]:
+    """(T - 1,): how far the fastest corner of the tool's box comes from each of the poses (T, 4, 4) to the next, m; no point of the tool comes farther."""
     low, high = tool.corners.min(axis=0), tool.corners.max(axis=0)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     steps = np.diff(poses, axis=0)
-    ways = np.linalg.norm(corners @ steps[:, :3, :3].transpose(0, 2, 1) + steps[:, None, :3, 3], axis=2).max(axis=1)
-    return float((ways / np.diff(times)).max())
+    ways = corners @ steps[:, :3, :3].transpose(0, 2, 1) + steps[:, None, :3, 3]
+    return np.asarray(np.linalg.norm(ways, axis=2).max(axis=1))
 
 
 @dataclass(frozen=True)
@@ -310,9 +315,15 @@ class FloatingRun:
         """By how many metres the hand has gone away from where it let the tool go: there is no hand."""
         return np.inf
 
-    def intrusions(self, interval: float = 0.02, check: Callable[[float], None] = lambda _time: None) -> tuple[Intrusion, ...]:
+    def intrusions(
+        self, interval: float = 0.02, check: Callable[[float], None] = lambda _time: None, harmless: float = 0.0
+    ) -> tuple[Intrusion, ...]:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
-        phase begins, sampled every ``interval`` seconds up to the release; ``check`` may raise to end it early."""
+        phase begins, sampled every ``interval`` seconds up to the release; ``check`` may raise to end it early.
+
+        ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it cannot
+        be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.
+        """
         setup, motion = self.setup, self._motion
         end = min((t for t in (self.release_time, self.strike_time) if t is not None), default=self.duration)
         times = np.append(np.arange(0.0, end, interval), end)
@@ -335,10 +346,15 @@ class FloatingRun:
         near = _near(corners, poses, others)
         if near.any():
             probe = Probe(setup.settings, list(setup.tool.hulls), others)
-            for index, (time, pose) in enumerate(zip(times[near], to_poses(poses[near]), strict=True)):
+            way = np.concatenate([[0.0], np.cumsum(_ways(poses, setup.tool))])[near]
+            known = -np.inf  # so far on its way it is no deeper than what is harmless
+            for index, (time, at, pose) in enumerate(zip(times[near], way, to_poses(poses[near]), strict=True)):
                 if index % 32 == 0:
                     check(0.0)
+                if at < known:
+                    continue
                 name, depth = probe.deepest(pose)
+                known = at + harmless - depth
                 if name:
                     note(name, depth, float(time))
         return tuple(worst.values())

@@ -104,7 +104,7 @@ class Watch:
         self.run = run
         self.rng = rng
         self.nudge = nudge
-        self.tree = goal.tree
+        self.tree: Node = goal.test  # type: ignore[assignment]
         self._trial = goal.trial
         self.drawn = nudge is not None
         self.metrics: dict[str, float] = {}

@@ -227,9 +227,12 @@ class _Stop:
             raise MagicError(Code.SIMULATION_TIMEOUT, f"out of time after {simulated:.2f} simulated seconds")
 
 
-def _refuse_intrusions(strategy: Strategy, run: FloatingRun, limits: Limits, stop: Any) -> dict[str, float]:
-    """Raise where the planned tool goes through static things; returns what was measured."""
-    found = run.intrusions(check=stop.check)
+def _refuse_intrusions(strategy: Strategy, run: FloatingRun, limits: Limits, stop: Any, measured: bool) -> dict[str, float]:
+    """Raise where the planned tool goes through static things; returns what was measured.
+
+    Where that is not to be ``measured``, for it is shown to nobody, what is allowed in any case need not be found.
+    """
+    found = run.intrusions(check=stop.check, harmless=0.0 if measured else min(limits.overlap, limits.press))
     for item in sorted(found, key=lambda i: i.time):
         if item.before_contact and item.depth > limits.overlap:
             raise MagicError(
@@ -306,7 +309,7 @@ class _Untouched:
         """After each step; ``kicked``: the test itself moves the target from now on."""
         world, limits = self._run.world, self._limits
         self._over = self._over or kicked
-        if self._over or np.linalg.norm(world.velocity(TARGET)) < self.STILL:
+        if self._over or math.hypot(*world.velocity(TARGET).tolist()) < self.STILL:
             return
         self._over = not self._fixed.issuperset(world.touched_by(TARGET, goals.TOUCH))
         way = self._middle(world.pose(TARGET)) - self._stood
@@ -414,7 +417,7 @@ def rollout(
         goal = goals.goal_test(strategy, run, np.random.default_rng([task.seed, index, 1]), None if drawn is None else drawn.nudge)
         recorder = _Recorder(run) if record else None
         if plan.variant == "fg":
-            metrics = _refuse_intrusions(strategy, run, limits, stop)
+            metrics = _refuse_intrusions(strategy, run, limits, stop, record)
         end = goal.until()
         # A kinematic tool touches nothing static, see _refuse_intrusions.
         watched = [TARGET] if setup.target_kind == DYNAMIC or plan.variant == "arm" else []

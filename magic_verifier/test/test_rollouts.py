@@ -15,7 +15,7 @@ from magic_verifier import uncertainty, verification
 from magic_verifier.floating import TABLE, Body, FloatingRun, lifted_onto_table, make_setup
 from magic_verifier.floating import speed as fastest
 from magic_verifier.goals import Judgement
-from magic_verifier.simulation import DYNAMIC, World, usable_pieces
+from magic_verifier.simulation import DYNAMIC, Probe, World, usable_pieces
 from magic_verifier.uncertainty import ShapeError, Spread
 from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, fewest, passes, verify, wilson
 
@@ -359,6 +359,23 @@ def test_a_hand_gives_way_to_the_table_by_what_the_tool_is_thicker(thicker):
     planned = deepest(FloatingRun(setup, plan))
     assert deepest(FloatingRun(changed, plan, 0.0, np.eye(4), setup.tool)) <= planned + 1e-6
     assert thicker < 0 or deepest(FloatingRun(changed, plan)) > planned + 0.003
+
+
+@pytest.mark.parametrize("lower", [0.0, 0.02])
+def test_a_path_is_looked_at_where_the_tool_may_be_deeper_than_is_harmless(lower, monkeypatch):
+    """A scoop along a quarter pipe, and one that is led through it."""
+    strategy, tool, target, pipe, plan = scenes.scooping()
+    poses = plan.tool_motion.world_from_tool @ transforms.make(translation=[0.0, 0.0, -lower])
+    plan = replace(plan, tool_motion=replace(plan.tool_motion, world_from_tool=poses))
+    run = FloatingRun(make_setup(tool, target, (pipe,), scenes.TABLE, strategy.physics, DEFAULTS["fg"]), plan)
+    looked, deepest = [], Probe.deepest
+    monkeypatch.setattr(Probe, "deepest", lambda probe, pose: looked.append(deepest(probe, pose)) or looked[-1])
+    everything, all_looks = run.intrusions(), len(looked)
+    looked.clear()
+    some = run.intrusions(harmless=0.01)
+    assert len(looked) < (1 if lower else 0.5) * all_looks
+    assert [i for i in some if i.depth > 0.01] == [i for i in everything if i.depth > 0.01]
+    assert bool(lower) == any(i.depth > 0.01 and i.body != TABLE for i in some)
 
 
 def test_a_drawn_tool_stands_as_it_was_seen_to_stand():
