@@ -144,7 +144,8 @@ class ArmRun:
         self._let_go_at: NDArray[np.float64] | None = None
         sliding, turning = ("tracking_error_slide", limits.tracking_slide, "m"), ("tracking_error", limits.tracking, "rad")
         self._tracking = [sliding if joint.sliding else turning for joint in robot.arm]
-        self._torque = np.zeros(len(robot.names))
+        self._torque = [0.0] * len(robot.names)
+        self._effort = self._arm.effort.tolist()
         self._metrics = {"torque_ratio": 0.0, "grip_load": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
         if in_hand:
             self._arm.place(self._q[0], min(motion.grasp_width + WIDER, robot.config.opening))
@@ -314,18 +315,19 @@ class ArmRun:
 
     def _watch_torque(self) -> None:
         # Averaged over about 0.1 s: a real arm stops when the limit is exceeded for longer.
-        share = self._every * self.world.timestep / 0.1
-        self._torque += min(share, 1.0) * (self._arm.transmitted() - self._torque)
-        ratio = np.abs(self._torque) / self._arm.effort
-        worst = int(ratio.argmax())
-        self._metrics["torque_ratio"] = max(self._metrics["torque_ratio"], float(ratio[worst]))
-        if ratio[worst] > 1:
+        share = min(self._every * self.world.timestep / 0.1, 1.0)
+        torque = self._torque = [before + share * (now - before) for before, now in zip(self._torque, self._arm.transmitted(), strict=True)]
+        ratio = [abs(carried) / effort for carried, effort in zip(torque, self._effort, strict=True)]
+        most = max(ratio)
+        self._metrics["torque_ratio"] = max(self._metrics["torque_ratio"], most)
+        if most > 1:
+            worst = ratio.index(most)
             what, unit = ("force", "N") if self.robot.arm[worst].sliding else ("torque", "Nm")
             raise MagicError(
                 Code.LIMIT_EXCEEDED,
                 f"{what} of {self.robot.names[worst]} at {self.time:.2f} s ({self.phase})",
-                f"{abs(self._torque[worst]):.1f} {unit}",
-                f"up to {self._arm.effort[worst]:g} {unit}",
+                f"{abs(torque[worst]):.1f} {unit}",
+                f"up to {self._effort[worst]:g} {unit}",
             )
 
     def _watch_contacts(self) -> None:

@@ -131,11 +131,10 @@ class Articulation:
                 mode="force",
             )
             joint.set_armature(np.array([options.finger_armature], dtype=np.float32))
-        # Rows of the links that the arm's joints move, in the order in which the engine reports joint forces.
+        # Where, among three forces and three torques for each link, the engine reports what a joint of the arm transmits about its axis, or
+        # along it where it slides: the axis is x of the engine's joint frames.
         links = [link.name for link in body.links]
-        self._driven = [links.index(joint.child) for joint in robot.arm]
-        # What a joint transmits about its axis, or along it where it slides: the axis is x of the engine's joint frames.
-        self._component = [0 if joint.sliding else 3 for joint in robot.arm]
+        self._carried = np.array([6 * links.index(joint.child) + (0 if joint.sliding else 3) for joint in robot.arm])
         self._tcp = body.find_link_by_name(robot.config.move_group)
         self.hand = body.find_link_by_name(robot.fingers[0].parent)
         #: Of the hand, in which the tool is.
@@ -208,9 +207,9 @@ class Articulation:
         """The same as the engine's pose."""
         return self._tcp.entity_pose
 
-    def transmitted(self) -> NDArray[np.float32]:
+    def transmitted(self) -> list[float]:
         """(J,): the torque about (the force along) the axis that each of the arm's joints carries, Nm (N)."""
-        return self.body.get_link_incoming_joint_forces()[self._driven, self._component]  # type: ignore[no-any-return]
+        return self.body.get_link_incoming_joint_forces().take(self._carried).tolist()  # type: ignore[no-any-return]
 
     # ------------------------------------------------------------ drives
 
@@ -282,7 +281,7 @@ class Articulation:
 
 
 def _load(world: World, robot: Description) -> Any:
-    builder, groups = _prepared(robot)
+    builder, groups, counts = _prepared(robot)
     builder.set_scene(world.scene)
     try:
         body = builder.build()
@@ -294,7 +293,7 @@ def _load(world: World, robot: Description) -> Any:
     body.set_solver_velocity_iterations(world.settings.velocity_iterations)
     for link in body.links:
         # The engine leaves out, and only logs, what it can make no hull of.
-        count = len(robot.shapes(link.name))
+        count = counts[link.name]
         if len(link.collision_shapes) != count:
             raise MagicError(
                 Code.BAD_REQUEST,
@@ -313,8 +312,8 @@ def _unloadable(robot: Description, error: Exception) -> MagicError:
 
 
 @lru_cache(maxsize=4)
-def _prepared(robot: Description) -> tuple[Any, dict[str, int]]:
-    """The engine's builder of the arm, read once, and the bits of its filter for each link."""
+def _prepared(robot: Description) -> tuple[Any, dict[str, int], dict[str, int]]:
+    """The engine's builder of the arm, read once, and for each link the bits of its filter and how many collision shapes it has."""
     from sapien.wrapper.urdf_loader import URDFLoader
 
     tree = robot.tree()
@@ -333,7 +332,7 @@ def _prepared(robot: Description) -> tuple[Any, dict[str, int]]:
             raise _unloadable(robot, error) from error
     if len(builders) != 1 or others:
         raise MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", f"{len(builders) + len(others)} separate bodies", "one")
-    return builders[0], collision_groups(robot)
+    return builders[0], collision_groups(robot), {link: len(robot.shapes(link)) for link in robot.links}
 
 
 def _complete_inertia(robot: Description, link: ET.Element) -> None:

@@ -159,6 +159,13 @@ def test_a_mesh_that_is_none_is_refused(config, tmp_path, content):
     assert error.value.code == Code.BAD_REQUEST and "shoulder" in error.value.message
 
 
+def test_the_files_of_a_robot_are_read_once_for_all_runs(config, tmp_path, monkeypatch):
+    robot = edited(config, tmp_path, ("", ""))
+    Articulation(World(Settings()), robot, GAINS)
+    monkeypatch.setattr(type(robot), "shapes", lambda *_: pytest.fail("the shapes are read again"))
+    Articulation(World(Settings()), robot, GAINS)
+
+
 def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, pull, tmp_path, monkeypatch):
     """The first joint becomes an upright axis: at rest it carries the weight of all above it."""
     first = '<joint name="joint_turn" type="revolute">'
