@@ -10,6 +10,7 @@ knows the answer.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import sys
@@ -104,6 +105,9 @@ def measure(task: str, variants: Sequence[str], count: int, rollouts: int, bags:
             graph.start("bag_player", "magic_bringup", "bag_player", str(bag), "--loop", "--delay", "0.7")
             _until(lambda: watcher.objects_at is not None, START, f"objects of {bag}", graph)
             graph.stop(["bag_player"])
+            # Of a goal's time, none is to be this process's own, in which the collector would walk through all that it has imported.
+            gc.collect()
+            gc.freeze()
             pids = {name: graph.processes[name].popen.pid for name in NODES}
             for variant in variants:
                 options = Options(task, variant, bag, scratch, timeout=ANSWER, pictures=False)
