@@ -244,8 +244,12 @@ class FloatingRun:
         thought: Body | None = None,
     ) -> None:
         motion = plan.tool_motion
+        self._off = 0.0  # by so much at most (m) a point of the tool is from where it would be as it is thought to be
         if tool_from_held is not None:
-            motion = replace(motion, world_from_tool=_clear_of_table(setup, motion.world_from_tool, tool_from_held, thought or setup.tool))
+            thought = thought or setup.tool
+            poses, raised = _clear_of_table(setup, motion.world_from_tool, tool_from_held, thought)
+            motion = replace(motion, world_from_tool=poses)
+            self._off = _apart(setup.tool, thought, tool_from_held) + raised
         self.setup = setup
         self.phases = motion.phases
         self.duration = float(motion.times[-1] - motion.times[0])
@@ -316,13 +320,18 @@ class FloatingRun:
         return np.inf
 
     def intrusions(
-        self, interval: float = 0.02, check: Callable[[float], None] = lambda _time: None, harmless: float = 0.0
+        self,
+        interval: float = 0.02,
+        check: Callable[[float], None] = lambda _time: None,
+        harmless: float = 0.0,
+        planned: float = np.inf,
     ) -> tuple[Intrusion, ...]:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
         phase begins, sampled every ``interval`` seconds up to the release; ``check`` may raise to end it early.
 
         ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it cannot
-        be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.
+        be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.  ``planned``: what this found of the
+        tool as it is thought to be, at the deepest, m: no obstacle is looked at where what the tool is off by adds too little to that.
         """
         setup, motion = self.setup, self._motion
         end = min((t for t in (self.release_time, self.strike_time) if t is not None), default=self.duration)
@@ -343,6 +352,8 @@ class FloatingRun:
         others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}
         if setup.target_kind == STATIC:
             others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
+        elif planned + self._off <= harmless:
+            others = {}
         near = _near(corners, poses, others)
         if near.any():
             probe = Probe(setup.settings, list(setup.tool.hulls), others)
@@ -360,19 +371,28 @@ class FloatingRun:
         return tuple(worst.values())
 
 
-def _clear_of_table(setup: Setup, poses: NDArray[np.float64], tool_from_held: NDArray[np.float64], thought: Body) -> NDArray[np.float64]:
+def _apart(tool: Body, thought: Body, tool_from_held: NDArray[np.float64]) -> float:
+    """How far (m) any corner of a tool that is held, and shaped, otherwise than thought is at most from where it is thought to be; infinite
+    where that does not bound how far its surface is: of balls, and of other pieces."""
+    if [len(hull) for hull in tool.hulls] != [len(hull) for hull in thought.hulls] or any(ball is not None for ball in tool.balls):
+        return np.inf
+    return float(np.linalg.norm(transforms.apply(tool_from_held, tool.corners) - thought.corners, axis=1).max())
+
+
+def _clear_of_table(
+    setup: Setup, poses: NDArray[np.float64], tool_from_held: NDArray[np.float64], thought: Body
+) -> tuple[NDArray[np.float64], float]:
     """The poses (T, 4, 4) of a tool that is held otherwise, and shaped otherwise, than thought, raised together so that it goes no deeper
-    into the table than 0, or than it was planned to: a hand gives way to the table by what it is off."""
+    into the table than 0, or than it was planned to: a hand gives way to the table by what it is off; and by how much (m)."""
     held = poses @ tool_from_held
     normal = setup.table[:3]
 
     def lowest(at: NDArray[np.float64], corners: NDArray[np.float64]) -> float:
         return float(((normal @ at[:, :3, :3]) @ corners.T + (at[:, :3, 3] @ normal)[:, None]).min() + setup.table[3])
 
-    depth = min(0.0, lowest(poses, thought.outermost)) - lowest(held, setup.tool.outermost)
-    if depth > 0:
-        held[:, :3, 3] += depth * normal
-    return held
+    depth = max(0.0, min(0.0, lowest(poses, thought.outermost)) - lowest(held, setup.tool.outermost))
+    held[:, :3, 3] += depth * normal
+    return held, depth
 
 
 def nears(

@@ -227,12 +227,15 @@ class _Stop:
             raise MagicError(Code.SIMULATION_TIMEOUT, f"out of time after {simulated:.2f} simulated seconds")
 
 
-def _refuse_intrusions(strategy: Strategy, run: FloatingRun, limits: Limits, stop: Any, measured: bool) -> dict[str, float]:
+def _refuse_intrusions(
+    strategy: Strategy, run: FloatingRun, limits: Limits, stop: Any, measured: bool, planned: float = np.inf
+) -> dict[str, float]:
     """Raise where the planned tool goes through static things; returns what was measured.
 
-    Where that is not to be ``measured``, for it is shown to nobody, what is allowed in any case need not be found.
+    Where that is not to be ``measured``, for it is shown to nobody, what is allowed in any case need not be found; ``planned``: what was of the
+    tool as it is thought to be, m.
     """
-    found = run.intrusions(check=stop.check, harmless=0.0 if measured else min(limits.overlap, limits.press))
+    found = run.intrusions(check=stop.check, harmless=0.0 if measured else min(limits.overlap, limits.press), planned=planned)
     for item in sorted(found, key=lambda i: i.time):
         if item.before_contact and item.depth > limits.overlap:
             raise MagicError(
@@ -329,7 +332,8 @@ class Task:
     """Everything that a rollout is a function of, beside its number: it may be sent to another process.
 
     ``eyes``: how well tool and target are known, and by how much these widths are to be multiplied; ``start``: the moment of the
-    motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``longer``: how many times as long their
+    motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``overlap``: how deep the tool that is led goes into
+    things as it was planned, m, where that is known; ``longer``: how many times as long their
     steps are; ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
     """
 
@@ -344,6 +348,7 @@ class Task:
     robot: Description | None = None
     start: float = 0.0
     held: Any = None
+    overlap: float = np.inf
     longer: float = 1.0
     shares: tuple[NDArray[np.float64], ...] | None = None
 
@@ -386,10 +391,10 @@ def rollout(
     stop: Any = None,
     progress: Callable[[str, float], None] | None = None,
     record: bool = True,
-    taken: Callable[[Any], None] | None = None,
+    begin: Callable[[Task], None] | None = None,
 ) -> Outcome:
-    """One rollout, a function of ``task`` and ``index`` alone.  ``taken`` hears of the first one, as soon as it is known, how the arm has
-    the tool in its hand at the task's start.  Raises for cancel and deadline only."""
+    """One rollout, a function of ``task`` and ``index`` alone.  ``begin`` hears of the first one, as soon as it is known, the task of the
+    others: how the arm has the tool in its hand at the task's start, or how deep the tool goes into things.  Raises for cancel and deadline only."""
     stop = stop or _Never()
     strategy, plan, limits = task.strategy, task.plan, task.limits
     drawn = task.drawn(index)
@@ -417,7 +422,9 @@ def rollout(
         goal = goals.goal_test(strategy, run, np.random.default_rng([task.seed, index, 1]), None if drawn is None else drawn.nudge)
         recorder = _Recorder(run) if record else None
         if plan.variant == "fg":
-            metrics = _refuse_intrusions(strategy, run, limits, stop, record)
+            metrics = _refuse_intrusions(strategy, run, limits, stop, record or drawn is None, task.overlap)
+            if drawn is None and begin is not None:
+                begin(replace(task, overlap=metrics["overlap"]))
         end = goal.until()
         # A kinematic tool touches nothing static, see _refuse_intrusions.
         watched = [TARGET] if setup.target_kind == DYNAMIC or plan.variant == "arm" else []
@@ -448,8 +455,8 @@ def rollout(
             goal.observe()
             if held is None and drawn is None and plan.variant == "arm" and run.time >= task.start:
                 held = run.held()
-                if held is not None and taken is not None:
-                    taken(held)
+                if held is not None and begin is not None:
+                    begin(from_held(task, held))
             if step % touch_every == 0 and run.time < run.contact_time:
                 _refuse_early_touch(run, watched, limits)
         run.world.check(names)
@@ -703,7 +710,7 @@ def rollouts(
 
     With a pool others compute some of them meanwhile, to the same outcomes, none beyond those that are needed at least if the scene as
     given passes: which ones are computed where depends on who is ready first, what comes of them does not.  They begin beside the scene
-    as given, the arm's as soon as it is known how it has the tool in its hand.
+    as given, as soon as is known what it has to tell of them: of the arm, how it has the tool in its hand.
     """
     stop = stop or _Never()
     elsewhere = _Elsewhere(pool, workers)
@@ -712,14 +719,19 @@ def rollouts(
     def needed(passed: int, count: int) -> int:
         return most if required is None else count + _least_more(passed, count, most, required, z)
 
+    others = task
+
+    def begin(known: Task) -> None:
+        nonlocal others
+        others = known
+        elsewhere.begin(others, needed(1, 1))
+
     try:
-        if task.plan.variant != "arm":
-            elsewhere.begin(task, needed(1, 1))
-        first = rollout(task, 0, stop, progress, taken=lambda held: elsewhere.begin(from_held(task, held), needed(1, 1)))
+        first = rollout(task, 0, stop, progress, begin=begin)
         outcomes, passed = [first], int(first.judgement.code == Code.OK)
         if not passed:
             return outcomes
-        task = from_held(task, first.held)
+        task = others
         while len(outcomes) < most:
             if required is not None and len(outcomes) > 1 and decided(passed, len(outcomes), most, required, z):
                 break

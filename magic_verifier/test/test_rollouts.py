@@ -378,6 +378,30 @@ def test_a_path_is_looked_at_where_the_tool_may_be_deeper_than_is_harmless(lower
     assert bool(lower) == any(i.depth > 0.01 and i.body != TABLE for i in some)
 
 
+@pytest.mark.parametrize("off, looks", [(0.004, False), (0.012, True)])
+def test_no_obstacle_is_looked_at_where_what_the_tool_is_off_by_is_too_little(off, looks, monkeypatch):
+    strategy, tool, target, pipe, plan = scenes.scooping()
+    setup = make_setup(tool, target, (pipe,), scenes.TABLE, strategy.physics, DEFAULTS["fg"])
+    planned = max((i.depth for i in FloatingRun(setup, plan).intrusions()), default=0.0)
+    low = FloatingRun(setup, plan, 0.0, transforms.make(translation=[0.0, 0.0, -off]), setup.tool)
+    assert max((i.depth for i in low.intrusions()), default=0.0) <= planned + off
+    looked, deepest = [], Probe.deepest
+    monkeypatch.setattr(Probe, "deepest", lambda probe, pose: looked.append(deepest(probe, pose)) or looked[-1])
+    low.intrusions(harmless=0.01, planned=planned)
+    assert bool(looked) == looks
+    looked.clear()
+    low.intrusions(harmless=0.01)
+    assert looked, "nothing is known of what was planned"
+
+
+def test_the_others_are_told_what_the_scene_as_given_shows():
+    strategy, tool, target, pipe, plan = scenes.scooping()
+    task = verification.make_task(strategy, tool, target, (pipe,), scenes.TABLE, plan)
+    told = []
+    first = verification.rollout(task, 0, begin=told.append)
+    assert [known.overlap for known in told] == [first.judgement.metrics["overlap"]] and task.overlap == np.inf
+
+
 def test_a_drawn_tool_stands_as_it_was_seen_to_stand():
     """With an underside and a tilt that are drawn mugs topple by themselves; what is drawn of sides and top stays."""
     mug = shapes.make("mug", 3).as_object("tool", transforms.make(translation=[0.5, 0.1, 0.0]))
