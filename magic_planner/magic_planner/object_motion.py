@@ -9,7 +9,8 @@ pose of the tool's contact frame in the target's:
 frames through the strategy's waypoints.  A strategy may have several pairs of contacts.  Of one that waypoints name the
 frames are led at these waypoints as those of the first are at the others; between two such waypoints the tool turns
 evenly.  One that no waypoint names is met together with the first: the tool is turned about the first contact, and shifted, as suits
-all of them best (:mod:`magic_core.placement`).  Where the tool has no room to meet the target
+all of them best (:mod:`magic_core.placement`).  A scoop with a smaller target is led nearer to walls
+(:mod:`magic_planner.proportion`).  Where the tool has no room to meet the target
 at the contact itself, the contact slides along it (:mod:`magic_planner.sliding`); what
 the table still lacks raises the whole motion; what is still in the way is given way to
 (:mod:`magic_planner.giving_way`).
@@ -36,6 +37,7 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
 from magic_planner.collision import Body, grown, hull, outer_points, solid_pieces
 from magic_planner.giving_way import GAP, give_way
+from magic_planner.proportion import in_measure
 from magic_planner.sliding import lowest, slid_contacts
 
 #: Largest step between two samples: metres, radians.
@@ -129,6 +131,8 @@ def plan_tool_motion(
     else:
         raise MagicError(Code.BAD_STRATEGY, f"mode of {strategy.name}", strategy.mode, MODES)
     world_from_meeting = world_from_contact @ contacts
+    if beneath:
+        world_from_meeting = in_measure(strategy, target, target_from_contact, contacts, obstacles, plane)
     room = min(gap, clearance) if beneath else gap
     frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, room)
     world_from_tool = world_from_meeting @ transforms.inverse(frames)

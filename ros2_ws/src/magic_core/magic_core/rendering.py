@@ -84,10 +84,11 @@ class Raycaster:
         found = np.sort(found.astype(np.float64))
         return found[np.concatenate([[True], np.diff(found) > 1e-6])] if len(found) else found
 
-    def nearest(self, point: ArrayLike) -> NDArray[np.float64]:
-        """The point (3,) of the meshes' surfaces that is nearest to a point (3,)."""
-        query = self._o3d.core.Tensor(np.asarray(point, dtype=np.float32)[None])
-        return self._scene.compute_closest_points(query)["points"].numpy()[0].astype(np.float64)
+    def nearest(self, points: ArrayLike) -> NDArray[np.float64]:
+        """The points (..., 3) of the meshes' surfaces that are nearest to points (..., 3)."""
+        points = np.asarray(points, dtype=np.float32)
+        query = self._o3d.core.Tensor(points.reshape(-1, 3))
+        return self._scene.compute_closest_points(query)["points"].numpy().astype(np.float64).reshape(points.shape)
 
     def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """How far points (N, 3) are from the meshes' surfaces, (N,), metres."""
