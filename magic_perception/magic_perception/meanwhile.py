@@ -1,4 +1,5 @@
-"""The scene while the arm moves: as long as the pictures differ by the arm alone, and by what it holds, nothing is perceived anew.  No ROS here."""
+"""The scene while nothing changes, which is looked at more closely, and while the arm moves: as long as the pictures differ by the arm alone, and by what
+it holds, nothing is perceived anew.  No ROS here."""
 
 from __future__ import annotations
 
@@ -10,11 +11,13 @@ from numpy.typing import NDArray
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.scene import ROBOT, UNSEEN, Scene, SceneObject
-from magic_perception.averaging import unchanged, unchanged_beside_robot
+from magic_perception.averaging import average, unchanged, unchanged_beside_robot
 from magic_perception.robot_in_view import Held, RobotInView
 
 #: A scene in which nothing changes is looked at again after so long by the stamps, s; what noise has made of it is not for ever.
 AFRESH = 10.0
+#: Of so many looks at a scene in which nothing changes the mean is perceived: with half of the noise handles come out that one look misses.
+LOOKS = 4
 #: Of a thing of which the robot hides more than this share that was seen before a part is hidden, and of which less than this share is left all of it.
 PART, REST = 0.05, 0.1
 
@@ -22,7 +25,7 @@ PART, REST = 0.05, 0.1
 @dataclass(frozen=True)
 class Made:
     """A scene and what it was made of: frames, fixtures, what the robot held; masks (H, W) in each frame by the ids of what was seen; carried: ids of what the
-    robot carries."""
+    robot carries; looks: the frames of the last looks at it, the newest last; count: of how many it was made."""
 
     scene: Scene
     frames: list[RgbdFrame]
@@ -30,11 +33,32 @@ class Made:
     held: tuple[Held, ...]
     masks: dict[str, list[NDArray[np.bool_]]]
     carried: frozenset[str]
+    looks: tuple[list[RgbdFrame], ...] = ()
+    count: int = 1
 
-    def recent(self, frames: list[RgbdFrame], known: tuple[SceneObject, ...]) -> bool:
-        """Whether frames may show this scene."""
-        age = _stamp(frames) - _stamp(self.frames)
-        return 0 <= age < AFRESH and list(map(id, known)) == list(map(id, self.known)) and len(frames) == len(self.frames)
+    def shows(self, frames: list[RgbdFrame], known: tuple[SceneObject, ...]) -> bool:
+        """Whether frames may be of this scene."""
+        return self._age(frames) >= 0 and list(map(id, known)) == list(map(id, self.known)) and len(frames) == len(self.frames)
+
+    def recent(self, frames: list[RgbdFrame]) -> bool:
+        """Whether it need not be looked at again yet."""
+        return self._age(frames) < AFRESH
+
+    def _age(self, frames: list[RgbdFrame]) -> float:
+        return _stamp(frames) - _stamp(self.frames)
+
+    def seen_again(self, frames: list[RgbdFrame]) -> Made:
+        """The same with one more look, by frames that show nothing else."""
+        return replace(self, looks=(*self.looks, frames)[-LOOKS:])
+
+    @property
+    def better(self) -> bool:
+        """Whether there are as many looks as are averaged, and it was made of fewer."""
+        return len(self.looks) == LOOKS > self.count
+
+    def mean(self) -> list[RgbdFrame]:
+        """The mean of the looks, one frame for each camera."""
+        return [average(list(each)) for each in zip(*self.looks, strict=True)]
 
     def same(self, frames: list[RgbdFrame]) -> bool:
         """Whether frames show nothing else than those that the scene was made of."""

@@ -397,13 +397,18 @@ class Perception(Node):
             self.last_run = now
             with self.lock:
                 known = tuple(item for items in self.known.values() for item in items)
-            if self.made is not None and self.made.recent(frames, known):
+            looks: tuple[list[RgbdFrame], ...] = (frames,)
+            if self.made is not None and self.made.shows(frames, known):
                 if self.made.same(frames):
-                    self.publish(replace(self.made.scene, stamp=max(frame.stamp for frame in frames)), self.made.scene)
-                    self.done += 1
-                    return
-                if (
+                    self.made = self.made.seen_again(frames)
+                    if self.made.recent(frames) and not self.made.better:
+                        self.publish(replace(self.made.scene, stamp=max(frame.stamp for frame in frames)), self.made.scene)
+                        self.done += 1
+                        return
+                    looks, frames = self.made.looks, self.made.mean()
+                elif (
                     self.robot is not None
+                    and self.made.recent(frames)
                     and (scene := self.made.meanwhile(frames, self.robot, self.world_from_base(frames[-1]))) is not None
                 ):
                     self.publish(scene)
@@ -424,7 +429,7 @@ class Perception(Node):
                 [frame.free for frame in frames], there, report.earlier, still & whole, [named[i] for i in carried if i in named]
             )
             masks = {i: [image == n for image in report.labels] for i, n in named.items()}
-            self.made = Made(scene, frames, known, held, masks, carried)
+            self.made = Made(scene, frames, known, held, masks, carried, looks, len(looks))
             self.publish(scene)
             seconds = time.monotonic() - now
             self.done += 1

@@ -98,8 +98,8 @@ def test_what_else_changes_is_looked_at(robot, what):
 def test_an_arm_that_stands_is_looked_past(robot):
     view = told(robot, (ASIDE, ASIDE))
     before, frames = made(view, "things", ASIDE), means(view, "things", ASIDE, NOW)
-    assert before.meanwhile(frames, view) is None and before.same(frames) and before.recent(frames, ())
-    assert not before.recent([replace(frame, stamp=THEN + AFRESH) for frame in frames], ())
+    assert before.meanwhile(frames, view) is None and before.same(frames) and before.shows(frames, ()) and before.recent(frames)
+    assert not before.recent([replace(frame, stamp=THEN + AFRESH) for frame in frames])
 
 
 def test_an_arm_stands_a_moment_after_it_stopped(robot):

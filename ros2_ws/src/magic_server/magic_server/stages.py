@@ -85,10 +85,12 @@ class Server(Protocol):
 class Stages:
     """The stages of :mod:`magic_server.pipeline`, done by the other nodes; messages pass through as they came.
 
-    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.
+    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.  tried: motions for the same task that were simulated before.
     """
 
-    def __init__(self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool, since: float = -math.inf) -> None:
+    def __init__(
+        self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool, since: float = -math.inf, tried: int = 0
+    ) -> None:
         self._server = server
         self._since = since
         self._run = run
@@ -102,7 +104,7 @@ class Stages:
         self._matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
         #: Motions that the verifier was asked for.
-        self._tried = 0
+        self._tried = tried
         self._last_code = 0
 
     @property

@@ -51,6 +51,10 @@ from magic_server.scene_change import Changed
 from magic_server.stages import Stages, complaint_code, hull_of, mark_of
 from magic_server.watch import Bounds
 
+#: Answers that another look at the same things may change: perception draws them anew every ten seconds, and sooner where it can do so more closely.
+BY_SIGHT = frozenset({Code.NO_MATCH, Code.OBJECT_CUT_OFF, Code.HANDLE_NOT_SEEN, Code.NO_CANDIDATE_SUCCEEDED})
+#: A run that is to be carried out waits for such a look so many times, s each.
+LOOKS, LOOK_TIME = 2, 12.0
 #: Whose explanation is looked for when no objects come, besides that of those who publish objects: the node of this name beside this one.
 PERCEPTION = "perception"
 #: How old such an explanation may be, s.
@@ -468,6 +472,7 @@ class StrategyServer(LifecycleNode):
         bounds = Bounds(0, self._loop.replans, time.monotonic() + request.timeout)
         tried: list[pipeline.Outcome] = []
         changes: list[str] = []
+        looks = LOOKS if self._arm is not None and request.variant == MotionPlan.ARM else 0
         while True:
             left = max(1.0, min(request.timeout, bounds.end - time.monotonic()))
             outcome = work(replace(request, timeout=left), stages, strategy.reflections)
@@ -475,6 +480,14 @@ class StrategyServer(LifecycleNode):
             fill(result, pipeline.joined(tried, outcome))
             result.notes = list(changes)
             # First what somebody waits for, then the pictures.
+            if outcome.code in BY_SIGHT and looks and self._other_look(stages, token):
+                looks -= 1
+                changes.append(f"{outcome.code.name}: {outcome.message}")
+                notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; perception has looked again", ()))
+                # Of motions for many looks one may pass by chance as well as of many for one.
+                simulated = sum(outcome.simulations for outcome in tried)
+                stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures, tried=simulated)
+                continue
             if outcome.code != Code.OK:
                 result.message = "; planned again from there: ".join([*changes, outcome.message])
                 break
@@ -526,6 +539,22 @@ class StrategyServer(LifecycleNode):
             self.get_logger().info(ending)
         else:
             self.get_logger().warning(ending)
+
+    def _other_look(self, stages: Stages, token: Token) -> bool:
+        """Whether perception makes something else of what stands there than what a run was begun with; waits for it a little."""
+        before = look_at(stages.scene).objects
+
+        def other() -> bool:
+            try:
+                seen = self.look()
+            except NotYet:
+                return False
+            return seen is not None and not (
+                seen.objects.keys() == before.keys() and all(np.array_equal(seen.objects[name], hull) for name, hull in before.items())
+            )
+
+        self.get_logger().info("waiting for another look")
+        return token.wait(other, time.monotonic() + LOOK_TIME, alive=lambda: None)
 
     def _request(self, goal: RunStrategy.Goal) -> pipeline.Request:
         """What the goal asks for, with the server's own numbers where it names none."""

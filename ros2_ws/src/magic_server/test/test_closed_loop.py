@@ -17,7 +17,7 @@ from magic_core.robot import Description
 from magic_core.scene import Scene, SceneObject
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.srv import MatchContact
-from magic_server import seen_goal
+from magic_server import seen_goal, strategy_server
 from magic_server.stages import Stages
 from magic_server.testing import fakes
 from magic_server.testing.bench import Bench
@@ -163,6 +163,42 @@ def test_a_tool_that_is_out_of_sight_after_it_was_corrected_is_carried_on(bench)
     bench.fakes.see(lambda: replace(scene(), objects=scene().objects[len(asked(bench, "plan_motion")) > 1 :]))
     result = run(bench)
     assert "TOOL_SLIPPED" in result.notes[0] and "was not seen" in result.notes[1]
+
+
+@pytest.mark.parametrize("shows", [True, False])
+def test_what_one_look_does_not_show_another_may(bench, monkeypatch, shows):
+    monkeypatch.setattr(strategy_server, "LOOK_TIME", 5.0 if shows else 0.3)
+    asks = []
+
+    def match(request):
+        asks.append(request)
+        if len(asks) > 1:
+            return matches(request)
+        bench.table.target += 0.002 * shows  # as another look makes it out
+        return MatchContact.Response(code=int(Code.HANDLE_NOT_SEEN), message="no handle in sight")
+
+    bench.fakes.on_match = match
+    result = run(bench, *(() if shows else (Code.HANDLE_NOT_SEEN, False)))
+    assert len(asks) == 1 + shows and moves(bench) == 3 * shows
+    assert result.notes == ["HANDLE_NOT_SEEN: no handle in sight"] * shows
+    assert shows or result.message == "no handle in sight"
+
+
+def test_what_fails_by_one_look_is_tried_by_another_and_has_to_show_more(bench, monkeypatch):
+    monkeypatch.setattr(strategy_server, "LOOK_TIME", 5.0)
+    passes, place = bench.fakes.verify, bench.table.target
+
+    def verify(goal, canceled):
+        if conversions.pose_from_msg(goal.target.pose)[0, 3] > place + 0.001:
+            return passes(goal, canceled)
+        if goal.tried == 5:  # both candidates with all their grasps
+            bench.table.target += 0.002
+        return VerifyMotion.Result(code=int(Code.DRIFT), message="it drifts")
+
+    bench.fakes.on_verify = verify
+    result = run(bench)
+    assert [goal.tried for goal in asked(bench, "verify_motion")] == list(range(7)) and result.simulations == 7
+    assert result.notes[0].startswith("NO_CANDIDATE_SUCCEEDED") and moves(bench) == 3
 
 
 def test_a_motion_planned_anew_has_its_own_verdict_or_does_not_begin(bench):
