@@ -37,6 +37,8 @@ MARGIN = 0.15
 BEHIND, AROUND = 0.015, 0.03
 #: Between parts of one solid that are farther from each other, m, is one that nobody saw.
 GAP = 0.006
+#: Two things are likely parts of one that a seam has parted where they touch (m), and, within so much of that place (m), have one height (m) and one chromaticity.
+TOUCHING, THERE, LEVEL, SHADE = 0.003, 0.02, 0.005, 0.02
 
 
 @dataclass
@@ -319,9 +321,10 @@ def _hidden(
     does does not say that there is none, as of what is thin.
 
     It may go on behind others where no camera looks: so far that it matters, or not.  What may be the rest of it, of its colour and beside it, leaves it cut off, and
-    so do parts that nothing joins.
+    so do parts that nothing joins.  What it goes on as, of its colour and height where they touch, cuts it off.
     """
-    cut = built.evidence.cut
+    rest = [other for other in solids if other is not built and _goes_on(built, other, world_from_table[:3, 2])]
+    cut = list(dict.fromkeys([*built.evidence.cut, *(other.label for other in rest)]))
     if built.hanging or not bordered(labels, built.label) or any(by in (PICTURE, REGION, scene.ROBOT, UNSEEN) for by in cut):
         return cut
     table_from_world = transforms.inverse(world_from_table)
@@ -330,17 +333,40 @@ def _hidden(
     if left.behind > BEHIND:
         return list(dict.fromkeys([*cut, *(by if by > 0 else FIXTURE for by in left.by)]))
     whole = left.around < AROUND and hangs_together(built.solid.mesh, GAP)
-    return [] if whole and not any(_one_thing(built, other) for other in solids if other is not built) else cut
+    return [] if whole and not rest and not any(_one_thing(built, other) for other in solids if other is not built) else cut
 
 
 def _one_thing(one: _Built, other: _Built) -> bool:
     """Whether two things may be parts of one: of one colour, and near each other."""
-    from scipy.spatial import cKDTree
-
     if np.linalg.norm(attached.shade(one.colors) - attached.shade(other.colors)) > attached.COLOR:
         return False
-    few, many = (built.points[:: max(1, len(built.points) // 2000)] for built in (one, other))
-    return bool(cKDTree(many).query(few, distance_upper_bound=attached.GAP)[0].min() < attached.GAP)
+    return _nearest(one, other, attached.GAP, 2000) is not None
+
+
+def _goes_on(one: _Built, other: _Built, normal: NDArray[np.float64]) -> bool:
+    """Whether a thing goes on as another: they touch, and are of one colour and equally high there; normal (3,): of the table."""
+    met = _nearest(one, other, TOUCHING, 20000)
+    if met is None:
+        return False
+    ends = []
+    for built, place in zip((one, other), met, strict=True):
+        offset = built.points - place
+        near = np.linalg.norm(offset - np.outer(offset @ normal, normal), axis=1) < THERE
+        ends.append((float(np.percentile(built.points[near] @ normal, 95)), attached.shade(built.colors[near])))
+    (height, shade), (level, tint) = ends
+    return abs(height - level) < LEVEL and float(np.linalg.norm(shade - tint)) < SHADE
+
+
+def _nearest(one: _Built, other: _Built, reach: float, most: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """The points (3,) of two things, at most so many looked at of each, that are nearest to each other; ``None`` where they are farther apart than ``reach``, m."""
+    from scipy.spatial import cKDTree
+
+    few, many = (built.points[:: max(1, len(built.points) // most)] for built in (one, other))
+    if np.any(few.min(axis=0) > many.max(axis=0) + reach) or np.any(many.min(axis=0) > few.max(axis=0) + reach):
+        return None
+    distance, index = cKDTree(many).query(few, distance_upper_bound=reach)
+    best = int(np.argmin(distance))
+    return (few[best], many[index[best]]) if distance[best] < reach else None
 
 
 def _about(mask: NDArray[np.bool_], color: NDArray[np.uint8]) -> NDArray[np.uint8]:

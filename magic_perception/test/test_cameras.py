@@ -1,6 +1,6 @@
 """Cameras that disagree, the table among planes, and what is seen in part, on ray-cast scenes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -289,6 +289,35 @@ def test_confidence_falls_with_what_was_seen(pair):
     good = {o.id: o.confidence for o in perceive(pair, parameters=REGION).objects}
     apart = {o.id: o.confidence for o in perceive(moved(pair, transforms.make(translation=[0.0065, 0.004, 0])), parameters=REGION).objects}
     assert all(apart[name] < good[name] for name in good)
+
+
+@dataclass(frozen=True)
+class Told:
+    """A segmenter that is told the labels."""
+
+    labels: list[np.ndarray]
+    name: str = "told"
+
+    def segment(self, looks, known, parameters):
+        return [image.copy() for image in self.labels]
+
+
+def test_what_goes_on_as_another_thing_is_cut_off_by_it():
+    """A bar that segmentation has parted is no tool, and a bar beside a block of another height or colour is one."""
+    bar = slab([0.02, 0.2, 0.016], [0.55, 0, 0.008], (120, 60, 50))
+    upper = slab([0.02, 0.1, 0.05], [0.55, 0.05, 0.025], (120, 60, 50))
+    blue = slab([0.02, 0.1, 0.016], [0.55, 0.05, 0.008], (60, 90, 150))
+    lower = slab([0.02, 0.1, 0.016], [0.55, -0.05, 0.008], (120, 60, 50))
+    for things, cut in (([bar], True), ([lower, upper], False), ([lower, blue], False)):
+        caster = sensor.scene_raycaster(things)
+        frames, parts = [], []
+        for i, (name, pose) in enumerate(sensor.STATION.items()):
+            frames.append(sensor.capture([], sensor.D435, pose, [7, i], camera=name, raycaster=caster))
+            cast, depth = caster.perspective(sensor.D435, pose)
+            y = transforms.apply(pose, sensor.D435.unproject(depth))[..., 1]
+            parts.append(np.where(cast.ids > 0, np.where(y < 0, 1, 2), 0).astype(np.int32))
+        found = perceive(frames, parameters=Parameters(region_low=(0.0, -0.7, -0.05)), segmenter=Told(parts)).objects
+        assert [item.cut_off for item in found] == ([("object_2",), ("object_1",)] if cut else [(), ()])
 
 
 def test_a_thing_whose_parts_nothing_joins_is_not_whole():

@@ -95,6 +95,30 @@ def test_errors_are_judged_by_scenes_that_the_weights_do_not_know():
     assert "120 things of 120 seeds" in text and "| all | 120 |" in text and 0 < loss < 0.2
 
 
+def test_more_is_stated_than_few_things_tell_so_that_five_of_six_others_lie_below():
+    """Many numbers of few things fit their errors too well."""
+    random = np.random.default_rng(4)
+
+    def drawn(count):
+        rows = random.normal(size=(count, len(surface_error.NUMBERS)))
+        errors = np.exp(0.5 + 0.5 * rows[:, 0] + 0.5 * random.normal(size=count)) / 1000
+        return [
+            learn_surface_error.Judged(4 * i, "flat", row, float(error)) for i, (row, error) in enumerate(zip(rows, errors, strict=True))
+        ]
+
+    shares = []
+    for _ in range(8):
+        known, others = drawn(90), drawn(300)
+        shares.append(
+            [
+                np.mean([thing.error <= model.error(thing.row) for thing in others])
+                for model in (learn_surface_error._fitted(known), learn_surface_error.learned(known))
+            ]
+        )
+    alone, raised = np.mean(shares, axis=0)
+    assert alone < surface_error.SHARE - 0.02 < raised
+
+
 def test_of_four_seeds_three_are_a_tool_alone_and_one_a_pile_and_a_ball_or_cylinder():
     (made,) = learn_surface_error.drawn(710001)
     assert made.things == 1 and made.meshes[0].bounds[0, 2] == pytest.approx(0, abs=1e-9)
