@@ -5,7 +5,9 @@ velocity, disturbed as a hand disturbs it) and corrected by what the frame shows
 
 * measured points near the surface lie on it: their signed distance s(p) is a residual, its gradient the direction;
 * where the model should be seen and the camera looks through to what is behind, the model's point is moved to the nearest pixel
-  that is not background: a flat tool that slides in its own plane is held by its outline.
+  that is not background: a flat tool that slides in its own plane is held by its outline;
+* the outline is moved to where the colours change from the tool's own to those of what is about it, which depth, smeared past every edge,
+  does not show.  The tool's colours are those of the pixels in which it lies first; those of what is about it are learned while it moves.
 
 What is nearer to the camera than the model hides it and says nothing: that is the hand, and whatever else comes between.  Points of
 the hand that touch the tool are told by their colour, where the tool has another, and by a loss that gives up what is far (Geman and
@@ -26,6 +28,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
@@ -36,14 +39,18 @@ from magic_core.mesh import Mesh
 Array = NDArray[np.float64]
 #: Spectral densities of a hand's accelerations: m^2/s^3 and rad^2/s^3.  It takes up 0.5 m/s and 3 rad/s within a quarter of a second.
 JERKY, TWISTY = 1.0, 36.0
+#: No hand moves a tool by so many standard deviations of that from one moment to the next.
+JUMP = 3.0
 #: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).
-START = (0.001, 0.005, 0.01, 0.05)
+START = (0.004, 0.03, 0.01, 0.05)
 #: Standard deviation (m) of a measured point from the reconstructed surface, and of an outline; errors hold together over a patch, so
 #: that the points of a frame count as so many at most.
 NOISE, OUTLINE, WORTH = 0.004, 0.005, 60.0
 #: Points farther from the surface than this are not the tool's (m): when the search begins, and when it ends.
 REACH, CLOSE = 0.030, 0.010
-ROUNDS = 10
+ROUNDS = 16
+#: The farthest that the search goes in a round: m, rad.
+STRIDE = (0.02, np.deg2rad(12.0))
 #: ... and where that does not find the tool; so few points looked through say that it is found.
 FAR, CLEAR = 0.06, 0.10
 #: Pictures whose stamps differ by no more (s) are of one moment.
@@ -51,13 +58,24 @@ AT_ONCE = 0.01
 #: Measured points used of a frame, and points of the surface that stand for the model.
 USED, SURFACE = 700, 900
 #: A camera looks through where it measures more than this (m) behind the model; what is so much nearer hides it.
-BEHIND = 0.012
+BEHIND, HIDES = 0.012, 0.005
 #: What is nearer to the table than this is taken for it (m).
 TABLE = 0.004
 #: How far from the outline a point that is looked through may be (pixels).
 ASTRAY = 25
-#: A point has another colour than the tool beyond so many standard deviations of the tool's own (L*a*b*, without L*), each at least FAINT.
-OTHER, FAINT = 4.0, 5.0
+#: Colours are told apart by L*, a* and b* in bins of so many units (of 256), blurred by as many bins as the light on a surface changes them;
+#: a colour that the tool has not shown is its own with this share of an even chance.
+BIN, BLUR, STRANGE = (16, 4, 4), (2.0, 1.5, 1.5), 0.02
+SHAPE = tuple(256 // size for size in BIN)
+EVEN = 1 / math.prod(SHAPE)
+#: Evidence of a pixel at most (natural logarithm of the ratio of likelihoods); pixels are not independent, and count as this share of it.
+EVIDENCE, SHARED = 3.0, 0.3
+#: What is about the tool in a picture, from half of BESIDE to AROUND pixels from its outline, is background; its colours are learned at the
+#: first of these rates, those of what has come nearer to a camera, anywhere in its picture, at the second.
+BESIDE, AROUND, LEARNING = 7, 20, (0.1, 0.3)
+#: So far (pixels) the outline is sought by its colours to either side, first and last; at so many places; standard deviation (pixels) of
+#: one that is found sharply, and so many places count as independent.
+SOUGHT, PLACES, SHARP, LINES = (6, 3), 120, 0.8, 40.0
 #: Of the points that should be seen, so many may be looked through; fewer than FEWEST say nothing.
 THROUGH, FEWEST = 0.35, 25
 #: A frame in which the tool was not found is left out; so long (s) none may be.
@@ -76,6 +94,16 @@ class Followed:
     shift: Array
     turn: Array
     seen: int
+
+
+@dataclass(frozen=True)
+class _View:
+    """A part of a picture with the tool drawn alone: rows, columns; mask (h, w), depth (h, w) in m, infinite beside it."""
+
+    rows: slice
+    columns: slice
+    mask: NDArray[np.bool_]
+    depth: NDArray[np.float32]
 
 
 @dataclass
@@ -137,21 +165,83 @@ class Follower:
         self._radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
         self._table = np.asarray(table, dtype=float)
         self._lying = np.asarray(world_from_tool, dtype=float)
-        self._color: tuple[Array, Array] | None = None
+        self._own = self._ground = self._moving = np.full(SHAPE, EVEN)
+        self._before: dict[str, RgbdFrame] = {}
         self._rng = rng
 
     # ------------------------------------------------------------ one frame
 
-    def learn_color(self, frame: RgbdFrame) -> None:
-        """Take the tool's colour from a frame in which it lies as it was first seen; one whose colour varies much is told by none."""
-        lab, found = _lab(frame), []
-        points, pixels = self._measured(frame, self._lying)
-        if len(points):
-            near = np.abs(self._distance(points, self._lying)[0]) < CLOSE / 2
-            found = lab[pixels[near, 1], pixels[near, 0], 1:]
-        if len(found) >= FEWEST:
-            spread = 1.48 * np.median(np.abs(found - np.median(found, axis=0)), axis=0)
-            self._color = np.median(found, axis=0), np.maximum(spread, FAINT)
+    def learn_colors(self, frames: Sequence[RgbdFrame]) -> None:
+        """Take the tool's colours, and those of what is about it, from frames in which it lies as it was first seen."""
+        own, ground = [], []
+        for frame in frames:
+            view = self._drawn(frame, self._lying)
+            if view is None:
+                continue
+            self._before[frame.camera] = frame
+            colors, (inside, outside) = _lab(frame), self._sides(frame, view)
+            own.append(colors[inside & np.isfinite(frame.depth)])
+            ground.append(colors[outside])
+        if sum(map(len, own)) >= FEWEST:
+            self._own, self._ground = _histogram(np.concatenate(own)), _histogram(np.concatenate(ground))
+
+    def see_around(self, frames: Sequence[RgbdFrame], pose: Array) -> None:
+        """Take the colours of what is not the tool now: of other ground about it, and of what has come into the pictures, the hand."""
+        for frame in frames:
+            view = self._drawn(frame, pose)
+            if view is None:
+                continue
+            colors, (_, outside) = _lab(frame), self._sides(frame, view)
+            about = colors[view.rows, view.columns][outside[view.rows, view.columns]]
+            if len(about) >= FEWEST:
+                self._ground = (1 - LEARNING[0]) * self._ground + LEARNING[0] * _histogram(about)
+            come = colors[self._come(frame) & outside]
+            if len(come) >= FEWEST:
+                self._moving = (1 - LEARNING[1]) * self._moving + LEARNING[1] * _histogram(come)
+
+    def _sides(self, frame: RgbdFrame, view: _View) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Pixels (H, W) of the drawn tool, and those surely beside it."""
+        mask = np.zeros(frame.depth.shape, np.uint8)
+        mask[view.rows, view.columns] = view.mask
+        return mask > 0, cv2.dilate(mask, np.ones((BESIDE, BESIDE))) == 0
+
+    def _come(self, frame: RgbdFrame) -> NDArray[np.bool_]:
+        """Where a camera that stands still measures something nearer than before the tool was taken, (H, W)."""
+        before = self._before.get(frame.camera)
+        if (
+            before is None
+            or before.depth.shape != frame.depth.shape
+            or not np.allclose(before.world_from_camera, frame.world_from_camera, atol=1e-3)
+        ):
+            return np.zeros(frame.depth.shape, bool)
+        with np.errstate(invalid="ignore"):
+            return frame.depth < before.depth - 2 * BEHIND
+
+    def evidence(self, frame: RgbdFrame) -> NDArray[np.float32]:
+        """For each pixel the logarithm of how much likelier its colour is the tool's than that of anything else, (H, W)."""
+        own = self._own + STRANGE * EVEN
+        other = 0.4 * self._ground + 0.4 * self._moving + 0.2 * EVEN
+        bins = tuple(np.moveaxis(_lab(frame) // BIN, -1, 0))
+        return np.clip(np.log(own / other), -EVIDENCE, EVIDENCE).astype(np.float32)[bins]
+
+    def _drawn(self, frame: RgbdFrame, pose: Array) -> _View | None:
+        """The tool as a camera would see it alone at a pose, with AROUND pixels about it; None where it is outside the picture."""
+        points = transforms.apply(transforms.inverse(frame.world_from_camera) @ pose, self._points)
+        if points[:, 2].min() < 0.1:
+            return None
+        pixels = frame.intrinsics.project(points)
+        height, width = frame.depth.shape
+        u0, v0 = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - AROUND, 0)
+        u1, v1 = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + AROUND + 1, [width, height])
+        if u1 - u0 < 3 or v1 - v0 < 3:
+            return None
+        u, v = np.meshgrid(np.arange(u0, u1), np.arange(v0, v1))
+        k = frame.intrinsics
+        rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(u.shape)], axis=-1)
+        tool_from_camera = transforms.inverse(pose) @ frame.world_from_camera
+        rays = np.concatenate([np.broadcast_to(tool_from_camera[:3, 3], rays.shape), rays @ tool_from_camera[:3, :3].T], axis=-1)
+        depth = self._scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+        return _View(slice(int(v0), int(v1)), slice(int(u0), int(u1)), np.isfinite(depth), depth)
 
     def _distance(self, points: Array, pose: Array) -> tuple[Array, Array]:
         """Signed distance (N,) of world points from the surface, and its gradient (N, 3) in the world."""
@@ -197,12 +287,6 @@ class Follower:
         about &= points @ self._table[:3] + self._table[3] > TABLE
         return points[about], pixels[about]
 
-    def _own_color(self, frame: RgbdFrame, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        if self._color is None or not len(pixels):
-            return np.ones(len(pixels), bool)
-        seen = _lab(frame)[pixels[:, 1], pixels[:, 0], 1:]
-        return np.linalg.norm((seen - self._color[0]) / self._color[1], axis=1) < OTHER * np.sqrt(2)
-
     def _model(self, frame: RgbdFrame, pose: Array) -> tuple[Array, Array, NDArray[np.int64], Array]:
         """Points of the surface that face the camera and that the tool itself does not hide, in the picture: world (N, 3), depth (N,), pixels (N, 2), pixels
         as numbers (N, 2)."""
@@ -234,8 +318,61 @@ class Follower:
         on, through, hidden = (int(count) for count in counts)
         return on, through, hidden
 
+    def _outlined(self, frame: RgbdFrame, pose: Array, evidence: NDArray[np.float32], sought: int) -> tuple[Array, Array]:
+        """What the colours of a frame say at a pose, as :meth:`_information`: the outline is moved to where they change.
+
+        Along the normal of each place of the drawn outline the tool's profile (inside, outside, and inside again behind a slit) is shifted
+        until it agrees best with the colours; its mean shift and how sharp that is make the residual and its weight (after Stoiber and
+        others, "Iterative Corresponding Geometry", CVPR 2022).  What is hidden says nothing.
+        """
+        matrix, vector = np.zeros((6, 6)), np.zeros(6)
+        view = self._drawn(frame, pose)
+        if view is None or not view.mask.any():
+            return matrix, vector
+        seen = frame.depth[view.rows, view.columns]
+        nearest = cv2.erode(np.where(view.mask, view.depth, 1e3).astype(np.float32), np.ones((2 * sought + 1,) * 2))
+        said = evidence[view.rows, view.columns]
+        # What lies on the tool hides it as well, and is told from it by its colour.
+        hidden = (seen < nearest - BEHIND) | ((seen < nearest - HIDES) & (said < 0))
+        said = np.where(hidden, 0, said).astype(np.float32)
+        soft = cv2.GaussianBlur(view.mask.astype(np.float32), (0, 0), 1.5)
+        slope = np.stack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)], axis=-1)
+        inner = view.mask & (cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3)), borderValue=0) == 0)
+        rows, columns = np.nonzero(inner & (np.linalg.norm(slope, axis=-1) > 0.05) & ~hidden)
+        if len(rows) < 6:
+            return matrix, vector
+        if len(rows) > PLACES:
+            chosen = np.linspace(0, len(rows) - 1, PLACES).astype(int)
+            rows, columns = rows[chosen], columns[chosen]
+        normal = -slope[rows, columns]
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        along = np.arange(-2 * sought, 2 * sought + 1)
+        u = (columns[:, None] + along * normal[:, :1]).astype(np.float32)
+        v = (rows[:, None] + along * normal[:, 1:]).astype(np.float32)
+        profile = 2 * cv2.remap(view.mask.astype(np.float32), u, v, cv2.INTER_LINEAR, borderValue=0) - 1
+        colors = cv2.remap(said, u, v, cv2.INTER_LINEAR, borderValue=0)
+        shifts = np.arange(-sought, sought + 1)
+        middle = slice(sought, 3 * sought + 1)
+        # The profile shifted by d, where it is known for all d.
+        score = np.stack([(profile[:, sought - d : 3 * sought + 1 - d] * colors[:, middle]).sum(axis=1) for d in shifts], axis=1)
+        weight = np.exp(SHARED * (score - score.max(axis=1, keepdims=True)))
+        weight /= weight.sum(axis=1, keepdims=True)
+        shift = weight @ shifts
+        spread = weight @ shifts**2 - shift**2
+        depth = view.depth[rows, columns].astype(float)
+        places = np.column_stack([columns + view.columns.start, rows + view.rows.start])
+        k = frame.intrinsics
+        rays = np.column_stack([(places[:, 0] - k.cx) / k.fx, (places[:, 1] - k.cy) / k.fy, np.ones(len(places))])
+        points = transforms.apply(frame.world_from_camera, rays * depth[:, None])
+        axis = normal @ frame.world_from_camera[:3, :2].T
+        scale = depth / k.fx
+        jacobian = np.concatenate([axis, np.cross(points - transforms.apply(pose, self.middle), axis)], axis=1)
+        sure = 1 / ((spread + SHARP**2) * scale**2) * np.clip(1 - spread / (sought**2 / 3), 0, 1)
+        sure *= min(1.0, LINES / len(sure))
+        return (jacobian * sure[:, None]).T @ jacobian, (jacobian * sure[:, None]).T @ (shift * scale)
+
     def _information(self, frame: RgbdFrame, pose: Array, measured: tuple[Array, NDArray[np.bool_]], reach: float) -> tuple[Array, Array]:
-        """What a frame says at a pose: (6, 6) and (6,), of a change of the pose as :func:`_moved` takes it."""
+        """What a frame's depth says at a pose: (6, 6) and (6,), of a change of the pose as :func:`_moved` takes it."""
         middle = transforms.apply(pose, self.middle)
         points, own = measured
         matrix, vector = np.zeros((6, 6)), np.zeros(6)
@@ -278,10 +415,11 @@ class Follower:
 
     def correct(self, frames: Sequence[RgbdFrame], state: _State, before: Array) -> tuple[_State, bool]:
         """The state after the frames of one moment, and whether the tool was found in them; before (4, 4): where it was last."""
-        measured = []
+        measured, colors = [], []
         for frame in frames:
             points, pixels = self._measured(frame, state.pose)
-            own = self._own_color(frame, pixels)
+            colors.append(self.evidence(frame))
+            own = colors[-1][pixels[:, 1], pixels[:, 0]] > 0
             if len(points) > USED:
                 chosen = self._rng.choice(len(points), USED, replace=False)
                 points, own = points[chosen], own[chosen]
@@ -289,9 +427,12 @@ class Follower:
         best, least = None, 1.0
         # A hand that stops or turns is not where it was going: then from where the tool was, and from farther off.
         for start, reach in ((state.pose, REACH), (before, REACH), (state.pose, FAR), (before, FAR)):
-            fitted = self._fitted(frames, measured, state, start, reach)
+            fitted = self._fitted(frames, measured, colors, state, start, reach)
             on, through, _ = self.looked_at(frames, fitted.pose)
             share = through / max(on + through, 1)
+            jump = _apart(fitted.pose, state.pose, self.middle)
+            if jump @ np.linalg.solve(state.covariance[:6, :6], jump) > JUMP**2:
+                continue
             if on >= FEWEST and share <= THROUGH and share < least:
                 best, least = fitted, share
             if best is not None and least < CLEAR:
@@ -299,7 +440,13 @@ class Follower:
         return (state, False) if best is None else (best, True)
 
     def _fitted(
-        self, frames: Sequence[RgbdFrame], measured: list[tuple[Array, NDArray[np.bool_]]], state: _State, start: Array, far: float
+        self,
+        frames: Sequence[RgbdFrame],
+        measured: list[tuple[Array, NDArray[np.bool_]]],
+        colors: list[NDArray[np.float32]],
+        state: _State,
+        start: Array,
+        far: float,
     ) -> _State:
         """The most likely state by what is expected and what is seen, sought from a pose (4, 4)."""
         prior = np.linalg.inv(state.covariance)
@@ -309,11 +456,15 @@ class Follower:
             reach = CLOSE + (far - CLOSE) * max(0.0, 1 - 2 * turn / ROUNDS)
             off = np.concatenate([_apart(pose, state.pose, self.middle), velocity - state.velocity])
             matrix, vector = prior.copy(), -prior @ off
-            for frame, seen in zip(frames, measured, strict=True):
-                information, pull = self._information(frame, pose, seen, reach)
-                matrix[:6, :6] += information
-                vector[:6] += pull
+            sought = round(SOUGHT[1] + (SOUGHT[0] - SOUGHT[1]) * max(0.0, 1 - 2 * turn / ROUNDS))
+            for frame, seen, color in zip(frames, measured, colors, strict=True):
+                for information, pull in (self._information(frame, pose, seen, reach), self._outlined(frame, pose, color, sought)):
+                    matrix[:6, :6] += information
+                    vector[:6] += pull
             change = np.linalg.solve(matrix, vector)
+            change *= min(
+                1.0, *(most / max(np.linalg.norm(part), 1e-12) for most, part in zip(STRIDE, np.split(change[:6], 2), strict=True))
+            )
             pose, velocity = _moved(pose, self.middle, change[:6]), velocity + change[6:]
             if reach == CLOSE and np.abs(change[:6]).max() < 2e-5:
                 break
@@ -326,8 +477,15 @@ def _add(matrix: Array, vector: Array, jacobian: Array, residual: Array, noise: 
     return matrix + (jacobian * weight[:, None]).T @ jacobian, vector + (jacobian * weight[:, None]).T @ residual
 
 
-def _lab(frame: RgbdFrame) -> NDArray[np.float32]:
-    return cv2.cvtColor(frame.color, cv2.COLOR_RGB2LAB).astype(np.float32)
+def _lab(frame: RgbdFrame) -> NDArray[np.uint8]:
+    return cv2.cvtColor(frame.color, cv2.COLOR_RGB2LAB)
+
+
+def _histogram(colors: NDArray[np.uint8]) -> Array:
+    """How often colours (N, 3) come, as shares of 1, in bins and blurred."""
+    counts = np.zeros(SHAPE)
+    np.add.at(counts, tuple((colors // BIN).T), 1.0)
+    return gaussian_filter(counts / max(len(colors), 1), BLUR)
 
 
 def _crop(pixels: NDArray[np.int64], shape: tuple[int, ...], margin: int) -> tuple[int, int, int, int]:
@@ -365,11 +523,12 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
         now = moment[-1].stamp
         if not times:
             last = now
-            follower.learn_color(moment[0])
+            follower.learn_colors(moment)
         expected, transition = _predicted(state, middle, now - times[-1] if times else 0.0)
         state, found = follower.correct(moment, expected, state.pose)
         times.append(now)
         if found:
+            follower.see_around(moment, state.pose)
             seen += 1
             last = now
         elif now - last > BLIND:

@@ -9,7 +9,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.sensor import SMEARED, STATION, capture, scene_raycaster
 from magic_core.shapes import make
 from magic_core.testing.hand import coming, hand
-from magic_perception.following import BLIND, Followed, _apart, _moved, _predicted, _State, follow
+from magic_perception.following import BLIND, Followed, Follower, _apart, _moved, _predicted, _State, follow
 
 SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -19,6 +19,12 @@ RATE = 10.0
 @pytest.fixture(scope="module")
 def hook():
     return make("l_hook", 0, length=0.25, tip=0.07, width=0.02, thickness=0.018, inner_radius=0.03, bend=np.pi / 2)
+
+
+@pytest.fixture(scope="module")
+def hanger():
+    """Of wire, in two colours."""
+    return make("hanger", 0)
 
 
 def path(hook):
@@ -35,8 +41,8 @@ def path(hook):
     return times, transforms.interpolate(knots, np.stack([rest, rest, up, over]), eased)
 
 
-def pictures(hook, times, poses, held=True, model=SMEARED, gone=np.inf):
-    grip = transforms.frame([-0.09, 0.0, 0.0], [1.0, 0, 0], [0, 0, 1.0])
+def pictures(hook, times, poses, held=True, model=SMEARED, gone=np.inf, held_at=(-0.09, 0.0, 0.0)):
+    grip = transforms.frame(held_at, [1.0, 0, 0], [0, 0, 1.0])
     skin = hand(0.02)
     for k, (t, pose) in enumerate(zip(times, poses, strict=True)):
         meshes = [hook.mesh.transformed(pose)] if t < gone else []
@@ -64,6 +70,33 @@ def test_a_known_motion_is_recovered(hook, held):
     np.testing.assert_allclose(found.times - 100.0, times)  # both cameras' pictures are of one moment
     shift, turn = errors(found, hook, times, poses)
     assert shift.max() < 0.005 and turn.max() < np.deg2rad(3)
+
+
+def test_a_thin_tool_in_a_hand_is_held_by_its_colours(hanger):
+    # Its depth is smeared to twice its breadth, more where the hand is near.
+    times, poses = path(hanger)
+    found = follow(hanger.mesh, poses[0], TABLE, pictures(hanger, times, poses, held_at=(-0.19, -0.1, 0.0)))
+    shift, turn = errors(found, hanger, times, poses)
+    assert shift.max() < 0.005 and turn.max() < np.deg2rad(3)
+
+
+def test_colours_tell_the_tool_from_the_ground_and_from_what_comes(hook):
+    times, poses = path(hook)
+    frames = [frame for frame in pictures(hook, times, poses) if frame.camera == "left"]
+    follower = Follower(hook.mesh, poses[0], TABLE)
+    follower.learn_colors(frames[:1])
+    for frame, pose in zip(frames[:6], poses[:6], strict=True):
+        follower.see_around([frame], pose)
+    last, evidence = frames[5], follower.evidence(frames[5])
+    alone, empty = (
+        capture([], SMALL, STATION["left"], 0, camera="left", stamp=0.0, raycaster=scene_raycaster(meshes)).depth
+        for meshes in ([hook.mesh.transformed(poses[5])], [])
+    )
+    of_tool = (np.abs(alone - last.depth) < 0.01) & (empty - alone > 0.03)
+    of_hand = (empty - last.depth > 0.05) & (np.abs(empty - alone) < 0.005)
+    of_table = np.abs(empty - last.depth) < 0.005
+    assert min(of_tool.sum(), of_hand.sum()) > 100
+    assert (evidence[of_tool] > 0).mean() > 0.8 and (evidence[of_hand] < 0).mean() > 0.8 and (evidence[of_table] < 0).mean() > 0.95
 
 
 def test_a_tool_that_is_gone_is_lost_and_not_guessed_on(hook):
