@@ -22,7 +22,7 @@ from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
 from magic_planner.giving_way import GAP, GAP_IN_HAND
-from magic_planner.object_motion import plan_tool_motion
+from magic_planner.object_motion import plan_tool_motion, warm_up
 
 
 class PlannerNode(Node):
@@ -41,6 +41,7 @@ class PlannerNode(Node):
         self._strategies = parameter(self, "strategies", "", "Folder of strategies; empty: those installed with magic_bringup.")
         self._timeout = parameter(self, "timeout", 10.0, "Wall time in s for one goal that names none.", low=0.05, high=3600.0)
         self._arm = self._load_arm(parameter(self, "arm", True, "Load the arm; without it only the variant fg is served."))
+        warm_up()
         self._threads = one_thread()
         self._server = OneGoalServer(
             self, PlanMotion, "plan_motion", self._answer, "another motion is being planned; send the goal again when it has ended"

@@ -76,6 +76,11 @@ ROUNDING = 0.0005
 ASIDE = (0.0, 0.002, -0.002, 0.004, -0.004, 0.006, -0.006)
 
 
+def warm_up() -> None:
+    """Load what the first motion with a wall or a hole would otherwise wait half a second for."""
+    Raycaster([Mesh(np.eye(3), np.array([[0, 1, 2]]))]).distances(np.zeros((1, 3)))
+
+
 def plan_tool_motion(
     strategy: Strategy,
     tool: SceneObject,
