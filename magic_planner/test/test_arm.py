@@ -504,3 +504,21 @@ def test_a_tool_that_hangs_elsewhere_is_not_in_the_hand(arm, solved):
     assert raised.value.code == Code.BAD_REQUEST
     with pytest.raises(MagicError, match="where the arm is"):
         arm.plan(*given)
+
+
+def test_a_refusal_says_by_how_much_the_tool_has_to_be_tipped(arm, monkeypatch):
+    given = problem()
+    tool, motion = given[1], given[5]
+    attitude = motion.world_from_tool[0][:3, :3]
+
+    def refuse(*_):
+        raise MagicError(Code.NO_GRASP, "stage grasp: faces", 0, "two that fit")
+
+    monkeypatch.setattr(arm, "_plan", refuse)
+    upright = dataclasses.replace(tool, world_from_object=transforms.make(attitude, tool.world_from_object[:3, 3]))
+    lying = dataclasses.replace(tool, world_from_object=transforms.from_rpy(np.pi / 2, 0, 0) @ upright.world_from_object)
+    for item, tipped in ((upright, False), (lying, True)):
+        with pytest.raises(MagicError) as caught:
+            arm.plan(given[0], item, *given[2:])
+        assert caught.value.code is Code.NO_GRASP and "two that fit" in caught.value.message
+        assert ("tipped by 90 degrees" in caught.value.message) == tipped
