@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not CAPTURES.is_dir(), reason="the shared captur
 #: (YCB's bowl of 159 mm at the widest; the others read from depth).
 SEEN = {
     "realsense_single/red_mug": {(343, 264): ("round with handle", True, 123)},
-    "realsense_single/cylinder": {(326, 139): ("round", False, 66)},
+    "realsense_single/cylinder": {(326, 139): ("cylinder", False, 66)},
     "mugs/blue_mug": {(331, 239): ("round with handle", True, 110)},
     "bowls_boxes/white_bowl": {(371, 280): ("round", False, 147)},
     "mugs/cluttered_0": {

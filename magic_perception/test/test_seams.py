@@ -91,7 +91,7 @@ def test_a_box_of_which_two_faces_show_has_its_sizes():
     report = Report()
     (item,) = perceive([frame], report=report).objects
     assert report.shapes[item.id] == "box"
-    assert np.sort(item.box_extents) == pytest.approx(np.sort(size), abs=0.006)
+    assert np.sort(item.box_extents) == pytest.approx(np.sort(size), abs=0.001)
     assert item.mesh.to_trimesh().is_watertight and len(item.pieces) == 1
 
 
