@@ -41,9 +41,9 @@ EVENTS = {
 NUDGE, SLIP, SLIP_TURN = 0.05, 0.012, 0.25
 #: Names of what is moved by events, and of the target.
 HAND, BLOCK, TARGET = "hand", "block", "target"
-#: Density that strategies assume, kg/m^3, and between which factors of it the true ones are drawn; friction coefficients of things,
-#: of the table and of the finger pads.
-DENSITY, FACTOR = 600.0, 2.0
+#: Between which factors of the densities that the strategy assumes the true ones are drawn; friction coefficients of things, of the table and of the
+#: finger pads.
+FACTOR = 2.0
 FRICTION, TABLE_FRICTION, PAD_FRICTION = (0.2, 0.5), (0.25, 0.5), (0.9, 1.5)
 
 
@@ -156,11 +156,13 @@ def draw(scenario: Scenario, case: Case, seed: int, strategies: str = "") -> Sce
     layout = lay_out(strategy, case, seed)
     rng = np.random.default_rng([*placing.seed_of(case.name, seed), 14])
 
-    def thing(item: SceneObject, kind: str = DYNAMIC) -> Thing:
-        return Thing(item, kind, DENSITY * float(FACTOR ** rng.uniform(-1, 1)), float(rng.uniform(*FRICTION)))
+    physics = strategy.physics
 
-    fixed = strategy.physics.target_is_fixed
-    things = [*map(thing, layout.tools), thing(layout.target, STATIC if fixed else DYNAMIC)]
+    def thing(item: SceneObject, kind: str = DYNAMIC, density: float = physics.tool_density) -> Thing:
+        return Thing(item, kind, density * float(FACTOR ** rng.uniform(-1, 1)), float(rng.uniform(*FRICTION)))
+
+    fixed = physics.target_is_fixed
+    things = [*map(thing, layout.tools), thing(layout.target, STATIC if fixed else DYNAMIC, physics.target_density)]
     things += [thing(item, STATIC) for item in layout.fixtures]
     known = (*layout.fixtures, *((layout.target,) if fixed else ()))
     return Scene(

@@ -10,7 +10,7 @@ from magic_core.shapes import make
 from magic_lab.cameras import Bodies, Camera
 from magic_lab.controllers import Error, Point
 from magic_lab.laboratory import Lab
-from magic_lab.scenarios import EVENTS, SCENARIOS, TARGET, Event, case_of, draw, hand_pose, scenario_of
+from magic_lab.scenarios import EVENTS, FACTOR, SCENARIOS, TARGET, Event, case_of, draw, hand_pose, scenario_of
 from magic_verifier.simulation import DYNAMIC
 
 
@@ -132,6 +132,16 @@ def test_a_seed_draws_a_scene_and_the_same_one_again():
     for wrong in (lambda: scenario_of("x"), lambda: case_of(scenario, "x", 0)):
         with pytest.raises(MagicError, match="allowed"):
             wrong()
+
+
+def test_true_densities_are_half_to_twice_what_the_strategy_assumes_of_each_thing():
+    scenario = scenario_of("scooping")  # whose ball is lighter than its tools
+    for seed in (94, 95):
+        scene = draw(scenario, case_of(scenario, "ladle", seed), seed)
+        physics = scene.strategy.physics
+        assert physics.target_density < physics.tool_density
+        for name, assumed in ((scene.tools[0], physics.tool_density), (scene.target, physics.target_density)):
+            assert assumed / FACTOR <= scene.thing(name).density <= FACTOR * assumed
 
 
 def test_a_camera_sees_what_the_sensor_model_sees_and_moving_things_move_in_it():

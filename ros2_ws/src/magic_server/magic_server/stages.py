@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any, Protocol
@@ -62,6 +62,7 @@ class Server(Protocol):
     planner: RemoteAction
     verifier: RemoteAction
     scene: SceneObjectArray | None
+    scenes: Sequence[SceneObjectArray]
     joints: JointStates
     words: OpenWords | None
     ahead: Ahead[pipeline.Planned]
@@ -86,12 +87,22 @@ class Stages:
     """The stages of :mod:`magic_server.pipeline`, done by the other nodes; messages pass through as they came.
 
     scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.  tried: motions for the same task that were simulated before.
+    closer: how long a better reconstruction is waited for, s, where that of what the request names is doubtful.
     """
 
     def __init__(
-        self, server: Server, token: Token, run: str, needs_verifier: bool, heatmap: bool, since: float = -math.inf, tried: int = 0
+        self,
+        server: Server,
+        token: Token,
+        run: str,
+        needs_verifier: bool,
+        heatmap: bool,
+        since: float = -math.inf,
+        tried: int = 0,
+        closer: float = 0.0,
     ) -> None:
         self._server = server
+        self._closer = closer
         self._since = since
         self._run = run
         self._heatmap = heatmap
@@ -103,8 +114,8 @@ class Stages:
         self._scene: SceneObjectArray | None = None
         self._matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
-        #: Motions that the verifier was asked for.
-        self._tried = tried
+        #: Motions for the same task that the verifier was asked for.
+        self.tried = tried
         self._last_code = 0
 
     @property
@@ -154,6 +165,11 @@ class Stages:
         scene = server.scene
         if not came or scene is None:
             raise self._no_objects(scene, wait)
+        if self._closer > 0 and self._doubtful(request):
+            # Motions for what does not stand there fail, and of those that follow more is asked, as of the last of many.
+            server.get_logger().info("waiting for a closer look at what is to be used")
+            self._token.wait(lambda: not self._doubtful(request), time.monotonic() + min(self._closer, timeout / 3), alive=still_there)
+            scene = server.scene or scene
         unknown = self._unknown(scene, request)
         if unknown:
             there = [o.id for o in scene.objects]
@@ -177,6 +193,11 @@ class Stages:
         request = replace(request, tool_id=ids_of.get("tool_id", request.tool_id), target_id=ids_of.get("target_id", request.target_id))
         pipeline.check_different(request)
         return request, "; ".join(reading.sentence for reading in readings.values())
+
+    def _doubtful(self, request: pipeline.Request) -> bool:
+        """Whether one of the things that are named by their ids is a doubtful reconstruction by the newest look."""
+        scene = self._server.scene
+        return scene is not None and any(o.id in (request.tool_id, request.target_id) and doubt(o) for o in scene.objects)
 
     def _enough(self, scene: SceneObjectArray, request: pipeline.Request) -> bool:
         """Whether there is a tool that was seen, and a target."""
@@ -288,9 +309,14 @@ class Stages:
         Perception goes on meanwhile, and an object's own frame, in which contacts are given, may be another one in the next
         scene: its axis may point the other way.  The contacts' points in the world tell.
         """
-        for scene in (self._seen, self._server.scene):
+        seen = self._seen
+        assert seen is not None
+        # A match takes as long as perception takes for several scenes: its own may be neither the first nor the newest of them.
+        since = conversions.time_from_msg(seen.header.stamp)
+        newer = [s for s in reversed(self._server.scenes) if s is not seen and conversions.time_from_msg(s.header.stamp) >= since]
+        for scene in (seen, *newer):
             if all(_stands_in(scene, c, answer.target_id) for c in answer.candidates):
-                if scene is not self._seen:
+                if scene is not seen:
                     self._take(scene, time.monotonic())
                 for candidate in answer.candidates:
                     self._carry_point(candidate)
@@ -416,10 +442,10 @@ class Stages:
             plan=plan,
             repetitions=server.settings.repetitions,
             seed=request.seed,
-            tried=self._tried,
+            tried=self.tried,
             timeout=timeout,
         )
-        self._tried += 1
+        self.tried += 1
         with self._minding(server.verifier):
             answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
         result = answer.result
@@ -479,6 +505,11 @@ def _stands_in(scene: SceneObjectArray, candidate: ContactCandidate, target_id: 
     world_from_tool = conversions.pose_from_msg(tools[candidate.tool_id].pose)
     contact = conversions.pose_from_msg(candidate.tool.object_from_contact)
     return bool(np.allclose((world_from_tool @ contact)[:3, 3], point, rtol=0.0, atol=SAME_POINT))
+
+
+def same_frames(one: SceneObjectArray, other: SceneObjectArray) -> bool:
+    """Whether two scenes have the same objects, in the same order, with their own frames where they were: contacts mean the same in both."""
+    return one.header.frame_id == other.header.frame_id and [(o.id, o.pose) for o in one.objects] == [(o.id, o.pose) for o in other.objects]
 
 
 def hull_of(item: SceneObject) -> NDArray[np.float64]:

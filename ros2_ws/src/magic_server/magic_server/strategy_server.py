@@ -48,13 +48,15 @@ from magic_server.permission import RECORDED, Claim, Limits, Look, NotYet, Verdi
 from magic_server.publication import Publication
 from magic_server.remote import SEND_GOAL, RemoteAction, RemoteService, Token, servers_of
 from magic_server.scene_change import Changed
-from magic_server.stages import Stages, complaint_code, hull_of, mark_of
+from magic_server.stages import Stages, complaint_code, hull_of, mark_of, same_frames
 from magic_server.watch import Bounds
 
 #: Answers that another look at the same things may change: perception draws them anew every ten seconds, and sooner where it can do so more closely.
 BY_SIGHT = frozenset({Code.NO_MATCH, Code.OBJECT_CUT_OFF, Code.HANDLE_NOT_SEEN, Code.NO_CANDIDATE_SUCCEEDED})
 #: A run that is to be carried out waits for such a look so many times, s each.
 LOOKS, LOOK_TIME = 2, 12.0
+#: Scenes that differ are kept, so many of them, for what another node answers of one that was the newest when it was asked.
+SCENES = 8
 #: Whose explanation is looked for when no objects come, besides that of those who publish objects: the node of this name beside this one.
 PERCEPTION = "perception"
 #: How old such an explanation may be, s.
@@ -130,6 +132,7 @@ class StrategyServer(LifecycleNode):
         self._look: tuple[SceneObjectArray, Look] | None = None
         self.scene: SceneObjectArray | None = None
         self.scene_came = -math.inf
+        self.scenes: tuple[SceneObjectArray, ...] = ()
         self.joints = JointStates()
         self.ahead: Ahead[pipeline.Planned] = Ahead()
 
@@ -217,6 +220,9 @@ class StrategyServer(LifecycleNode):
 
     def _on_objects(self, message: SceneObjectArray) -> None:
         self.scene, self.scene_came = message, time.monotonic()
+        # What stands as it stood is told again every second, with a new stamp: of those the newest is enough.
+        told = bool(self.scenes) and same_frames(self.scenes[-1], message)
+        self.scenes = (*(self.scenes[:-1] if told else self.scenes[1 - SCENES :]), message)
         if self._frame_of(message) != self.robot.base_frame and self._transforms is None:
             self._transforms = TransformListener(self, self._group)
         self._poke()
@@ -450,7 +456,9 @@ class StrategyServer(LifecycleNode):
         self.publication.take_back("a new run has begun")
         strategy = strategies.known(goal.strategy, self.settings.strategies or None)
         request = self._request(goal)
-        stages = Stages(self, token, self._run_id, needs_verifier=strategy.simulatable, heatmap=goal.want_pictures)
+        looks = LOOKS if self._arm is not None and request.variant == MotionPlan.ARM else 0
+        closer = LOOK_TIME if looks else 0.0
+        stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures, closer=closer)
         notify = self._notifier(handle)
 
         def work(
@@ -472,7 +480,6 @@ class StrategyServer(LifecycleNode):
         bounds = Bounds(0, self._loop.replans, time.monotonic() + request.timeout)
         tried: list[pipeline.Outcome] = []
         changes: list[str] = []
-        looks = LOOKS if self._arm is not None and request.variant == MotionPlan.ARM else 0
         while True:
             left = max(1.0, min(request.timeout, bounds.end - time.monotonic()))
             outcome = work(replace(request, timeout=left), stages, strategy.reflections)
@@ -485,8 +492,7 @@ class StrategyServer(LifecycleNode):
                 changes.append(f"{outcome.code.name}: {outcome.message}")
                 notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; perception has looked again", ()))
                 # Of motions for many looks one may pass by chance as well as of many for one.
-                simulated = sum(outcome.simulations for outcome in tried)
-                stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures, tried=simulated)
+                stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures, tried=stages.tried)
                 continue
             if outcome.code != Code.OK:
                 result.message = "; planned again from there: ".join([*changes, outcome.message])

@@ -184,6 +184,24 @@ def test_what_one_look_does_not_show_another_may(bench, monkeypatch, shows):
     assert shows or result.message == "no handle in sight"
 
 
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_better_look_at_a_doubtful_tool_is_waited_for_a_while(bench, monkeypatch, comes):
+    monkeypatch.setattr(strategy_server, "LOOK_TIME", 10.0 if comes else 0.3)
+    scene, doubted, sure = bench.table.scene, [], []
+    doubtful = Stages._doubtful
+    monkeypatch.setattr(Stages, "_doubtful", lambda stages, request: doubted.append(request) or doubtful(stages, request))
+
+    def see():
+        tool, *rest = scene().objects
+        return replace(scene(), objects=(replace(tool, confidence=0.9 if comes and doubted else 0.03), *rest))
+
+    bench.fakes.see(see)
+    bench.until(lambda: bench.server.scene.objects[0].confidence < 0.1)
+    bench.fakes.on_match = lambda request: sure.append(bench.server.scene.objects[0].confidence > 0.5) or matches(request)
+    run(bench)
+    assert sure[0] is comes and moves(bench) == 3
+
+
 def test_what_fails_by_one_look_is_tried_by_another_and_has_to_show_more(bench, monkeypatch):
     monkeypatch.setattr(strategy_server, "LOOK_TIME", 5.0)
     passes, place = bench.fakes.verify, bench.table.target
@@ -193,11 +211,12 @@ def test_what_fails_by_one_look_is_tried_by_another_and_has_to_show_more(bench, 
             return passes(goal, canceled)
         if goal.tried == 5:  # both candidates with all their grasps
             bench.table.target += 0.002
-        return VerifyMotion.Result(code=int(Code.DRIFT), message="it drifts")
+        return VerifyMotion.Result(code=int(Code.DRIFT), message="it drifts", rollouts=9)
 
     bench.fakes.on_verify = verify
     result = run(bench)
-    assert [goal.tried for goal in asked(bench, "verify_motion")] == list(range(7)) and result.simulations == 7
+    # Motions count, not their rollouts.
+    assert [goal.tried for goal in asked(bench, "verify_motion")] == list(range(7)) and result.simulations == 6 * 9 + 1
     assert result.notes[0].startswith("NO_CANDIDATE_SUCCEEDED") and moves(bench) == 3
 
 

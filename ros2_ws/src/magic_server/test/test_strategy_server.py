@@ -548,6 +548,28 @@ def test_the_contacts_belong_to_the_objects_that_are_planned_with(bench):
         result, _ = bench.run()
         assert result.code == 0, result.message
         np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), newer.world_from_object, atol=1e-9)
+        # A long match: its objects came after the run began, and when it answers there are newer ones again.
+        shifted = replace(first, world_from_object=transforms.make(translation=[0.0, 0.0, 0.001]) @ first.world_from_object)
+        scenes["newest"] = replace(fakes.scene(), objects=(shifted, fakes.scene().objects[1]))
+        bench.fakes.publish(scenes["older"])
+        bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] > 0)
+
+        def slow(request):
+            for name in ("newer", "newest"):
+                came = bench.server.scene_came
+                bench.fakes.publish(scenes[name])
+                bench.until(lambda came=came: bench.server.scene_came > came)
+            asked.append(request)
+            return MatchContact.Response(
+                candidates=[conversions.candidate_to_msg(fakes.candidate(), newer.world_from_object)], target_id="object_2", features="fake"
+            )
+
+        bench.fakes.on_match = slow
+        planned.clear()
+        asked.clear()
+        result, _ = bench.run()
+        assert (result.code, len(asked)) == (0, 1), result.message
+        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), newer.world_from_object, atol=1e-9)
     finally:
         bench.fakes.publish(fakes.scene())
 
