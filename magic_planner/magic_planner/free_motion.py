@@ -58,12 +58,10 @@ class FreeMotion:
                 )
 
         def hold(room: float) -> None:
-            self.space.hold(request, branch.grasp, request.roomy(request.tool, room))
-            robot.allow(request.tool.id, "table")
+            self.space.hold_with_room(request, branch.grasp, room, (start, goal))
 
         def clear(path: Array) -> bool:
-            # What was left out: the table, above which the task may begin by a hair.
-            self.space.hold(request, branch.grasp)
+            self.space.hold(request, branch.grasp)  # to the table nothing was asked but not to pass through it
             return robot.free(timing.swept(path, FINE), request.budget, "transfer")
 
         # A tool shifts a little in the hand when it is gripped: it is carried with room about it, where its ends leave that.

@@ -29,6 +29,8 @@ from magic_planner.timing import Limits
 
 #: Joint positions that are tried as starts of the inverse kinematics.
 SEEDS = 6000
+#: How far the table's slab lies below its plane, m: what lies on it does not touch it.
+TABLE_GAP = 0.001
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ class Robot:
         solids = [fcl.CollisionObject(shape) for shape in shapes]
         self.world.add_object(fcl.FCLObject(name, fcl_pose(world_from_object), solids, [fcl_pose(np.eye(4))] * len(solids)))
 
-    def add_table(self, plane: NDArray[np.float64], name: str = "table", gap: float = 0.001) -> None:
+    def add_table(self, plane: NDArray[np.float64], name: str = "table", gap: float = TABLE_GAP) -> None:
         """Put the table in as a slab 0.2 m thick whose top lies ``gap`` below the plane (4,); what of the arm never moves may touch it."""
         from mplib.collision_detection import fcl
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from magic_core import transforms
 from magic_planner.cloud import CloudSettings, cloud_name
 from magic_planner.grasps import Grasp
 from magic_planner.request import Request
-from magic_planner.robot import Robot
+from magic_planner.robot import TABLE_GAP, Robot
 
 Array = NDArray[np.float64]
+#: The table as it stands for a tool that is carried with room about it.
+DEEPER = "table/deeper"
 
 
 class Workspace:
@@ -54,9 +57,20 @@ class Workspace:
         if robot.world.has_object(name):
             robot.world.remove_object(name)
         robot.open_to(grasp.width)
+        if robot.world.has_object(DEEPER):
+            robot.world.remove_object(DEEPER)
         robot.attach(name, shapes or request.shapes, transforms.inverse(grasp.tool_from_tcp), tuple(robot.hand))
-        robot.allow(name, "table", *request.surroundings(), allowed=False)
+        robot.allow(name, "table", DEEPER, *request.surroundings(), allowed=False)
         self.ignore_target(request, False)
+
+    def hold_with_room(self, request: Request, grasp: Grasp, room: float, ends: Iterable[Array]) -> None:
+        """As :meth:`hold`, the tool with so much room (m) about it.  To the table it needs none, above which the task may begin by a hair: it stands that much
+        deeper for the tool, and not at all where the ``ends`` (J,) of the way meet even that.  :meth:`hold` undoes it."""
+        robot, name = self.robot, request.tool.id
+        self.hold(request, grasp, request.roomy(request.tool, room))
+        robot.allow(name, "table")
+        robot.add_table(request.plane, DEEPER, TABLE_GAP + room)
+        robot.allow(name, DEEPER, allowed=any(robot.collides(q) for q in ends))
 
     def carry_off(self, request: Request, grasp: Grasp) -> None:
         """As :meth:`hold`, and the tool may touch what it leaves, or is led to."""

@@ -23,6 +23,7 @@ from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
 from magic_planner.request import ArmSettings, StageError
 from magic_planner.schedule import slowed
 from magic_planner.task_path import TaskPath
+from magic_planner.workspace import DEEPER
 
 
 def problem(at=(0.6, 0.0), **changes):
@@ -343,6 +344,33 @@ def test_a_carried_tool_keeps_room_about_it():
     box = scenes.box([0.1, 0.1, 0.1])
     (large,) = grown([box], 0.01)
     np.testing.assert_allclose(np.ptp(large.vertices, axis=0), 0.12)
+
+
+def test_a_tool_that_is_carried_with_room_does_not_pass_through_the_table(arm, monkeypatch):
+    asked = []
+    carry = arm.free.carry
+    monkeypatch.setattr(arm.free, "carry", lambda *given: asked.append(given) or carry(*given))
+    strategy, tool, *rest = problem()
+    arm.plan(strategy, tool, *rest)
+    request, branch, q, _ = asked[-1]
+    robot, space, room = arm.robot, arm.space, arm.settings.room
+    pose = robot.chain.forward(q[None])[0] @ transforms.inverse(branch.grasp.tool_from_tcp)
+    lowest = float(transforms.apply(pose, tool.mesh.vertices)[:, 2].min())
+
+    def meets(above, *ends):
+        """Whether the tool meets the table that it is so far above."""
+        at = dataclasses.replace(request, plane=np.array([0.0, 0.0, 1.0, above - lowest]), obstacles=(), cloud={})
+        space.build(at)
+        space.hold_with_room(at, branch.grasp, room, ends)
+        for table in ("table", DEEPER):
+            robot.allow(table, *robot.planner.user_link_names)
+        return robot.collides(q)
+
+    assert not meets(0.005)
+    assert meets(-2 * room)
+    assert not meets(-2 * room, q)  # nothing is found between ends that meet it: it is left to the look without room
+    space.hold(request, branch.grasp)
+    assert not robot.world.has_object(DEEPER)
 
 
 def test_a_plan_carries_its_margins_and_a_heavy_tool_is_refused_with_its_number(arm, solved):
