@@ -33,6 +33,8 @@ from magic_server.settings import Settings
 
 #: How much later than here the same objects may arrive at the matcher, s.
 OBJECTS_LAG = 5.0
+#: An id that is in no objects yet is looked for so long, s: who asks by the newest ones may be quicker than they come here.
+ID_LAG = 1.0
 #: Points of a contact that are nearer than this are the same, m: it went through messages, but nobody measured it anew.
 SAME_POINT = 1e-6
 #: A reconstruction whose surface may be off by more than this, m, is no longer what a hook, a handle or a hollow is judged by; where nobody says by how much,
@@ -146,13 +148,14 @@ class Stages:
         if not self._token.wait(lambda: all(len(s) <= 1 for s in server.servers().values()), deadline, alive=lambda: None):
             check_single(server.servers())
         wait = min(timeout, server.patience * server.settings.objects)
+        soon = time.monotonic() + ID_LAG
 
         def enough() -> bool:
             scene = server.scene
             if scene is None or conversions.time_from_msg(scene.header.stamp) < self._since:
                 return False
-            # A wrong id is answered at once; too few objects may still become enough.
-            return bool(self._unknown(scene, request)) or self._enough(scene, request)
+            # A wrong id is answered soon; too few objects may still become enough.
+            return time.monotonic() > soon if self._unknown(scene, request) else self._enough(scene, request)
 
         self._minds = {remote.name: remote.mind() for remote in (server.planner, *self._verifier())}
         watches = [server.objects_watch(), *(remote.watch() for remote in needed)]

@@ -132,7 +132,7 @@ class StrategyServer(LifecycleNode):
         self._look: tuple[SceneObjectArray, Look] | None = None
         self.scene: SceneObjectArray | None = None
         self.scene_came = -math.inf
-        self.scenes: tuple[SceneObjectArray, ...] = ()
+        self.scenes: Sequence[SceneObjectArray] = ()
         self.joints = JointStates()
         self.ahead: Ahead[pipeline.Planned] = Ahead()
 

@@ -574,6 +574,24 @@ def test_the_contacts_belong_to_the_objects_that_are_planned_with(bench):
         bench.fakes.publish(fakes.scene())
 
 
+def test_an_id_whose_objects_are_on_their_way_is_waited_for_a_moment(bench, monkeypatch):
+    """Who asks has the newest objects already."""
+    scene, unknown, late = fakes.scene(), Stages._unknown, []
+    newer = replace(scene, objects=(replace(scene.objects[0], id="object_3"), scene.objects[1]))
+
+    def looked_up(stages, seen, request):
+        if not late:
+            late.append(bench.fakes.publish(newer))
+        return unknown(stages, seen, request)
+
+    monkeypatch.setattr(Stages, "_unknown", looked_up)
+    bench.fakes.on_match = lambda request: MatchContact.Response(code=int(Code.NO_MATCH), message="asked")
+    try:
+        assert bench.run(tool_id="object_3")[0].code == Code.NO_MATCH
+    finally:
+        bench.fakes.publish(scene)
+
+
 def test_goals_carry_what_the_servers_need(bench):
     bench.run(variant="arm", seed=7)
     names = [name for name, _ in bench.fakes.goals]
