@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from scipy.spatial import ConvexHull
 
 pytest.importorskip("magic_matcher.matching")
 pytest.importorskip("magic_planner.object_motion")
 
-from magic_core import shapes, transforms
+from magic_core import decomposition, shapes, transforms
 from magic_core import strategy as strategies
-from magic_core.decomposition import convex_pieces
+from magic_core.decomposition import ABOVE, convex_pieces
 from magic_core.errors import Code, MagicError
 from magic_core.goal import Goal
 from magic_core.mesh import Mesh
@@ -104,7 +105,7 @@ def test_pieces_of_a_ring_fill_it_and_leave_its_hole_open():
     ring = trimesh.creation.torus(0.05, 0.01)
     pieces = convex_pieces(Mesh(ring.vertices, ring.faces))
     assert _volume(pieces) == pytest.approx(ring.volume, rel=0.15)
-    assert all(np.linalg.norm(p.vertices[:, :2], axis=1).min() > 0.035 for p in pieces)
+    assert all(np.linalg.norm(p.vertices[:, :2], axis=1).min() > 0.0385 for p in pieces)
 
 
 def test_a_convex_mesh_is_one_piece():
@@ -124,6 +125,64 @@ def test_a_thin_hollow_thing_is_not_taken_for_convex():
     assert _volume(pieces) < 1.6 * _volume(shape.pieces)
     plate = trimesh.creation.box(extents=[0.3, 0.05, 0.004])
     assert len(convex_pieces(Mesh(plate.vertices, plate.faces))) == 1
+
+
+def _dish(depth, width, floor=0.003, rim=0.02):
+    """A board with a spherical hollow of that depth and width at its top, z = 0, and the ball that made it: centre and radius."""
+    radius = (depth**2 + (width / 2) ** 2) / (2 * depth)
+    size = width + 2 * rim
+    board = trimesh.creation.box(extents=[size, size, depth + floor])
+    board.apply_translation([0, 0, -(depth + floor) / 2])
+    ball = trimesh.creation.icosphere(5, radius)
+    ball.apply_translation([0, 0, radius - depth])
+    dish = board.difference(ball)
+    return Mesh(dish.vertices, dish.faces), np.array([0, 0, radius - depth]), radius
+
+
+def _into(pieces, centre, radius):
+    """How far pieces reach into a ball, m, by points all over their surfaces, within the plane z = 0."""
+    points = np.concatenate([trimesh.sample.sample_surface(trimesh.convex.convex_hull(p.vertices), 2000, seed=0)[0] for p in pieces])
+    return float((radius - np.linalg.norm(points - centre, axis=1))[points[:, 2] < 1e-6].max())
+
+
+@pytest.mark.parametrize(("depth", "width"), [(0.02, 0.08), (0.005, 0.06)])
+def test_pieces_follow_a_hollow_of_known_depth(depth, width):
+    mesh, centre, radius = _dish(depth, width)
+    # Long as a spoon is: cubes as coarse as for one.
+    handle = trimesh.creation.box(extents=[0.5, 0.02, 0.006])
+    handle.apply_translation([0.25 + width / 2 + 0.01, 0, -0.004])
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces).union(handle)
+    pieces = convex_pieces(Mesh(whole.vertices, whole.faces))
+    assert _into(pieces, centre, radius) < ABOVE + 0.0003
+    # Followed, not left out: what is beneath the hollow is there, and no piece lies outside of the solid but by that.
+    assert _volume(pieces) == pytest.approx(whole.volume, rel=0.08)
+    assert len(pieces) < 400
+
+
+def test_a_bowl_without_thickness_stays_whole_and_open():
+    ball = trimesh.creation.icosphere(4, 0.04)
+    cap = ball.slice_plane([0, 0, -0.01], [0, 0, -1])
+    plane = trimesh.creation.box(extents=[0.3, 0.02, 0.003])
+    plane.apply_translation([0.189, 0, -0.0115])
+    whole = trimesh.util.concatenate([cap, plane])
+    pieces = convex_pieces(Mesh(whole.vertices, whole.faces))
+    assert _into(pieces, np.zeros(3), 0.04) < ABOVE + 0.0003
+    planes = [ConvexHull(p.vertices).equations for p in pieces]
+    points = trimesh.sample.sample_surface(cap, 1000, seed=0)[0]
+    gap = np.min([(points @ p[:, :3].T + p[:, 3]).max(axis=1) for p in planes], axis=0)
+    assert gap.max() < 0.001
+
+
+def test_furrows_in_which_nothing_can_lie_are_cut_no_further(monkeypatch):
+    board = trimesh.creation.box(extents=[0.1, 0.05, 0.01])
+    for x in np.linspace(-0.04, 0.04, 10):
+        furrow = trimesh.creation.box(extents=[0.002, 0.06, 0.012])
+        furrow.apply_translation([x, 0, 0.005])
+        board = board.difference(furrow)
+    mesh = Mesh(board.vertices, board.faces)
+    count = len(convex_pieces(mesh))
+    monkeypatch.setattr(decomposition, "ABOVE", np.inf)
+    assert len(convex_pieces(mesh)) == count > 1
 
 
 @pytest.mark.parametrize(
