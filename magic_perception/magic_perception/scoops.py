@@ -42,6 +42,8 @@ FAR, WITHIN, STANDING = 2.5, 0.85, 0.05
 #: What sticks out of a handle's side is a part of it where it is wider than this share of the handle's mean width.
 WHISKER = 0.6
 _SECTORS, _PIECES = 48, 16
+#: Pieces follow a bowl's profile to this, m.
+FOLLOWED = 0.001
 
 
 @dataclass(frozen=True)
@@ -336,7 +338,7 @@ def bowl_solid(bowl: Bowl) -> tuple[Mesh, list[Mesh]]:
     ]
     mesh = Mesh(vertices, np.concatenate(faces))
     # Pieces between rings at which the profile bends, and sectors; the floor's middle is one.
-    cuts = np.array([0.4, 0.7, 0.9, 1.0])
+    cuts = _bends(bowl)
     inner, outer = bowl.surface(cuts, _PIECES, 0.0), bowl.surface(cuts, _PIECES, bowl.wall)
     outer[-1] = bowl.rim(bowl.wall, _PIECES)
     outer[..., 2], inner[..., 2] = np.maximum(outer[..., 2], 0), np.maximum(inner[..., 2], 0.001)
@@ -346,3 +348,19 @@ def bowl_solid(bowl: Bowl) -> tuple[Mesh, list[Mesh]]:
             t = (s + 1) % _PIECES
             clouds.append(np.concatenate([side[[k, k, k + 1, k + 1], [s, t, s, t]] for side in (inner, outer)]))
     return mesh, [hull for cloud in clouds if (hull := hull_of(cloud)) is not None]
+
+
+def _bends(bowl: Bowl) -> NDArray[np.float64]:
+    """Shares (K,) of the way to the rim, the last 1, so that a flat floor up to the first and straight walls between them are within FOLLOWED of the hollow."""
+    shares = np.linspace(0, 1, 101)
+    profile = np.column_stack([float(bowl.half.mean()) * shares, -np.interp(shares, RINGS, bowl.depths)])
+    chosen = [max(1, int(np.flatnonzero(profile[:, 1] <= profile[0, 1] + FOLLOWED)[-1]))]
+    while chosen[-1] < 100:
+        begin = chosen[-1]
+        for end in range(100, begin, -1):
+            along = transforms.unit(profile[end] - profile[begin])
+            away = profile[begin:end] - profile[begin]
+            if np.abs(along[0] * away[:, 1] - along[1] * away[:, 0]).max() <= FOLLOWED:
+                break
+        chosen.append(end)
+    return shares[chosen]

@@ -211,6 +211,19 @@ def test_a_scoop_is_hollow_also_where_its_near_wall_hides_it(family, seed, yaw, 
     assert np.sqrt(np.mean(off)) < least, np.sqrt(np.mean(off))
 
 
+@pytest.mark.parametrize(("deep", "half"), [(0.02, 0.04), (0.012, 0.03), (0.008, 0.025)])
+def test_the_pieces_of_a_bowl_do_not_fill_its_hollow(deep, half):
+    bowl = scoops.Bowl(transforms.make(translation=[0, 0, deep + 0.004]), np.array([half, half]), deep * (1 - scoops.RINGS**2), 0.002)
+    _, pieces = scoops.bowl_solid(bowl)
+    assert len(pieces) <= 49
+    above = bowl.surface(np.linspace(0.02, 0.95, 30), 32, 0.0).reshape(-1, 3) + [0, 0, 0.002]
+    for piece in pieces:
+        corners = piece.vertices[piece.faces]
+        outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        off = np.einsum("fi,pfi->pf", outward, above[:, None] - corners[None, :, 0])
+        assert (off > 0).any(axis=1).all()
+
+
 def test_a_hollow_is_held_against_all_that_is_seen_in_it():
     """A lump in a bowl, below its rim or above it, is no hollow, though most of what is seen fits one."""
     depths = 0.02 * np.sqrt(np.maximum(1 - scoops.RINGS**2, 0))
