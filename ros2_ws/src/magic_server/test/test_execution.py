@@ -276,7 +276,7 @@ def moved(by):
     "now, says, code",
     [
         (moved(0.03), "object_1 has moved since the plan, in mm: 29.9", Code.OK),
-        (fakes.scene(("object_1",)), "objects gone since the plan: 'object_2'", Code.UNKNOWN_OBJECT),
+        (fakes.scene(("object_1",)), "objects gone since the plan: 'object_2'", Code.NO_OBJECTS),
         (fakes.scene(("object_1", "object_2", "object_3")), "objects come since the plan: 'object_3'", Code.OK),
     ],
     ids=["moved", "gone", "come"],
