@@ -89,6 +89,7 @@ WHEELS = {
     "jinja2": "Jinja2",
     "sklearn": "scikit-learn",
     "mani_skill": "mani-skill",
+    "rerun": "rerun-sdk",
 }
 #: What comes with ROS, or with the workspace's build, and not from PyPI.
 OF_ROS = {"rclpy", "launch", "ament_index_python", "magic_interfaces", "rcl_interfaces", "builtin_interfaces"}

@@ -48,6 +48,7 @@ setup(
         beside("magic_perception"),
         beside("magic_server"),
     ],
+    extras_require={"rerun": ["rerun-sdk"]},
     zip_safe=False,
     maintainer="MAGIC developers",
     maintainer_email="maintainers@magic-robotics.org",

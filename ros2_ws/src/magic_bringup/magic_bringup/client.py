@@ -23,6 +23,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage, Image
 
+from magic_bringup import rerun_recording
 from magic_bringup.connection import Client, connected
 from magic_bringup.doctor import examine
 from magic_bringup.record import IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
@@ -98,6 +99,10 @@ class Witness:
 
 def run(client: Client, given: argparse.Namespace) -> int:
     """A run with its progress, what came of it, and why."""
+    if given.rerun:
+        rerun_recording.rerun()
+        if given.out is None:
+            raise MagicError(Code.BAD_REQUEST, "--rerun", "without --out", "a folder for it: --out DIR")
     witness = Witness(client.node) if given.out is not None else None
     begin, said = time.monotonic(), [""]
 
@@ -125,7 +130,10 @@ def run(client: Client, given: argparse.Namespace) -> int:
             say(f"  picture    {path}")
         summary = empty_summary(goal.strategy, given.variant, command=given.command)
         take(summary, result)
-        say(f"  report     {written(witness.record(summary, result), given.out)}")
+        record = witness.record(summary, result)
+        say(f"  report     {written(record, given.out)}")
+        if given.rerun:
+            say(f"  rerun      {rerun_recording.write(record, given.out)}")
     return 0 if result.code == Code.OK else 1
 
 
@@ -287,6 +295,7 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
     one.add_argument("--timeout", type=float, default=0.0, help="s for everything (default: the server's)")
     one.add_argument("--out", type=Path, help="folder for report.html, summary.json and pictures: the simulation, the heat map")
+    one.add_argument("--rerun", action="store_true", help="write run.rrd into it as well, for the rerun viewer (an extra)")
     two = verbs.add_parser("match", help="find the corresponding contacts")
     two.add_argument("strategy", help="hooking, hanging, scooping, or the folder of a strategy")
     two.add_argument("--tool", nargs="+", default=[], help="object ids to choose the tool from (default: all)")

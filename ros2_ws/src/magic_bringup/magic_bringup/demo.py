@@ -55,7 +55,7 @@ class Options:
 
     command: what the user typed, for the report.  weights: of the features.  launch: a launch file and its arguments, which start the
     nodes instead.  cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it is played.
-    files: parameters files by node.
+    files: parameters files by node.  rerun: a recording for the rerun viewer as well.
     """
 
     strategy: str
@@ -74,6 +74,7 @@ class Options:
     cameras: tuple[str, ...] = ()
     topics: tuple[tuple[str, str], ...] = ()
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
+    rerun: bool = False
 
 
 def look_into(bag: Path, topics: Sequence[tuple[str, str]] = (), cameras: Sequence[str] = ()) -> tuple[tuple[str, ...], float]:
@@ -440,6 +441,7 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument("--features", default="auto", help="feature backend: auto, embedded or dinov2 (default auto)")
     parser.add_argument("--weights", default="", help="weights of the features: a hub name or a local folder (facebook/dinov2-base)")
     parser.add_argument("--out", type=Path, help="folder for summary.json and report.html (default out/<strategy>_<variant>)")
+    parser.add_argument("--rerun", action="store_true", help="write run.rrd into it as well, for the rerun viewer (an extra)")
     parser.add_argument("--tool", default="", help="the tool: an id, or a name such as 'the red mug' (default: the matcher chooses)")
     parser.add_argument("--target", default="", help="the target: an id or a name (default: the matcher chooses)")
     parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
@@ -470,6 +472,13 @@ def parse(argv: list[str] | None = None) -> Options:
     parser.add_argument("--root", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
     given = sys.argv[1:] if argv is None else argv
     a = parser.parse_args(given)
+    if a.rerun:
+        from magic_bringup import rerun_recording
+
+        try:
+            rerun_recording.rerun()
+        except MagicError as error:
+            parser.error(error.message)
     if a.launch:
         if not Path(a.launch[0]).is_file():
             parser.error(f"--launch: {a.launch[0]}: no such file")
@@ -510,6 +519,7 @@ def parse(argv: list[str] | None = None) -> Options:
         cameras=tuple(a.cameras),
         topics=tuple(topics),
         files=files,
+        rerun=a.rerun,
     )
 
 
@@ -566,11 +576,13 @@ def _run(options: Options) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     write_summary(record, options.out)
     try:
-        from magic_bringup import report, run_bag
+        from magic_bringup import report, rerun_recording, run_bag
 
         report.save(record, options.out)
         report.write(record, options.out / "report.html", options.out / "logs")
         run_bag.write(record, options.out)
+        if options.rerun:
+            rerun_recording.write(record, options.out)
     except Exception as error:  # the summary counts, the pictures are an addition
         import traceback
 
