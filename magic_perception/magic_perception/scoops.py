@@ -43,7 +43,7 @@ FAR, WITHIN, STANDING = 2.5, 0.85, 0.05
 WHISKER = 0.6
 _SECTORS, _PIECES = 48, 16
 #: Pieces follow a bowl's profile to this, m.
-FOLLOWED = 0.001
+FOLLOWED = 0.0015
 
 
 @dataclass(frozen=True)
