@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_bringup.record import Record
+from magic_bringup.run_bag import PERIOD, joints_at
 from magic_core import conversions
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
@@ -23,8 +24,6 @@ from magic_core.robot_pictures import link_mesh
 
 #: Of the recording, in the folder of a run.
 NAME = "run.rrd"
-#: Between two poses of the motion, s.
-PERIOD = 0.05
 
 
 def rerun() -> Any:
@@ -56,7 +55,7 @@ def write(record: Record, folder: Path) -> Path:
     log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     log("verdict", rr.TextDocument(f"{record.summary['strategy']}, {record.summary['variant']}: {record.summary['message']}"))
     for topic, message in record.images.items():
-        depth = message.encoding in ("16UC1", "32FC1")
+        depth = topic.endswith("aligned_depth_to_color/image_raw")
         picture = conversions.depth_from_msg(message) if depth else conversions.color_from_msg(message)
         log(f"cameras/{topic.strip('/')}", rr.DepthImage(picture, meter=1.0) if depth else rr.Image(picture))
     objects = conversions.scene_from_msg(record.scene).objects if record.scene is not None else ()
@@ -82,10 +81,7 @@ def write(record: Record, folder: Path) -> Path:
             rr.set_time_seconds("motion", when, recording=stream)
             placed(f"world/objects/{record.result.tool_id}", way[int(np.abs(times - when).argmin())], static=False)
             if links:
-                joints = [np.interp(when, arm.times, column) for column in arm.positions.T]
-                held = arm.grasp_time <= when and not (arm.release_time is not None and when > arm.release_time)
-                fingers = robot.finger_positions(arm.grasp_width if held else robot.config.opening)
-                poses = robot.poses(robot.arm_positions(np.array([*joints, *fingers])))
+                poses = robot.poses(robot.arm_positions(joints_at(robot, arm, when)))
                 for link in links:
                     placed(f"world/robot/{link}", poses[link], static=False)
     rr.disconnect(recording=stream)

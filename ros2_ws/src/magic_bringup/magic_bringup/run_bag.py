@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TransformStamped
+from numpy.typing import NDArray
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
@@ -32,6 +33,7 @@ from magic_bags.recording import Recording
 from magic_bringup.record import Record
 from magic_bringup.robot_model import link_frames, shown
 from magic_core import conversions
+from magic_core.motion import ArmMotion
 from magic_core.robot import Description
 from magic_interfaces.msg import MotionPlan
 
@@ -58,6 +60,13 @@ def write(record: Record, folder: Path) -> Path:
         if record.result is not None:
             _tell(bag, record.result, start)
     return path
+
+
+def joints_at(robot: Description, arm: ArmMotion, when: float) -> NDArray[np.float64]:
+    """The arm's joints (J,) of a motion at a time, s, and after them the fingers'."""
+    held = arm.grasp_time <= when and not (arm.release_time is not None and when > arm.release_time)
+    fingers = robot.finger_positions(arm.grasp_width if held else robot.config.opening)
+    return np.array([*(np.interp(when, arm.times, column) for column in arm.positions.T), *fingers])
 
 
 def _tell(bag: Recording, result: Any, start: float) -> None:
@@ -91,11 +100,7 @@ def _tell(bag: Recording, result: Any, start: float) -> None:
         bag.write("/robot_description", String(data=shown(robot)), start, latched=True, depth=1)
         arm = motion.arm_motion
         for when in np.arange(0.0, arm.times[-1] + PERIOD, PERIOD):
-            positions = {name: float(np.interp(when, arm.times, arm.positions[:, j])) for j, name in enumerate(arm.joint_names)}
-            held = arm.grasp_time <= when and not (arm.release_time is not None and when > arm.release_time)
-            width = arm.grasp_width if held else robot.config.opening
-            positions |= dict(zip((joint.name for joint in robot.fingers), robot.finger_positions(width).tolist(), strict=True))
-            frames = link_frames(robot, positions)
+            frames = link_frames(robot, robot.arm_positions(joints_at(robot, arm, when)))
             transforms = [
                 TransformStamped(header=conversions.header(parent, start + when), child_frame_id=child, transform=transform)
                 for (parent, child), transform in zip(frames, conversions.transforms_to_msgs(np.stack(list(frames.values()))), strict=True)
