@@ -250,7 +250,8 @@ class Solid:
     """What collision tests need to know of P convex pieces, in their frame.
 
     tree: their surfaces; normals (P, F, 3), offsets (P, F): their planes, the shorter lists filled up, and how many (P,) there are
-    of each; centres (P, 3), radii (P,): balls about them; first (P, 3): a point of each.
+    of each; centres (P, 3), radii (P,): balls about them; halves (P, 3): half the sides of their boxes, about the same centres;
+    first (P, 3): a point of each.
     """
 
     tree: Any
@@ -259,6 +260,7 @@ class Solid:
     counts: NDArray[np.int64]
     centres: NDArray[np.float64]
     radii: NDArray[np.float64]
+    halves: NDArray[np.float64]
     first: NDArray[np.float64]
 
 
@@ -290,6 +292,7 @@ def solid(pieces: Iterable[Mesh]) -> Solid:
         counts=counts,
         centres=centres,
         radii=np.array([np.linalg.norm(v - c, axis=1).max() for (v, _), c in zip(hulls, centres, strict=True)]),
+        halves=np.array([(vertices.max(axis=0) - vertices.min(axis=0)) / 2 for vertices, _ in hulls]),
         first=np.array([vertices[0] for vertices, _ in hulls]),
     )
     return _SOLIDS.put(key, (hulls, made), len(faces) * TREE_BYTES + normals.nbytes + offsets.nbytes)[1]

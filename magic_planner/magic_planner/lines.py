@@ -33,15 +33,20 @@ def crossings(
     their points to both sides in which crossings are wanted; of those farther away not all are left out.
     """
     count = points.shape[1]
+    # A line along one of a box's sides is between that pair of planes all the way, or never.
+    inverse = 1.0 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     for piece in range(len(pieces.radii)):
         groups = np.arange(len(points)) if near is None else np.flatnonzero(near[:, piece])
         if not len(groups):
             continue
-        # Only lines that pass through a piece's ball are cut with its planes.
+        # Only lines that pass through a piece's ball and box are cut with its planes, of which there are many more.
         arm = pieces.centres[piece] - points[groups]
         along = np.einsum("gcj,gj->gc", arm, directions[groups])
         passes = np.einsum("gcj,gcj->gc", arm, arm) - along**2 < (pieces.radii[piece] + 1e-6) ** 2
         group, cell = np.nonzero(passes & (np.abs(along) < pieces.radii[piece] + within))
+        middle, slack = arm[group, cell] * inverse[groups[group]], (pieces.halves[piece] + 1e-6) * np.abs(inverse[groups[group]])
+        boxed = (middle - slack).max(axis=1) <= (middle + slack).min(axis=1)
+        group, cell = group[boxed], cell[boxed]
         if len(group):
             lines = groups[group] * count + cell
             yield _cut(pieces, piece, lines, points[groups[group], cell], directions[groups[group]])

@@ -206,7 +206,7 @@ class Stages(Protocol):
         """Turn one contact into a motion."""
 
     def expect(self, request: Request, matches: Matches, trial: Trial, timeout: float) -> None:
-        """Begin, beside what follows, the plan that will probably be asked for next; returns at once, and raises nothing."""
+        """Begin, beside the simulation that follows, the plan that will probably be asked for next; returns at once, and raises nothing."""
 
     def forget(self) -> None:
         """What was expected is not asked for any more; returns at once."""

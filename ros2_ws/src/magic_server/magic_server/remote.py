@@ -280,21 +280,29 @@ class RemoteAction(_Remote):
         presence: float = 5.0,
         grace: float = 0.0,
         feedback: Callable[[Any], None] | None = None,
+        accepted: Callable[[], None] = lambda: None,
     ) -> Answer:
         """The answer to a goal, of one of this project's actions.
 
         ``timeout`` is what the server itself is given; ``grace`` what is waited
-        beyond it for the answer.  Raises what :meth:`respond` does.
+        beyond it for the answer; ``accepted`` is called, from here, when the server has taken the goal.
+        Raises what :meth:`respond` does.
         """
         # Of this project's actions none changes anything but its answer: a goal may be sent again.
-        answer: Answer = self._asked_again(lambda left: self.respond(goal, left, token, presence, feedback), timeout + grace)
+        answer: Answer = self._asked_again(lambda left: self.respond(goal, left, token, presence, feedback, accepted), timeout + grace)
         if answer.status != GoalStatus.STATUS_SUCCEEDED and answer.result.code == 0:
             # rclpy answers an empty result where a server's handler raised.
             raise MagicError(Code.INTERNAL, f"the {self.server} ended its goal with status {answer.status} and no result")
         return answer
 
     def respond(
-        self, goal: Any, timeout: float, token: Token, presence: float = 5.0, feedback: Callable[[Any], None] | None = None
+        self,
+        goal: Any,
+        timeout: float,
+        token: Token,
+        presence: float = 5.0,
+        feedback: Callable[[Any], None] | None = None,
+        accepted: Callable[[], None] = lambda: None,
     ) -> Answer:
         """The answer to a goal, of any action.
 
@@ -315,6 +323,7 @@ class RemoteAction(_Remote):
             handle = accepting.result()
             if not handle.accepted:
                 raise MagicError(self._refusal, f"the {self.server} ({self.name}) refused the goal")
+            accepted()
             future = self._answer(handle.get_result_async, token, deadline, still_there)
             if future is None:
                 raise self._late("did not finish", timeout)

@@ -116,6 +116,7 @@ class Stages:
         self._scene: SceneObjectArray | None = None
         self._matches: pipeline.Matches | None = None
         self._last_goal: VerifyMotion.Goal | None = None
+        self._meanwhile: Callable[[], None] = lambda: None  # begun once, while the verifier is at work
         #: Motions for the same task that the verifier was asked for.
         self.tried = tried
         self._last_code = 0
@@ -359,9 +360,11 @@ class Stages:
             return self._ask_planner(request, matches, trial, max(0.0, deadline - time.monotonic()), self._token)
 
     def expect(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> None:
-        """Ask the planner for a trial in another thread."""
+        """Have the planner asked for a trial, in another thread, as soon as the verifier has its next motion: not before, for that is waited for."""
         token = Token(self._token)
-        self._server.ahead.begin(self._key(trial), lambda: self._ask_planner(request, matches, trial, timeout, token), token.cancel)
+        self._meanwhile = lambda: self._server.ahead.begin(
+            self._key(trial), lambda: self._ask_planner(request, matches, trial, timeout, token), token.cancel
+        )
 
     def forget(self) -> None:
         """Cancel what the planner was asked for that nobody waits for."""
@@ -449,8 +452,9 @@ class Stages:
             timeout=timeout,
         )
         self.tried += 1
+        meanwhile, self._meanwhile = self._meanwhile, lambda: None
         with self._minding(server.verifier):
-            answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace)
+            answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace, accepted=meanwhile)
         result = answer.result
         self._last_goal, self._last_code = goal, result.code
         code = code_of(result.code)

@@ -27,9 +27,10 @@ from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import SceneObject
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, remote
+from magic_server.ahead import Ahead
 from magic_server.joints import JointStates
 from magic_server.permission import ARM_UNKNOWN
-from magic_server.remote import Token
+from magic_server.remote import RemoteAction, Token
 from magic_server.stages import Stages, doubt
 from magic_server.strategy_server import complaint_code
 from magic_server.testing import fakes
@@ -603,6 +604,25 @@ def test_goals_carry_what_the_servers_need(bench):
     assert (plan.tool.id, plan.target.id, plan.variant, plan.seed, plan.reflection) == ("object_1", "object_2", "arm", 7, "keep")
     assert verify.plan.arm_trajectory.points
     assert 0 < plan.timeout <= 30.0
+
+
+def test_the_next_plan_is_asked_for_when_the_verifier_has_its_motion(bench, monkeypatch):
+    """What is waited for goes first: both messages are large."""
+    events, respond, begin = [], RemoteAction.respond, Ahead.begin
+
+    def asked(remote, *arguments):
+        events.append(remote.name)
+        return respond(remote, *arguments)
+
+    def ahead(*arguments):
+        events.append("ahead")
+        return begin(*arguments)
+
+    monkeypatch.setattr(RemoteAction, "respond", asked)
+    monkeypatch.setattr(Ahead, "begin", ahead)
+    result, _ = bench.run(variant="arm")
+    assert result.code == 0, result.message
+    assert events[:3] == ["/plan_motion", "/verify_motion", "ahead"]
 
 
 def test_the_verifier_hears_what_was_seen_of_the_tool(bench):
