@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -30,7 +31,10 @@ from magic_perception.sight import agreement
 from magic_perception.smear import behind
 from magic_perception.solids import hangs_together, hull_of
 from magic_perception.surface_error import Departure, departure, likely
+from magic_perception.table import Plane
 
+#: A frame with fewer pixels of depth shows nothing; nor does one with fewer of a thing tell of that.
+LEAST, FEW = 100, 20
 #: Round an object in its picture, as a share of its longer side.
 MARGIN = 0.15
 #: Behind others a thing may go on by this, m, and is told whole; and by the second where some camera has the thing itself before it.
@@ -95,124 +99,136 @@ def perceive(
     segmenter = segmenter or DepthSegmenter()
     if not frames:
         raise MagicError(Code.NO_FRAMES, "frames", 0, "at least one RGB-D frame")
-    given = frames
-    seeing = [bool(np.isfinite(frame.depth).sum() >= 100) for frame in given]
-    report.notes += [f"{frame.camera}: no depth" for frame, sees in zip(given, seeing, strict=True) if not sees]
-    if not any(seeing):
-        raise MagicError(
-            Code.NO_DEPTH, "pixels with depth", {f.camera: int(np.isfinite(f.depth).sum()) for f in frames}, "at least 100 in one camera"
-        )
-    frames, now = [*(frame for frame, sees in zip(given, seeing, strict=True) if sees), *(frame.free for frame in earlier)], sum(seeing)
+    seeing = _seeing(frames, report.notes)
+    now = sum(seeing)
+    used = [*(frame for frame, sees in zip(frames, seeing, strict=True) if sees), *(frame.free for frame in earlier)]
     with report.stage("table"):
-        table, own = find_table(frames, parameters, report.notes)
-        world_from_table = _frame_on(table, np.eye(4))
-        if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and abs(table.heights(np.zeros(3))) < parameters.snap_height:
-            world_from_table = np.eye(4)
-        looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(frames, own, strict=True)), parameters.workers)
+        table, own = find_table(used, parameters, report.notes)
+        world_from_table = _table_frame(table, parameters)
+        looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(used, own, strict=True)), parameters.workers)
 
     with report.stage("masks"):
         fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
-        labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
+
+        def labelled(looks: list[Looked]) -> _Views:
+            labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
+            return _Views(looks, labels, now, world_from_table, fixtures)
+
+        views = labelled(looks)
         if earlier:
-            stale = keyframes.contradicted(looks, labels, now, world_from_table)
+            stale = keyframes.contradicted(looks, views.labels, now, world_from_table)
             for i, pixels in enumerate(stale, now):
                 if pixels.any():
-                    frames[i] = frames[i].blinded(pixels)
-                    looks[i] = look(frames[i], own[i], world_from_table, parameters)
+                    used[i] = used[i].blinded(pixels)
+                    looks[i] = look(used[i], own[i], world_from_table, parameters)
             if any(pixels.any() for pixels in stale):
-                labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
-            report.earlier = list(zip(earlier, frames[now:], strict=True))
+                views = labelled(looks)
+            report.earlier = list(zip(earlier, used[now:], strict=True))
 
     with report.stage("cameras"):
-        poses = [frame.world_from_camera for frame in frames]
-        # One camera alone is measured against where it was before.
-        count = now if now > 1 else len(looks)
-        hanging = _hanging(looks, labels, fixtures)
-        still = [_at_rest(image, hanging) for image in labels[:count]]
-        pairs = cameras.measure(looks[:count], still, poses[:count], world_from_table, parameters.seed)
-        report.cameras = pairs
-        worst = max(pairs, key=lambda pair: (pair.beyond, pair.offset), default=None)
-        if worst is not None and worst.beyond:
-            raise MagicError(
-                Code.CAMERAS_DISAGREE,
-                "poses of the cameras",
-                str(worst),
-                f"up to {1000 * cameras.MOST_OFFSET:.0f} mm and {np.degrees(cameras.MOST_ANGLE):.1f} degrees; calibrate them again",
-            )
-        for pair in pairs:
-            if pair.certain:
-                report.notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if now == 2 else ""))
-            elif pair.offset > cameras.MOST_OFFSET:
-                report.notes.append(f"cameras may disagree: {pair}; more things in common view would tell")
-        both = sum(bool((image > 0).any()) for image in labels[:count]) > 1
-        if both and not pairs:
-            report.notes.append("whether the cameras agree could not be measured: they see no side of anything in common")
-        if now == 2 and worst is not None and worst.certain:
-            # What a camera saw from where it still stands is off as it is now.
-            here = [
-                any(keyframes.alike(each.frame, other.frame, keyframes.STILL, keyframes.STEADY) for other in looks[:now]) for each in looks
-            ]
-            moved = cameras.brought_together(looks, worst, world_from_table)
-            looks = [after if same else before for before, after, same in zip(looks, moved, here, strict=True)]
-            labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
-            hanging = _hanging(looks, labels, fixtures)
-        found = iter(labels[:now])
-        report.labels = [next(found) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(given, seeing, strict=True)]
-        blank = [item for look, image in zip(looks[:now], labels[:now], strict=True) for item in unmeasured(look, image, world_from_table)]
-        report.notes += [f"[{int(Code.NO_DEPTH)} {Code.NO_DEPTH.name}] {item}" for item in once(blank)]
-
-    offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
-    # Cameras of which nothing is known may be as far apart as would be borne.
-    apart = offset if worst is not None else cameras.MOST_OFFSET if both else 0.0
-
-    def build(label: int) -> _Built | MagicError:
-        try:
-            return _build(label, looks, labels, now, label in hanging, world_from_table, apart, parameters)
-        except MagicError as error:
-            return error
+        report.cameras = _disagreements(views, used, parameters.seed)
+        worst = _worst(report.cameras)
+        report.notes += _about_poses(report.cameras, views)
+        apart = _apart(worst, views)
+        if views.corrects and worst is not None and worst.certain:
+            views = labelled(_brought_together(views, worst))
+        report.notes += _about_glass(views)
 
     with report.stage("meshes"):
-        before = [image.copy() for image in labels]
-        numbers = list(range(1, max((int(image.max()) for image in labels), default=0) + 1))
-        solids: list[_Built] = []
-        ids: dict[int | str, str] = {}
-        for label, built in zip(numbers, each(build, numbers, parameters.workers), strict=True):
-            if isinstance(built, MagicError):
-                report.notes.append(f"cluster {label} left out: {built.message}")
-                for image in labels:
-                    image[image == label] = 0
-            else:
-                solids.append(built)
-                ids[label] = f"object_{len(solids)}"
-                report.numbers[ids[label]] = label
-        hidden = each(lambda built: _hidden(built, solids, looks, before, fixtures, world_from_table), solids, parameters.workers)
+        solids, refused = _solids(views, apart, parameters)
+        report.notes += [f"cluster {label} left out: {error.message}" for label, error in refused.items()]
+        ids = {built.label: f"object_{number}" for number, built in enumerate(solids, 1)}
+        report.numbers = {name: label for label, name in ids.items()}
+        told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[:now])
+        report.labels = [next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)]
+        hidden = each(lambda built: _hidden(built, solids, views), solids, parameters.workers)
 
     with report.stage("views"):
         objects = []
         made = each(lambda built: _as_object(built, world_from_table), solids, parameters.workers)
-        for built, names, item in zip(solids, hidden, made, strict=True):
+        for built, by, item in zip(solids, hidden, made, strict=True):
             # What hides a thing and was left out itself is as nameless as a fixture.
-            by = tuple(dict.fromkeys(by if isinstance(by, str) else ids.get(by, FIXTURE) for by in names))
-            item = replace(
-                item, id=f"object_{len(objects) + 1}", cut_off=by, seen_share=built.evidence.witnessed.seen, hanging=built.hanging
-            )
-            if item.hanging:
-                x, y, z = item.world_from_box[:3, 3]
-                report.notes.append(
-                    f"something hangs above the table, with nothing below that carries it, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
-                )
-            report.evidence[item.id], report.departures[item.id] = built.evidence, built.departed
-            report.shapes[item.id], report.pixels[item.id] = built.solid.shape, built.pixels
-            objects.append(item)
+            names = dict.fromkeys(name if isinstance(name, str) else ids.get(name, FIXTURE) for name in by)
+            objects.append(replace(item, id=ids[built.label], cut_off=tuple(names)))
+            _tell(report, built, objects[-1])
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
-    stamp = max(frame.stamp for frame in frames)
+    stamp = max(frame.stamp for frame in used)
+    offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
     return Scene((*objects, *known), plane, stamp, camera_offset=offset, camera_angle=angle, notes=tuple(report.notes))
 
 
-def _hanging(looks: list[Looked], labels: list[NDArray[np.int32]], fixtures: tuple[Mesh, ...]) -> set[int]:
-    """The labels of what hangs above the table."""
-    top = max((int(image.max()) for image in labels), default=0)
-    return {label for label in range(1, top + 1) if mostly_held(looks, labels, label) or hangs(looks, labels, label, fixtures)}
+# ---------------------------------------------------------------- frames, table, cameras
+
+
+def _seeing(frames: list[RgbdFrame], notes: list[str]) -> list[bool]:
+    """Which frames have depth enough to be looked at; the others are noted.  Raises ``NO_DEPTH`` where none has."""
+    counts = [int(np.isfinite(frame.depth).sum()) for frame in frames]
+    seeing = [count >= LEAST for count in counts]
+    notes += [f"{frame.camera}: no depth" for frame, sees in zip(frames, seeing, strict=True) if not sees]
+    if not any(seeing):
+        found = {frame.camera: count for frame, count in zip(frames, counts, strict=True)}
+        raise MagicError(Code.NO_DEPTH, "pixels with depth", found, f"at least {LEAST} in one camera")
+    return seeing
+
+
+def _table_frame(table: Plane, parameters: Parameters) -> NDArray[np.float64]:
+    """world_from_table (4, 4), z up: the world's own frame where the table is as good as its z = 0."""
+    near = abs(table.heights(np.zeros(3))) < parameters.snap_height
+    if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and near:
+        return np.eye(4)
+    return _frame_on(table, np.eye(4))
+
+
+@dataclass(frozen=True)
+class _Views:
+    """What all frames show of one scene: first those of now, one of each camera, then the earlier ones, oldest first.
+
+    labels (H, W) of each: which thing a pixel belongs to, 1, 2, ... the same in all of them; 0 none, negative the robot or what is known.  now: so many are of now.
+    world_from_table (4, 4): z up, z = 0 on the table.  fixtures: what is known, in the world frame.
+    """
+
+    looks: list[Looked]
+    labels: list[NDArray[np.int32]]
+    now: int
+    world_from_table: NDArray[np.float64]
+    fixtures: tuple[Mesh, ...]
+
+    @property
+    def numbers(self) -> list[int]:
+        """The labels of things."""
+        return list(range(1, max((int(image.max()) for image in self.labels), default=0) + 1))
+
+    @cached_property
+    def hanging(self) -> set[int]:
+        """The labels of what hangs above the table."""
+        return {
+            label
+            for label in self.numbers
+            if mostly_held(self.looks, self.labels, label) or hangs(self.looks, self.labels, label, self.fixtures)
+        }
+
+    @property
+    def compared(self) -> int:
+        """The poses of so many of the frames are compared: those of now, but one camera alone is measured against where it was before."""
+        return self.now if self.now > 1 else len(self.looks)
+
+    @property
+    def corrects(self) -> bool:
+        """Whether cameras that disagree are brought together: of three nobody knows which is off."""
+        return self.now == 2
+
+    @property
+    def several_see(self) -> bool:
+        """Whether more than one of the compared frames shows something."""
+        return sum(bool((image > 0).any()) for image in self.labels[: self.compared]) > 1
+
+
+def _disagreements(views: _Views, frames: list[RgbdFrame], seed: int) -> list[cameras.Disagreement]:
+    """How far each pair of the compared frames' poses disagrees, by what is at rest in both; frames: as they came, since looks have their tables put on one another."""
+    count = views.compared
+    still = [_at_rest(image, views.hanging) for image in views.labels[:count]]
+    poses = [frame.world_from_camera for frame in frames[:count]]
+    return cameras.measure(views.looks[:count], still, poses, views.world_from_table, seed)
 
 
 def _at_rest(labels: NDArray[np.int32], hanging: set[int]) -> NDArray[np.int32]:
@@ -221,6 +237,70 @@ def _at_rest(labels: NDArray[np.int32], hanging: set[int]) -> NDArray[np.int32]:
     beside = cv2.dilate((labels == ROBOT).view(np.uint8), np.ones((7, 7), np.uint8)).view(bool)
     doubtful = hanging | set(np.unique(labels[beside & (labels > 0)]).tolist())
     return np.where(np.isin(labels, sorted(doubtful)), 0, labels) if doubtful else labels
+
+
+def _worst(pairs: list[cameras.Disagreement]) -> cameras.Disagreement | None:
+    """The pair that disagrees most; ``None`` where none could be compared.  Raises ``CAMERAS_DISAGREE`` where that is more than may be corrected."""
+    worst = max(pairs, key=lambda pair: (pair.beyond, pair.offset), default=None)
+    if worst is not None and worst.beyond:
+        raise MagicError(
+            Code.CAMERAS_DISAGREE,
+            "poses of the cameras",
+            str(worst),
+            f"up to {1000 * cameras.MOST_OFFSET:.0f} mm and {np.degrees(cameras.MOST_ANGLE):.1f} degrees; calibrate them again",
+        )
+    return worst
+
+
+def _about_poses(pairs: list[cameras.Disagreement], views: _Views) -> list[str]:
+    """What there is to say of the poses of the cameras."""
+    if not pairs and views.several_see:
+        return ["whether the cameras agree could not be measured: they see no side of anything in common"]
+    notes = []
+    for pair in pairs:
+        if pair.certain:
+            notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if views.corrects else ""))
+        elif pair.offset > cameras.MOST_OFFSET:
+            notes.append(f"cameras may disagree: {pair}; more things in common view would tell")
+    return notes
+
+
+def _apart(worst: cameras.Disagreement | None, views: _Views) -> float:
+    """How far the cameras are, or may be, apart, m: those of which nothing is known as far as would be borne."""
+    if worst is not None:
+        return worst.offset
+    return cameras.MOST_OFFSET if views.several_see else 0.0
+
+
+def _brought_together(views: _Views, worst: cameras.Disagreement) -> list[Looked]:
+    """The looks with the two cameras of a pair moved half way to each other, and the earlier frames that were taken from where these still stand."""
+    moved = cameras.brought_together(views.looks, worst, views.world_from_table)
+    current = [look.frame for look in views.looks[: views.now]]
+    return [
+        after if any(keyframes.alike(before.frame, frame, keyframes.STILL, keyframes.STEADY) for frame in current) else before
+        for before, after in zip(views.looks, moved, strict=True)
+    ]
+
+
+def _about_glass(views: _Views) -> list[str]:
+    """What there is to say of what stands there and gives no depth."""
+    pairs = zip(views.looks[: views.now], views.labels[: views.now], strict=True)
+    blank = [item for look, image in pairs for item in unmeasured(look, image, views.world_from_table)]
+    return [f"[{int(Code.NO_DEPTH)} {Code.NO_DEPTH.name}] {item}" for item in once(blank)]
+
+
+# ---------------------------------------------------------------- solids
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What all frames saw of one thing: how each saw it that saw enough of it, in the table frame; points (N, 3) of the world, without strays, and their colors (N, 3); counts:
+    its pixels in each of the frames."""
+
+    sights: list[Sight]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    counts: list[int]
 
 
 @dataclass(frozen=True)
@@ -241,23 +321,75 @@ class _Built:
     hanging: bool
 
 
-def _build(
-    label: int,
-    looks: list[Looked],
-    labels: list[NDArray[np.int32]],
-    now: int,
-    hanging: bool,
-    world_from_table: NDArray[np.float64],
-    apart: float,
-    parameters: Parameters,
-) -> _Built:
-    """The solid of the object with that label, and what was seen of it; now: so many looks are no earlier ones; hanging: nothing carries it; apart: how far the cameras disagree, m."""
-    table_from_world = transforms.inverse(world_from_table)
+def _solids(views: _Views, apart: float, parameters: Parameters) -> tuple[list[_Built], dict[int, MagicError]]:
+    """The things that are built, in the order of their labels, and why others are not; apart: how far the cameras disagree, m."""
+
+    def attempt(label: int) -> _Built | MagicError:
+        try:
+            return _build(label, views, apart, parameters)
+        except MagicError as error:
+            return error
+
+    found = dict(zip(views.numbers, each(attempt, views.numbers, parameters.workers), strict=True))
+    refused = {label: built for label, built in found.items() if isinstance(built, MagicError)}
+    return [built for built in found.values() if not isinstance(built, MagicError)], refused
+
+
+def _build(label: int, views: _Views, apart: float, parameters: Parameters) -> _Built:
+    """The solid of the thing with that label, and what speaks for it; apart: how far the cameras disagree, m.  Raises ``RECONSTRUCTION_FAILED``,
+    and ``OBJECT_CUT_OFF`` for a wall, a monitor, a person: no thing on the table."""
+    looks, labels, now, hanging = views.looks, views.labels, views.now, label in views.hanging
+    seen = _seen(label, views, parameters)
+    cut = cut_off(looks, labels, label, parameters)
+    if max(seen.counts[:now]) < parameters.min_pixels:
+        cut.append(UNSEEN)
+    across = float(np.ptp(np.percentile(seen.points[:: max(1, len(seen.points) // 500)], [1, 99], axis=0), axis=0).max())
+    if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut) and not hanging:
+        raise MagicError(
+            Code.OBJECT_CUT_OFF,
+            "extent in metres of something that the picture or the region cuts; motions do not avoid it",
+            round(across, 2),
+            f"up to {parameters.max_extent}",
+        )
+    # Of a hand, or of what is in one, its place is asked, and it is elsewhere in the next scene.
+    hull = hull_of(transforms.apply(transforms.inverse(views.world_from_table), seen.points)) if hanging else None
+    solid = reconstruct(seen.sights, parameters) if hull is None else Reconstruction(hull, (hull,), "hull")
+    evidence = Evidence(
+        shape=solid.shape,
+        fit=solid.fit or agreement(solid.mesh, seen.sights),
+        witnessed=witnessed(solid.mesh, seen.sights),
+        extents=solid.mesh.extents,
+        cameras=_places(seen.sights),
+        apart=apart,
+        cut=cut,
+        joined=joined(looks, labels, label),
+    )
+    # Its picture is of now, unless earlier frames alone show it.
+    best = int(np.argmax(seen.counts[:now] if max(seen.counts[:now]) else seen.counts))
+    mask, frame = labels[best] == label, looks[best].frame
+    return _Built(
+        label,
+        solid,
+        seen.points,
+        seen.colors,
+        mask,
+        frame.camera,
+        seen.counts[best],
+        _about(mask, frame.color),
+        evidence,
+        departure(solid.mesh, seen.sights),
+        hanging,
+    )
+
+
+def _seen(label: int, views: _Views, parameters: Parameters) -> _Seen:
+    """What all frames saw of the thing with that label.  Raises ``RECONSTRUCTION_FAILED`` where that is next to nothing."""
+    table_from_world = transforms.inverse(views.world_from_table)
     sights, clouds, paints, counts = [], [], [], []
-    for looked, image in zip(looks, labels, strict=True):
+    for looked, image in zip(views.looks, views.labels, strict=True):
         mask = image == label
         counts.append(int(np.count_nonzero(mask)))
-        if counts[-1] < 20:
+        if counts[-1] < FEW:
             continue
         x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
         cut = (slice(y, y + h), slice(x, x + w))
@@ -273,63 +405,27 @@ def _build(
         clouds.append(looked.points(rows + y, columns + x))
         paints.append(looked.frame.color[rows + y, columns + x])
     if not sights:
-        raise MagicError(Code.RECONSTRUCTION_FAILED, "pixels of the object", max(counts), "at least 20 in one camera")
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "pixels of the object", max(counts), f"at least {FEW} in one camera")
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
-    points, colors = points[keep], colors[keep]
-    cut = cut_off(looks, labels, label, parameters)
-    if max(counts[:now]) < parameters.min_pixels:
-        cut.append(UNSEEN)
-    # A wall, a monitor, a person: no thing on the table.
-    across = float(np.ptp(np.percentile(points[:: max(1, len(points) // 500)], [1, 99], axis=0), axis=0).max())
-    if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut) and not hanging:
-        raise MagicError(
-            Code.OBJECT_CUT_OFF,
-            "extent in metres of something that the picture or the region cuts; motions do not avoid it",
-            round(across, 2),
-            f"up to {parameters.max_extent}",
-        )
-    # Of a hand, or of what is in one, its place is asked, and it is elsewhere in the next scene.
-    seen_alone = hull_of(transforms.apply(table_from_world, points)) if hanging else None
-    solid = reconstruct(sights, parameters) if seen_alone is None else Reconstruction(seen_alone, (seen_alone,), "hull")
-    evidence = Evidence(
-        solid.shape,
-        solid.fit or agreement(solid.mesh, sights),
-        witnessed(solid.mesh, sights),
-        solid.mesh.extents,
-        _places(sights),
-        apart,
-        cut,
-        joined(looks, labels, label),
-    )
-    best = int(np.argmax(counts[:now] if max(counts[:now]) else counts))
-    mask, frame = labels[best] == label, looks[best].frame
-    departed = departure(solid.mesh, sights)
-    picture = _about(mask, frame.color)
-    return _Built(label, solid, points, colors, mask, frame.camera, counts[best], picture, evidence, departed, hanging)
+    return _Seen(sights, points[keep], colors[keep], counts)
 
 
-def _hidden(
-    built: _Built,
-    solids: list[_Built],
-    looks: list[Looked],
-    labels: list[NDArray[np.int32]],
-    fixtures: tuple[Mesh, ...],
-    world_from_table: NDArray[np.float64],
-) -> list[int | str]:
+def _hidden(built: _Built, solids: list[_Built], views: _Views) -> list[int | str]:
     """What keeps a part of a thing out of sight, once it is known where other things are: that something ends its outline in a picture does not say so, and that nothing
     does does not say that there is none, as of what is thin.
 
     It may go on behind others where no camera looks: so far that it matters, or not.  What may be the rest of it, of its colour and beside it, leaves it cut off, and
     so do parts that nothing joins.  What it goes on as, of its colour and height where they touch, cuts it off.
     """
+    world_from_table = views.world_from_table
     rest = [other for other in solids if other is not built and _goes_on(built, other, world_from_table[:3, 2])]
     cut = list(dict.fromkeys([*built.evidence.cut, *(other.label for other in rest)]))
-    if built.hanging or not bordered(labels, built.label) or any(by in (PICTURE, REGION, scene.ROBOT, UNSEEN) for by in cut):
+    if built.hanging or not bordered(views.labels, built.label) or any(by in (PICTURE, REGION, scene.ROBOT, UNSEEN) for by in cut):
         return cut
     table_from_world = transforms.inverse(world_from_table)
-    others = [other.solid.mesh for other in solids if other is not built] + [mesh.transformed(table_from_world) for mesh in fixtures]
-    left = room(built.solid.mesh, looks, labels, built.label, others, world_from_table, BEHIND)
+    others = [other.solid.mesh for other in solids if other is not built] + [mesh.transformed(table_from_world) for mesh in views.fixtures]
+    left = room(built.solid.mesh, views.looks, views.labels, built.label, others, world_from_table, BEHIND)
     if left.behind > BEHIND:
         return list(dict.fromkeys([*cut, *(by if by > 0 else FIXTURE for by in left.by)]))
     whole = left.around < AROUND and hangs_together(built.solid.mesh, GAP)
@@ -385,9 +481,21 @@ def _places(sights: list[Sight]) -> int:
     return len(places)
 
 
+# ---------------------------------------------------------------- objects
+
+
+def _tell(report: Report, built: _Built, item: SceneObject) -> None:
+    """Write into the report what the scene does not say of an object."""
+    if item.hanging:
+        x, y, z = item.world_from_box[:3, 3]
+        report.notes.append(f"something hangs above the table, with nothing below that carries it, at ({x:.2f}, {y:.2f}, {z:.2f}) m")
+    report.evidence[item.id], report.departures[item.id] = built.evidence, built.departed
+    report.shapes[item.id], report.pixels[item.id] = built.solid.shape, built.pixels
+
+
 def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObject:
-    """Object frame at the centre of the smallest upright box, z up, x along its longer horizontal side (towards +x, else +y, of the world);
-    painted, with its canonical view."""
+    """The object of the scene, as yet without id.  Its frame is at the centre of the smallest upright box, z up, x along its longer horizontal side (towards +x, else +y,
+    of the world); painted, with its canonical view."""
     mesh = built.solid.mesh
     low, high = mesh.bounds
     (cx, cy), (w, h), angle = cv2.minAreaRect(((mesh.vertices[:, :2] - low[:2]) * 1000).astype(np.float32))
@@ -407,7 +515,7 @@ def _as_object(built: _Built, world_from_table: NDArray[np.float64]) -> SceneObj
     return SceneObject(
         "", local, pieces, pose, find_view(local, pieces), built.points, built.colors, built.mask, built.camera, built.picture,
         world_from_box=pose, box_extents=local.extents, confidence=chance(built.evidence),
-        surface_error=likely(built.evidence, built.departed),
+        seen_share=built.evidence.witnessed.seen, surface_error=likely(built.evidence, built.departed), hanging=built.hanging,
     )  # fmt: skip
 
 
