@@ -6,7 +6,8 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,17 @@ TURNED = 1.0
 ASKING_PERIOD = 0.1
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """A goal at work: what was asked for, by which strategy, as the pipeline is asked for it, what cancels it, and who is told how it goes."""
+
+    goal: RunStrategy.Goal
+    strategy: strategies.Strategy
+    request: pipeline.Request
+    token: Token
+    notify: Callable[[pipeline.Progress], None]
+
+
 class StrategyServer(LifecycleNode):
     """Action ``run_strategy``: perceive, match, plan, verify, publish.
 
@@ -118,7 +130,7 @@ class StrategyServer(LifecycleNode):
             arm.state_age,
             arm.start_tolerance,
         )
-        group = ReentrantCallbackGroup()
+        self._group = ReentrantCallbackGroup()
         self._lock = threading.Lock()
         self._token: Token | None = None
         self._run_id = ""
@@ -127,7 +139,6 @@ class StrategyServer(LifecycleNode):
         self._waiting: list[str] | None = None
         self._closing = False
         self._active = self._stopped = self._moves = False
-        self._group = group
         self._transforms: TransformListener | None = None
         self._look: tuple[SceneObjectArray, Look] | None = None
         self.scene: SceneObjectArray | None = None
@@ -136,41 +147,49 @@ class StrategyServer(LifecycleNode):
         self.joints = JointStates()
         self.ahead: Ahead[pipeline.Planned] = Ahead()
 
-        self.matcher = RemoteService(self, MatchContact, "match_contact", "matcher", group)
-        self.planner = RemoteAction(self, PlanMotion, "plan_motion", "planner", group)
-        self.verifier = RemoteAction(self, VerifyMotion, "verify_motion", "verifier", group)
         # Of a simulation's clock nobody knows how slow it is.
         self.patience = SLOW if self.get_parameter("use_sim_time").value else 1.0
-        self._arm = Arm(self, settings.trajectory_action, settings.gripper_action, arm, group) if settings.execute else None
+        self.matcher = RemoteService(self, MatchContact, "match_contact", "matcher", self._group)
+        self.planner = RemoteAction(self, PlanMotion, "plan_motion", "planner", self._group)
+        self.verifier = RemoteAction(self, VerifyMotion, "verify_motion", "verifier", self._group)
+        self._arm = Arm(self, settings.trajectory_action, settings.gripper_action, arm, self._group) if settings.execute else None
         self._server_name = self.resolve_service_name("run_strategy")
         self._outlet = Outlet(self, self.robot.base_frame)
         self.publication = Publication(self._outlet, self.world, self._limits)
-        # What comes on a topic is taken in the order in which it came: two at a time, the older could be the one that stays.
-        one, two = (MutuallyExclusiveCallbackGroup() for _ in range(2))
-        self.objects_topic = self.create_subscription(
-            SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=one
-        ).topic_name
-        listen_apart(self, JointState, "joint_states", self._on_joints, qos.STATES)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=two)
         self._marker_pub = self.create_publisher(MarkerArray, "strategy/markers", qos.LATCHED)
         self._frames_pub = self.create_publisher(TFMessage, "/tf_static", qos.LATCHED)
         self._held_pub = self.create_publisher(SceneObjectArray, "in_hand", qos.LATCHED)
-        self._server = ActionServer(
+        self.objects_topic = self._listen()
+        self._server = self._serve()
+        if settings.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+        self._diagnostics = Diagnostics(self, self._report, self._group)
+        self._diagnostics.publish()
+
+    def _listen(self) -> str:
+        """Subscribe to what comes in; the topic of the objects."""
+        # What comes on a topic is taken in the order in which it came: two at a time, the older could be the one that stays.
+        one, two = (MutuallyExclusiveCallbackGroup() for _ in range(2))
+        objects = self.create_subscription(SceneObjectArray, "objects", self._on_objects, qos.LATCHED, callback_group=one)
+        listen_apart(self, JointState, "joint_states", self._on_joints, qos.STATES)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, qos.RELIABLE, callback_group=two)
+        return objects.topic_name
+
+    def _serve(self) -> ActionServer:
+        """Offer the action and the emergency stop."""
+        server = ActionServer(
             self,
             RunStrategy,
             "run_strategy",
             execute_callback=self._execute,
             goal_callback=lambda goal: GoalResponse.REJECT if self._closing else GoalResponse.ACCEPT,
             cancel_callback=self._on_cancel,
-            callback_group=group,
+            callback_group=self._group,
             result_timeout=RESULT_TIMEOUT,
         )
-        self.create_service(Trigger, "~/emergency_stop", self._on_emergency_stop, callback_group=group)
-        if settings.autostart:
-            self.trigger_configure()
-            self.trigger_activate()
-        self._diagnostics = Diagnostics(self, self._report, group)
-        self._diagnostics.publish()
+        self.create_service(Trigger, "~/emergency_stop", self._on_emergency_stop, callback_group=self._group)
+        return server
 
     # ------------------------------------------------------------ whether anything may move
 
@@ -452,37 +471,19 @@ class StrategyServer(LifecycleNode):
         return handle.status == GoalStatus.STATUS_CANCELING
 
     def _run(self, handle: Any, token: Token, result: RunStrategy.Result) -> None:
+        """Plan until physics has passed a motion for the scene as it is, publish it, and have the arm carry it out where that is wanted; the result is told on the way."""
         goal = handle.request
         self.publication.take_back("a new run has begun")
         strategy = strategies.known(goal.strategy, self.settings.strategies or None)
-        request = self._request(goal)
-        looks = LOOKS if self._arm is not None and request.variant == MotionPlan.ARM else 0
-        closer = LOOK_TIME if looks else 0.0
-        stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures, closer=closer)
-        notify = self._notifier(handle)
-
-        def work(
-            request: pipeline.Request, stages: Stages, reflections: Sequence[str], spent: Callable[[Any], int] = lambda candidate: 0
-        ) -> pipeline.Outcome:
-            return pipeline.Run(
-                request,
-                reflections,
-                strategy.simulatable,
-                stages,
-                # A tool that is in the hand is held as it is held.
-                pipeline.Settings(attempts=1 if isinstance(stages, HeldStages) else self.settings.attempts),
-                notify,
-                lambda: token.canceled,
-                lambda error: describe(self, error),
-                spent=spent,
-            ).execute()
-
-        bounds = Bounds(0, self._loop.replans, time.monotonic() + request.timeout)
+        asked = _Asked(goal, strategy, self._request(goal), token, self._notifier(handle))
+        looks = LOOKS if self._arm is not None and asked.request.variant == MotionPlan.ARM else 0
+        stages = self._stages(asked, closer=LOOK_TIME if looks else 0.0)
+        bounds = Bounds(0, self._loop.replans, time.monotonic() + asked.request.timeout)
         tried: list[pipeline.Outcome] = []
         changes: list[str] = []
         while True:
-            left = max(1.0, min(request.timeout, bounds.end - time.monotonic()))
-            outcome = work(replace(request, timeout=left), stages, strategy.reflections)
+            left = max(1.0, min(asked.request.timeout, bounds.end - time.monotonic()))
+            outcome = self._plan(asked, replace(asked.request, timeout=left), stages, strategy.reflections)
             tried.append(outcome)
             fill(result, pipeline.joined(tried, outcome))
             result.notes = list(changes)
@@ -490,9 +491,9 @@ class StrategyServer(LifecycleNode):
             if outcome.code in BY_SIGHT and looks and self._other_look(stages, token):
                 looks -= 1
                 changes.append(f"{outcome.code.name}: {outcome.message}")
-                notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; perception has looked again", ()))
+                asked.notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; perception has looked again", ()))
                 # Of motions for many looks one may pass by chance as well as of many for one.
-                stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures, tried=stages.tried)
+                stages = self._stages(asked, tried=stages.tried)
                 continue
             if outcome.code != Code.OK:
                 result.message = "; planned again from there: ".join([*changes, outcome.message])
@@ -505,35 +506,11 @@ class StrategyServer(LifecycleNode):
             except Changed as change:
                 # No arm has moved yet: what has come meanwhile is planned with.
                 changes.append(f"{change.code.name}: {change.message}")
-                notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; planning again from the scene as it is", ()))
-                stages = Stages(self, token, self._run_id, strategy.simulatable, goal.want_pictures)
+                asked.notify(pipeline.Progress("perceive", 0, 0, f"{changes[-1]}; planning again from the scene as it is", ()))
+                stages = self._stages(asked)
                 continue
             if self._arm is not None and (published or (waived and not outcome.verified)) and outcome.plan.variant == MotionPlan.ARM:
-                loop = ClosedLoop(
-                    self,
-                    self._arm,
-                    self._loop,
-                    self._limits,
-                    strategy,
-                    request,
-                    token,
-                    Job(outcome, stages, claim),
-                    self._run_id,
-                    work,
-                    lambda outcome, stages: self._claim(outcome, stages, waived),
-                    lambda ask: self._when_allowed(ask, token),
-                    # Nobody else is to begin what is being carried out.
-                    lambda: self.publication.take_back("the strategy server carries it out itself", claim.run),
-                    lambda job, text: notify(
-                        pipeline.Progress(
-                            "execute",
-                            job.outcome.reports[-1].trial.index,
-                            len(job.stages.matches.candidates),
-                            text,
-                            job.outcome.reports,
-                        )
-                    ),
-                )
+                loop = self._closed_loop(asked, self._arm, Job(outcome, stages, claim), waived)
                 self._carry_out(loop, result, tried[:-1])
                 outcome, stages = loop.jobs[-1].outcome, loop.jobs[-1].stages
             break
@@ -545,6 +522,58 @@ class StrategyServer(LifecycleNode):
             self.get_logger().info(ending)
         else:
             self.get_logger().warning(ending)
+
+    def _stages(self, asked: _Asked, tried: int = 0, closer: float = 0.0) -> Stages:
+        """The stages of a run from the newest scene on; tried and closer: as :class:`Stages` has them."""
+        needs_verifier = asked.strategy.simulatable
+        return Stages(self, asked.token, self._run_id, needs_verifier, asked.goal.want_pictures, tried=tried, closer=closer)
+
+    def _plan(
+        self,
+        asked: _Asked,
+        request: pipeline.Request,
+        stages: Stages,
+        reflections: Sequence[str],
+        spent: Callable[[Any], int] = lambda candidate: 0,
+    ) -> pipeline.Outcome:
+        """One run of the pipeline: from objects to a verified motion."""
+        return pipeline.Run(
+            request,
+            reflections,
+            asked.strategy.simulatable,
+            stages,
+            # A tool that is in the hand is held as it is held.
+            pipeline.Settings(attempts=1 if isinstance(stages, HeldStages) else self.settings.attempts),
+            asked.notify,
+            lambda: asked.token.canceled,
+            lambda error: describe(self, error),
+            spent=spent,
+        ).execute()
+
+    def _closed_loop(self, asked: _Asked, arm: Arm, first: Job, waived: bool) -> ClosedLoop:
+        """What carries a planned motion out, and whatever is planned after it; waived: also what physics has not passed."""
+
+        def tell(job: Job, text: str) -> None:
+            reports = job.outcome.reports
+            asked.notify(pipeline.Progress("execute", reports[-1].trial.index, len(job.stages.matches.candidates), text, reports))
+
+        return ClosedLoop(
+            self,
+            arm,
+            self._loop,
+            self._limits,
+            asked.strategy,
+            asked.request,
+            asked.token,
+            first,
+            self._run_id,
+            partial(self._plan, asked),
+            claim_of=lambda outcome, stages: self._claim(outcome, stages, waived),
+            allowed=lambda ask: self._when_allowed(ask, asked.token),
+            # Nobody else is to begin what is being carried out.
+            begun=lambda: self.publication.take_back("the strategy server carries it out itself", first.claim.run),
+            tell=tell,
+        )
 
     def _other_look(self, stages: Stages, token: Token) -> bool:
         """Whether perception makes something else of what stands there than what a run was begun with; waits for it a little."""
