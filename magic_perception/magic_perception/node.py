@@ -22,27 +22,25 @@ from visualization_msgs.msg import MarkerArray
 
 from magic_core import conversions as cv
 from magic_core import depth as depths
-from magic_core import devices, transforms
+from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.diagnostics import Diagnostics, label, wall_timer
 from magic_core.errors import Code, MagicError
 from magic_core.listening import listen_apart
-from magic_core.node import describe, parameter, robot_parameters, run
+from magic_core.node import describe, run
 from magic_core.qos import LATCHED, SENSOR, STATES
-from magic_core.robot import Description, RobotConfig
 from magic_core.scene import Scene, SceneObject
-from magic_core.self_filter import Margins
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
+from magic_perception import settings
 from magic_perception.averaging import average
 from magic_perception.keyframes import STEADY, STILL, Keyframes
 from magic_perception.meanwhile import Made
-from magic_perception.parameters import METHODS, WORKSPACE, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
 from magic_perception.robot_in_view import Held, RobotInView
-from magic_perception.segmenters import SEGMENTERS, make_segmenter
+from magic_perception.segmenters import make_segmenter
 from magic_perception.stream import WAITING, Pair, Stream, next_scene
 from magic_perception.tracking import Tracker
 
@@ -65,6 +63,15 @@ class Placed(NamedTuple):
     color_from_depth: np.ndarray | None
 
 
+class Outcome(NamedTuple):
+    """How the last look came out, for the diagnostics."""
+
+    level: bytes
+    code: Code
+    message: str
+    values: dict[str, object]
+
+
 class Perception(Node):
     """Turns the newest frames of all cameras into objects, at most ``rate`` times a second.
 
@@ -80,48 +87,13 @@ class Perception(Node):
 
     def __init__(self) -> None:
         super().__init__("perception")
-        p = partial(parameter, self, read_only=True)
-        self.cameras = list(p("cameras", ["left", "right"], "names of the cameras, used in their topics"))
-        if not self.cameras or len(set(self.cameras)) != len(self.cameras):
-            raise MagicError(Code.BAD_REQUEST, "parameter cameras", self.cameras, "at least one name, none twice")
-        self.frame = p("frame", "panda_link0", "frame of the results, z up")
-        self.skew = p(
-            "camera_tolerance",
-            0.5,
-            "a camera whose newest frame is older than the newest of all by more than this is left out, s",
-            low=0.0,
-            high=60.0,
-        )
-        self.patience = p("camera_timeout", 2.0, "a camera silent for this long is no longer waited for, s", low=0.1, high=60.0)
-        self.max_age = p("max_age", 0.0, "frames older than this by the node's clock are refused, s; 0: any age", low=0.0, high=3600.0)
-        self.aligned = p("aligned", True, "depth is registered to colour by the driver")
-        self.count = p("average", 3, "frames of a camera at rest that are averaged", low=1, high=30)
-        self.transform_timeout = p(
-            "transform_timeout",
-            1.0,
-            "how long the transform at an image's stamp is waited for, s; no other pose is taken",
-            low=0.0,
-            high=10.0,
-        )
-        tolerance = p("pairing_tolerance", 0.02, "largest difference of the stamps of colour and depth, s", low=0.0, high=1.0)
-        self.period = 1.0 / p("rate", 1.0, "scenes a second, at most", low=0.05, high=20.0)
-        self.depth_unit = p("depth_unit", "", "what 1 in a depth image is (mm, 0.25mm, m, ...); empty: mm in 16UC1, m in 32FC1")
-        if self.depth_unit:
-            depths.metres(self.depth_unit)
-        name = p("segmenter", "depth", "how masks are found", choices=SEGMENTERS)
-        weights = p("weights", "", "weights of the segmenter: a hub name or a local folder; empty: its default")
-        device = p("device", devices.AUTO, "torch device of the segmenter; auto: cuda where there is a GPU, else cpu")
-        self.parameters = self._algorithm()
-        self.given = {camera: pose for camera in self.cameras if (pose := self._extrinsics(camera)) is not None}
-        self.segmenter = make_segmenter(name, weights, device)
-        self.keyframes = Keyframes(
-            p("keyframes", 4, "earlier views that are looked at together with the newest frames, at most; 0: none", low=0, high=16),
-            p("keyframe_age", 60.0, "an earlier view is forgotten after this, s", low=0.1, high=3600.0),
-        )
-        self.robot = self._robot(tolerance)
+        self.settings = settings.read(self)
+        self.segmenter = make_segmenter(self.settings.segmenter, self.settings.weights, self.settings.device)
+        self.robot = settings.read_robot(self, self.settings.tolerance)
+        self.keyframes = Keyframes(self.settings.keyframes, self.settings.keyframe_age)
         self.warm_up()
 
-        self.streams = {camera: Stream(camera, tolerance, self.count + WAITING) for camera in self.cameras}
+        self.streams = {camera: Stream(camera, self.settings.tolerance, self.settings.count + WAITING) for camera in self.settings.cameras}
         self.tracker = Tracker()
         # The last scene and what it was made of.
         self.made: Made | None = None
@@ -139,7 +111,7 @@ class Perception(Node):
         self.done_stamp = self.last_run = -math.inf
         self.again = False  # the newest frames are to be looked at once more
         self.done = 0
-        self.outcome: tuple[bytes, Code, str, dict[str, object]] = (DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
+        self.outcome = Outcome(DiagnosticStatus.WARN, Code.NO_FRAMES, "no frames yet", {})
         self.lock = threading.Lock()
         self.started = time.monotonic()
         # When images began to come after nobody had sent any for a while: from then on a camera that says nothing is waited for.
@@ -149,7 +121,7 @@ class Perception(Node):
         self.markers_out = self.create_publisher(MarkerArray, "perception/markers", LATCHED)
         inputs, work, report = (MutuallyExclusiveCallbackGroup() for _ in range(3))
         self.inputs = inputs
-        self.topics = {camera: self._subscribe(camera, inputs) for camera in self.cameras}
+        self.topics = {camera: self._subscribe(camera, inputs) for camera in self.settings.cameras}
         self.compressed: dict[tuple[str, str], Subscription] = {}
         self.transforms = TransformListener(self, inputs, self.lock)
         for topic in ("known_objects", "obstacles"):
@@ -158,63 +130,19 @@ class Perception(Node):
             # Not behind the images: who is cut out by a state that is missing is not cut out.
             self.listen(SceneObjectArray, "in_hand", self.on_held, LATCHED, inputs)
             listen_apart(self, JointState, "joint_states", self.on_joints, STATES)
-        wall_timer(self, min(0.1, self.period / 4), self.on_work, work)
+        wall_timer(self, min(0.1, self.settings.period / 4), self.on_work, work)
         wall_timer(self, 0.5, self.on_look, report)
         self.diagnostics = Diagnostics(self, self.on_report, report)
-        self.get_logger().info(f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.frame}")
-
-    def _algorithm(self) -> Parameters:
-        """The parameters that :func:`magic_perception.pipeline.perceive` is told."""
-        p = partial(parameter, self, read_only=True)
-        low = p(
-            "region_low", list(WORKSPACE["region_low"]), "lower corner of the workspace box, m: x and y in `frame`, z from the table found"
+        self.get_logger().info(
+            f"waiting for {', '.join(t for c in self.topics.values() for t in c.values())} and TF to {self.settings.frame}"
         )
-        high = p(
-            "region_high",
-            list(WORKSPACE["region_high"]),
-            "upper corner of the workspace box, m: x and y in `frame`, z from the table found",
-        )
-        if len(low) != 3 or len(high) != 3:
-            raise MagicError(Code.BAD_REQUEST, "parameters region_low, region_high", f"{list(low)}, {list(high)}", "three numbers each")
-        return Parameters(
-            region_low=tuple(low),
-            region_high=tuple(high),
-            method=p("method", "completed", "reconstruction", choices=METHODS),
-            use_color=p("use_color", True, "refine masks by the colour difference to the table"),
-            split=p("split", True, "part touching objects at concave seams where their forms say that they are two"),
-            known_margin=p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1),
-            min_height=p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1),
-            seed=p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1),
-        )
-
-    def _robot(self, slack: float) -> RobotInView | None:
-        """The arm that is cut out of the pictures, as the parameters describe it; ``None``: there is none to cut."""
-        p = partial(parameter, self, read_only=True)
-        cuts = p("self_filter", True, "cut the robot (parameters robot.*) out of the pictures by joint_states; false where there is no arm")
-        age = p("joint_state_age", 0.2, "how far a joint state may be from a picture's stamp, s", low=0.001, high=2.0)
-        space = p("robot_margin", 0.01, "how much wider than its shapes the robot is cut: calibration, cables, m", low=0.0, high=0.1)
-        config = robot_parameters(self)
-        if not cuts:
-            return None
-        return RobotInView(Description(RobotConfig(**config)), Margins(space=space), age, slack)
-
-    def _extrinsics(self, camera: str) -> np.ndarray | None:
-        """world_from_camera (4, 4) of a camera as parameters give it; None: it comes from TF."""
-        name = f"extrinsics.{camera}"
-        text = f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF"
-        numbers = list(parameter(self, name, [0.0] * 7, text, read_only=True))
-        if not any(numbers):
-            return None
-        if len(numbers) != 7 or not 0.9 < np.linalg.norm(numbers[3:]) < 1.1:
-            raise MagicError(Code.BAD_REQUEST, f"parameter {name}", numbers, "x y z and a unit quaternion x y z w")
-        return transforms.from_quaternion(numbers[:3], numbers[3:])
 
     def _subscribe(self, camera: str, group: MutuallyExclusiveCallbackGroup) -> dict[str, str]:
         """Subscribe to one camera; what of it comes on which topic."""
         base = f"camera/{camera}"
-        depth = "aligned_depth_to_color/image_raw" if self.aligned else "depth/image_rect_raw"
+        depth = "aligned_depth_to_color/image_raw" if self.settings.aligned else "depth/image_rect_raw"
         topics = {"color": f"{base}/color/image_raw", "camera_info": f"{base}/color/camera_info", "depth": f"{base}/{depth}"}
-        if not self.aligned:
+        if not self.settings.aligned:
             topics["depth_camera_info"] = f"{base}/depth/camera_info"
         for what, topic in topics.items():
             if what.endswith("camera_info"):
@@ -260,7 +188,7 @@ class Perception(Node):
             tool = tool.transformed(transforms.make(translation=[0.5, 0.0, -tool.bounds[0, 2]]))
             small = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
             frame = sensor.capture([tool], small, sensor.looking_at([0.2, 0.0, 0.6], [0.5, 0.0, 0.0]), 0, camera="warm_up")
-            pc.markers(perceive([frame], (), self.parameters, self.segmenter, Report()))
+            pc.markers(perceive([frame], (), self.settings.algorithm, self.segmenter, Report()))
         except Exception as error:  # what is wrong will be told when real images come
             self.get_logger().debug(f"warm-up: {describe(self, error)[1]}")
         self.get_logger().debug(f"warmed up in {time.monotonic() - begin:.2f} s")
@@ -288,7 +216,7 @@ class Perception(Node):
         now = time.monotonic()
         stream = self.streams[camera]
         with self.lock:
-            if now - self.heard > self.patience:
+            if now - self.heard > self.settings.patience:
                 self.resumed = now
             self.heard = now
             try:
@@ -297,14 +225,14 @@ class Perception(Node):
                     raise MagicError(
                         Code.NO_TRANSFORM, f"frame_id on {self.topics[camera][what]}", "empty", "the name of the optical frame"
                     )
-                if self.max_age > 0:
+                if self.settings.max_age > 0:
                     age = self.get_clock().now().nanoseconds * 1e-9 - stamp
-                    if age > self.max_age:
+                    if age > self.settings.max_age:
                         raise MagicError(
                             Code.STALE_DATA,
                             f"age in s of the image on {self.topics[camera][what]}",
                             round(age, 2),
-                            f"at most {self.max_age}",
+                            f"at most {self.settings.max_age}",
                         )
                 compressed = isinstance(msg, CompressedImage)
                 _, raw_decoder, decoder = DECODERS[what]
@@ -312,8 +240,10 @@ class Perception(Node):
                 if what == "color":
                     stream.color(stamp, decode(msg), msg.header.frame_id, now)
                 else:
-                    stream.unit = self.depth_unit or ("m" if (msg.format if compressed else msg.encoding).startswith("32FC1") else "mm")
-                    stream.depth(stamp, decode(msg, self.depth_unit), msg.header.frame_id, now)
+                    stream.unit = self.settings.depth_unit or (
+                        "m" if (msg.format if compressed else msg.encoding).startswith("32FC1") else "mm"
+                    )
+                    stream.depth(stamp, decode(msg, self.settings.depth_unit), msg.header.frame_id, now)
             except Exception as error:
                 code, message = describe(self, error)
                 stream.last[what] = now
@@ -343,8 +273,8 @@ class Perception(Node):
     def on_known(self, topic: str, msg: SceneObjectArray) -> None:
         """Calibrated fixtures, and obstacles that other software tells."""
         try:
-            if msg.header.frame_id and msg.header.frame_id.lstrip("/") != self.frame:
-                raise MagicError(Code.NO_TRANSFORM, f"frame of {topic}", msg.header.frame_id, self.frame)
+            if msg.header.frame_id and msg.header.frame_id.lstrip("/") != self.settings.frame:
+                raise MagicError(Code.NO_TRANSFORM, f"frame of {topic}", msg.header.frame_id, self.settings.frame)
             known = cv.scene_from_msg(msg).objects
             with self.lock:
                 others = [item.id for name, items in self.known.items() if name != topic for item in items]
@@ -387,7 +317,7 @@ class Perception(Node):
     def on_work(self) -> None:
         """Perceive when there is something new; no exception leaves."""
         now = time.monotonic()
-        if now - self.last_run < self.period:
+        if now - self.last_run < self.settings.period:
             return
         try:
             held = () if self.robot is None else self.robot.held
@@ -397,85 +327,83 @@ class Perception(Node):
             self.last_run = now
             with self.lock:
                 known = tuple(item for items in self.known.values() for item in items)
+            made = self.made if self.made is not None and self.made.shows(frames, known) else None
+            same = made is not None and made.same(frames)
             looks: tuple[list[RgbdFrame], ...] = (frames,)
-            if self.made is not None and self.made.shows(frames, known):
-                if self.made.same(frames):
-                    self.made = self.made.seen_again(frames)
-                    if self.made.recent(frames) and not self.made.better:
-                        self.publish(replace(self.made.scene, stamp=max(frame.stamp for frame in frames)), self.made.scene)
-                        self.done += 1
-                        return
-                    looks, frames = self.made.looks, self.made.mean()
-                elif (
-                    self.robot is not None
-                    and self.made.recent(frames)
-                    and (scene := self.made.meanwhile(frames, self.robot, self.world_from_base(frames[-1]))) is not None
-                ):
-                    self.publish(scene)
+            if made is not None:
+                if same:
+                    made = self.made = made.seen_again(frames)
+                if self.tell_again(made, frames, same):
                     self.done += 1
                     return
+                if same:
+                    looks, frames = made.looks, made.mean()
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
-            scene = perceive(frames, known, self.parameters, self.segmenter, report, earlier)
-            # An arm that could not be cut out would be remembered as a thing.
-            whole = {f.camera for f in frames if not isinstance(self.cut.get(f.camera), MagicError)}
-            numbers = [report.numbers.get(item.id, 0) for item in scene.objects]
-            scene = self.tracker.update(replace(scene, frame_id=self.frame))
-            named = {item.id: n for n, item in zip(numbers, scene.objects, strict=True) if n}
-            carried = frozenset(item.id for item in scene.objects if self.tracker.carried(item))
-            # What the robot holds is elsewhere in the next picture.
-            there = [_free(frame, image) for frame, image in zip(frames, report.labels, strict=True)]
-            self.keyframes.update(
-                [frame.free for frame in frames], there, report.earlier, still & whole, [named[i] for i in carried if i in named]
-            )
-            masks = {i: [image == n for image in report.labels] for i, n in named.items()}
+            scene = perceive(frames, known, self.settings.algorithm, self.segmenter, report, earlier)
+            scene, masks, carried = self.remember(scene, frames, report, still)
             self.made = Made(scene, frames, known, held, masks, carried, looks, len(looks))
             self.publish(scene)
             seconds = time.monotonic() - now
             self.done += 1
-            seen = [o for o in scene.objects if o.source == "camera"]
-            values: dict[str, object] = {
-                "objects": ", ".join(o.id for o in scene.objects),
-                "seconds": round(seconds, 3),
-                "cameras": ", ".join(f.camera for f in frames),
-                "earlier views": ", ".join(f"{f.camera}, {frames[-1].stamp - f.stamp:.1f} s before" for f in earlier),
-            }
-            values.update({f"seconds {k}": round(v, 4) for k, v in report.seconds.items()})
-            if report.cameras:
-                values["camera poses"] = "; ".join(str(pair) for pair in report.cameras)
-            values["notes"] = "; ".join(report.notes)
-            hanging = [o.id for o in seen if o.hanging]
-            if hanging:
-                uncut = "; ".join(sorted({e.message for e in self.cut.values() if isinstance(e, MagicError)}))
-                self.outcome = (
-                    DiagnosticStatus.WARN,
-                    Code.SOMETHING_HANGS,
-                    f"[{int(Code.SOMETHING_HANGS)} SOMETHING_HANGS] {', '.join(hanging)}: {values['notes']}"
-                    + (f"; the robot was not cut out of all pictures: {uncut}" if uncut else ""),
-                    values,
-                )
-            elif seen:
-                level = DiagnosticStatus.WARN if report.notes else DiagnosticStatus.OK
-                self.outcome = (
-                    level,
-                    Code.OK,
-                    f"{len(seen)} objects seen, {len(scene.objects) - len(seen)} known" + (f"; {values['notes']}" if report.notes else ""),
-                    values,
-                )
-            else:
-                self.outcome = (
-                    DiagnosticStatus.WARN,
-                    Code.NO_OBJECTS,
-                    "[106 NO_OBJECTS] nothing stands on the table in the region of interest",
-                    values,
-                )
+            self.outcome = self.outcome_of(scene, report, _values(scene, report, frames, earlier, seconds))
             if self.done == 1:
-                self.get_logger().info(f"first scene after {now - self.started:.1f} s: {self.outcome[2]}, in {seconds:.2f} s")
+                self.get_logger().info(f"first scene after {now - self.started:.1f} s: {self.outcome.message}, in {seconds:.2f} s")
         except Exception as error:
             code, message = describe(self, error)
             self.last_run, self.made = now, None
-            self.outcome = (DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
-            self.get_logger().error(self.outcome[2], throttle_duration_sec=5.0)
+            self.outcome = Outcome(DiagnosticStatus.ERROR, Code(code), f"[{code} {Code(code).name}] {message}", {})
+            self.get_logger().error(self.outcome.message, throttle_duration_sec=5.0)
+
+    def tell_again(self, made: Made, frames: list[RgbdFrame], same: bool) -> bool:
+        """Publish the last scene once more where that is all that the newest frames tell: they show the same, or that and the arm on its way; false: there is more to see."""
+        if not made.recent(frames):
+            return False
+        if same:
+            if made.better:
+                return False
+            self.publish(replace(made.scene, stamp=max(frame.stamp for frame in frames)), made.scene)
+            return True
+        if self.robot is None:
+            return False
+        scene = made.meanwhile(frames, self.robot, self.world_from_base(frames[-1]))
+        if scene is not None:
+            self.publish(scene)
+        return scene is not None
+
+    def remember(
+        self, scene: Scene, frames: list[RgbdFrame], report: Report, still: set[str]
+    ) -> tuple[Scene, dict[str, list[np.ndarray]], frozenset[str]]:
+        """The scene under the names that its things had before, the masks (H, W) of each of them in the frames, and the names of those that the robot carries.
+
+        The frames are kept for what they show; still: the cameras that did not move.
+        """
+        numbers = [report.numbers.get(item.id, 0) for item in scene.objects]
+        scene = self.tracker.update(replace(scene, frame_id=self.settings.frame))
+        named = {item.id: n for n, item in zip(numbers, scene.objects, strict=True) if n}
+        carried = frozenset(item.id for item in scene.objects if self.tracker.carried(item))
+        # An arm that could not be cut out would be remembered as a thing.
+        whole = {f.camera for f in frames if not isinstance(self.cut.get(f.camera), MagicError)}
+        # What the robot holds is elsewhere in the next picture.
+        there = [_free(frame, image) for frame, image in zip(frames, report.labels, strict=True)]
+        passing = [named[i] for i in carried if i in named]
+        self.keyframes.update([frame.free for frame in frames], there, report.earlier, still & whole, passing)
+        return scene, {i: [image == n for image in report.labels] for i, n in named.items()}, carried
+
+    def outcome_of(self, scene: Scene, report: Report, values: dict[str, object]) -> Outcome:
+        """How a scene came out: with things, with none, or with some that nothing carries."""
+        seen = [o for o in scene.objects if o.source == "camera"]
+        hanging = [o.id for o in seen if o.hanging]
+        if hanging:
+            uncut = "; ".join(sorted({e.message for e in self.cut.values() if isinstance(e, MagicError)}))
+            message = f"[{int(Code.SOMETHING_HANGS)} SOMETHING_HANGS] {', '.join(hanging)}: {values['notes']}"
+            message += f"; the robot was not cut out of all pictures: {uncut}" if uncut else ""
+            return Outcome(DiagnosticStatus.WARN, Code.SOMETHING_HANGS, message, values)
+        if seen:
+            message = f"{len(seen)} objects seen, {len(scene.objects) - len(seen)} known" + (f"; {values['notes']}" if report.notes else "")
+            return Outcome(DiagnosticStatus.WARN if report.notes else DiagnosticStatus.OK, Code.OK, message, values)
+        message = "[106 NO_OBJECTS] nothing stands on the table in the region of interest"
+        return Outcome(DiagnosticStatus.WARN, Code.NO_OBJECTS, message, values)
 
     def gather(self, now: float) -> tuple[list[RgbdFrame], list[str], set[str]]:
         """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for; notes; and which cameras stood still."""
@@ -489,18 +417,18 @@ class Perception(Node):
             limit = math.inf
             for stream in streams:
                 found, pending, error = self.place(stream, now)
-                if error is not None and (not found or newest - found[-1].pair.stamp > self.skew):
+                if error is not None and (not found or newest - found[-1].pair.stamp > self.settings.skew):
                     self.leave_out(stream, error, notes, now)
                 else:
                     placed[stream.name], limit = found, min(limit, pending)
             stamps = {camera: [p.pair.stamp for p in found] for camera, found in placed.items()}
-            done, period = (math.nextafter(self.done_stamp, -math.inf), 0.0) if self.again else (self.done_stamp, self.period)
+            done, period = (math.nextafter(self.done_stamp, -math.inf), 0.0) if self.again else (self.done_stamp, self.settings.period)
             settled = now - max(s.pairs[-1].arrived for s in streams) > SETTLED if streams else False
-            stamp = next_scene(stamps, self.count, done, period, self.skew, limit, settled)
+            stamp = next_scene(stamps, self.settings.count, done, period, self.settings.skew, limit, settled)
             if stamp is not None:
                 # Whatever comes of it: frames that are no good must not be in the way of the next.
                 self.done_stamp, self.again = stamp, False
-                placed = {camera: [p for p in found if p.pair.stamp <= stamp][-self.count :] for camera, found in placed.items()}
+                placed = {camera: [p for p in found if p.pair.stamp <= stamp][-self.settings.count :] for camera, found in placed.items()}
             elif placed:
                 return [], notes, set()
         frames = []
@@ -528,18 +456,18 @@ class Perception(Node):
             return None
         if newest < self.done_stamp - 1.0:
             self.done_stamp = -math.inf  # a bag began again
-        if newest - self.done_stamp < self.period * (1 - 1e-6) and not self.again:
+        if newest - self.done_stamp < self.settings.period * (1 - 1e-6) and not self.again:
             return None  # the next scene's stamp is still to come
         streams = []
         for camera, stream in self.streams.items():
             silent = now - max(stream.last.get("pair", -math.inf), self.resumed)
-            few = stream.intrinsics is None or len(stream.pairs) < self.count
+            few = stream.intrinsics is None or len(stream.pairs) < self.settings.count
             # Of a bag that has fewer frames and is played again and again the first one is always young.
             stream.few = min(stream.few, stream.pairs[0].arrived if stream.pairs else math.inf) if few else math.inf
-            if few and silent < self.patience:
+            if few and silent < self.settings.patience:
                 # The first frames of a camera that speaks, or the wait for one that has not spoken yet.
                 first = self.resumed if math.isinf(stream.few) else max(stream.few, self.resumed)
-                if now - first < self.patience:
+                if now - first < self.settings.patience:
                     return None
             if stream.intrinsics is None:
                 if (stream.pairs or stream.counts["color"]) and "camera_info" not in stream.problems:
@@ -549,8 +477,8 @@ class Perception(Node):
                 notes.append(f"camera {camera} left out: no camera_info")
             elif not stream.pairs:
                 notes.append(f"camera {camera} left out: no frames")
-            elif newest - stream.pairs[-1].stamp > self.skew:
-                message = f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.skew} s)"
+            elif newest - stream.pairs[-1].stamp > self.settings.skew:
+                message = f"newest frame is {newest - stream.pairs[-1].stamp:.2f} s older than the other cameras' (allowed: {self.settings.skew} s)"
                 stream.wrong("stamps", Code.STALE_DATA, f"{self.topics[camera]['color']}: {message}", now)
                 notes.append(f"camera {camera} left out: {message}")
             else:
@@ -567,18 +495,18 @@ class Perception(Node):
         last: MagicError | None = None
         for pair in stream.pairs:
             try:
-                pose = self.given.get(stream.name)
+                pose = self.settings.extrinsics.get(stream.name)
                 if pose is None:
-                    pose = self.transforms.buffer.lookup(self.frame, pair.frame_id, pair.stamp)
-                moved = None if self.aligned else self.transforms.buffer.lookup(pair.frame_id, pair.depth_frame_id, pair.stamp)
+                    pose = self.transforms.buffer.lookup(self.settings.frame, pair.frame_id, pair.stamp)
+                moved = None if self.settings.aligned else self.transforms.buffer.lookup(pair.frame_id, pair.depth_frame_id, pair.stamp)
             except MagicError as error:
-                if now - pair.arrived < self.transform_timeout:
+                if now - pair.arrived < self.settings.transform_timeout:
                     pending = min(pending, pair.stamp)
                 else:
                     wrong = error
                 last = error
                 continue
-            if self.robot is not None and self.robot.waits(pair.stamp) and now - pair.arrived < self.transform_timeout:
+            if self.robot is not None and self.robot.waits(pair.stamp) and now - pair.arrived < self.settings.transform_timeout:
                 pending = min(pending, pair.stamp)
                 continue
             found.append(Placed(pair, pose, moved))
@@ -588,7 +516,7 @@ class Perception(Node):
         else:
             # Of a camera that was never placed the newest frames are always young, and those of a short bag are again and again.
             stream.unplaced = min(stream.unplaced, now)
-            wrong = last if now - stream.unplaced >= self.transform_timeout else wrong
+            wrong = last if now - stream.unplaced >= self.settings.transform_timeout else wrong
         return found, pending, self.transforms.explain(wrong) if wrong is not None else None
 
     def frame_of(self, stream: Stream, placed: list[Placed]) -> RgbdFrame:
@@ -637,16 +565,16 @@ class Perception(Node):
     def check_unit(self, stream: Stream, frame: RgbdFrame) -> None:
         """Depth that is no table-top's, or not that of the table under this camera, is of another unit than its encoding says."""
         depths.check_distance(frame.depth, self.topics[stream.name]["depth"], stream.unit, True, REMEDY)
-        depths.check_pose(frame, stream.unit, REMEDY, self.parameters.region_low, self.parameters.region_high)
+        depths.check_pose(frame, stream.unit, REMEDY, self.settings.algorithm.region_low, self.settings.algorithm.region_high)
 
     def world_from_base(self, frame: RgbdFrame) -> np.ndarray | None:
         """Where the robot's base was at a frame's stamp (4, 4); ``None``: it is the frame of the results.  Raises NO_TRANSFORM."""
         assert self.robot is not None
         base = self.robot.robot.base
-        if base == self.frame:
+        if base == self.settings.frame:
             return None
         with self.lock:
-            return self.transforms.buffer.lookup(self.frame, base, frame.stamp)
+            return self.transforms.buffer.lookup(self.settings.frame, base, frame.stamp)
 
     def without_robot(self, frame: RgbdFrame) -> RgbdFrame:
         """The frame, blind where the robot is; as it is where nobody tells, which the diagnostics then say.  Raises STALE_DATA where the arm is told of, but not
@@ -696,7 +624,7 @@ class Perception(Node):
         """Once a second: what is there and what is missing."""
         now = time.monotonic()
         with self.lock:
-            states = [self.camera_status(camera, now) for camera in self.cameras]
+            states = [self.camera_status(camera, now) for camera in self.settings.cameras]
         level, code, message, values = self.outcome
         worst = [s for s in states if s.level != DiagnosticStatus.OK]
         if self.done == 0 and code is Code.NO_FRAMES and worst:
@@ -753,7 +681,7 @@ class Perception(Node):
         inputs = ("color", "depth", "camera_info", *(("depth_camera_info",) if "depth_camera_info" in self.topics[camera] else ()))
         for what in sorted(inputs, key=lambda w: w in stream.last):
             silent = now - stream.last.get(what, self.started)
-            limit = math.inf if what.endswith("camera_info") else self.patience
+            limit = math.inf if what.endswith("camera_info") else self.settings.patience
             if what not in stream.last or silent > limit:
                 topic = self.topics[camera][what]
                 publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
@@ -778,6 +706,21 @@ def _still(one: Placed, other: Placed) -> bool:
     """Whether a camera was at one place at two times."""
     apart = np.linalg.norm(one.world_from_camera[:3, 3] - other.world_from_camera[:3, 3])
     return bool(apart <= STILL and transforms.rotation_angle(one.world_from_camera, other.world_from_camera) <= STEADY)
+
+
+def _values(scene: Scene, report: Report, frames: list[RgbdFrame], earlier: list[RgbdFrame], seconds: float) -> dict[str, object]:
+    """What the diagnostics tell of a scene beside how it came out; seconds: that it took."""
+    values: dict[str, object] = {
+        "objects": ", ".join(o.id for o in scene.objects),
+        "seconds": round(seconds, 3),
+        "cameras": ", ".join(f.camera for f in frames),
+        "earlier views": ", ".join(f"{f.camera}, {frames[-1].stamp - f.stamp:.1f} s before" for f in earlier),
+    }
+    values.update({f"seconds {k}": round(v, 4) for k, v in report.seconds.items()})
+    if report.cameras:
+        values["camera poses"] = "; ".join(str(pair) for pair in report.cameras)
+    values["notes"] = "; ".join(report.notes)
+    return values
 
 
 def _free(frame: RgbdFrame, labels: np.ndarray) -> np.ndarray:

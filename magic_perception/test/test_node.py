@@ -62,7 +62,7 @@ class Bench:
             )
 
     def __enter__(self):
-        used = [self.out[name][i] for name in self.node.cameras for i in ((0, 1, 2) if self.node.aligned else (0, 2))]
+        used = [self.out[name][i] for name in self.node.settings.cameras for i in ((0, 1, 2) if self.node.settings.aligned else (0, 2))]
         try:
             self.until(lambda: all(p.get_subscription_count() for p in [*used, self.tf]), "discovery")
         except BaseException:
