@@ -13,9 +13,10 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -25,7 +26,7 @@ from magic_bags.recording import Recording
 from magic_bringup import make_strategies
 from magic_bringup.demonstrating import UP, demonstrated, made_of, target_contact, target_view, through
 from magic_core import transforms
-from magic_core.camera import Intrinsics
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.goal import Goal
 from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
@@ -284,10 +285,9 @@ def record_scene(path: Path, things: list[Thing], seed: int, cameras: dict[str, 
         known = [t.shape.as_object(t.name, t.world_from_object) for t in things if t.known]
         if known:
             bag.known_objects(known, START)
-        events = [(f.stamp, bag.frame, (f,)) for f in frames]
+        events: list[tuple[float, Callable[..., None], tuple]] = [(frame.stamp, bag.frame, (frame,)) for frame in frames]
         events += [(t, bag.joints, (t,)) for t in START + np.arange(0, 0.1 + FRAMES * PERIOD, JOINT_PERIOD)]
-        for _, action, arguments in sorted(events, key=lambda e: e[0]):
-            action(*arguments)
+        _play(events)
     _write_truth(path, seed, things)
 
 
@@ -318,50 +318,66 @@ def gripped(tool: Shape) -> tuple[Array, float]:
     return transforms.frame(place, x, [0.0, 0.0, 1.0]), float(max(np.ptp(across), high[2] - low[2]))
 
 
-def record_demonstration(
-    path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array], model: DepthModel, bare: Bare | None = None
-) -> None:
-    """The tool lying, taken up and in use: its pose and the target's over time, the target moved by physics, seen by both cameras.
+def made(entry: Mapping[str, Any]) -> Shape:
+    """The shape that an entry of a strategy's environment describes."""
+    return make(entry["family"], entry["seed"], **entry["parameters"])
 
-    bare: by a hand, all of the time and with nothing that tells the tool's pose.
-    """
-    made = {
-        key: make(strategy.environment[key]["family"], strategy.environment[key]["seed"], **strategy.environment[key]["parameters"])
-        for key in ("tool", "target")
-    }
-    tool, target = made["tool"], made["target"]
-    world_from_target = demonstrated_pose(strategy.environment)
-    obstacles = fixtures(strategy.environment, (world_from_target @ strategy.target_contact.object_from_contact)[:3, 3])
-    world_from_tool = world_from_target @ strategy.target_from_tool
-    times = strategy.times
-    settle = 2.0 if strategy.releases else 0.5
 
-    rest = settled(tool, lying(tool, *PICKED_UP_FROM[strategy.name]))
+@dataclass(frozen=True)
+class Cast:
+    """What takes part in a demonstration: tool and target, where the target stands (4, 4) in the world, and the fixtures with the shapes that they are, by id."""
+
+    tool: Shape
+    target: Shape
+    world_from_target: Array
+    fixtures: list[SceneObject]
+    shapes: dict[str, Shape]
+
+    @classmethod
+    def of(cls, strategy: Strategy) -> Cast:
+        """As the strategy's environment has it."""
+        environment = strategy.environment
+        world_from_target = demonstrated_pose(environment)
+        found = fixtures(environment, (world_from_target @ strategy.target_contact.object_from_contact)[:3, 3])
+        shapes = {entry["id"]: made(entry) for entry in environment.get("fixtures", ())}
+        return cls(
+            made(environment["tool"]), made(environment["target"]), world_from_target, found, {item.id: shapes[item.id] for item in found}
+        )
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where tool and target are (4, 4), so many seconds after the demonstration has begun."""
+
+    seconds: float
+    world_from_tool: Array
+    world_from_target: Array
+
+    @property
+    def stamp(self) -> float:
+        """Seconds since the epoch."""
+        return START + 0.1 + self.seconds
+
+
+def played(strategy: Strategy, cast: Cast) -> list[Moment]:
+    """The demonstration, a moment every :data:`POSE_PERIOD`: the tool lies, is taken up and used, and the target goes as physics has it."""
+    rest = settled(cast.tool, lying(cast.tool, *PICKED_UP_FROM[strategy.name]))
     above = transforms.make(translation=[0, 0, 0.25]) @ rest
-    begin = REST + TAKE
-    way = np.stack([rest, rest, above, world_from_tool[0], *world_from_tool[1:]])
-    times = np.array([0.0, REST, REST + 0.4 * TAKE, begin, *(begin + times[1:] - times[0])])
+    way = np.stack([rest, rest, above, *(cast.world_from_target @ strategy.target_from_tool)])
+    used = REST + TAKE + strategy.times - strategy.times[0]
+    times = np.array([0.0, REST, REST + 0.4 * TAKE, *used])
 
     world = _World()
-    friction = strategy.physics.friction
-    world.add("tool", tool, rest, "kinematic", friction, strategy.physics.tool_density)
-    world.add(
-        "target",
-        target,
-        world_from_target,
-        "static" if strategy.physics.target_is_fixed else "dynamic",
-        friction,
-        strategy.physics.target_density,
-    )
-    shapes: dict[str, Shape] = {}
-    for item in obstacles:
-        entry = next(e for e in strategy.environment["fixtures"] if e["id"] == item.id)
-        shapes[item.id] = make(entry["family"], entry["seed"], **entry["parameters"])
-        world.add(item.id, shapes[item.id], item.world_from_object, "static", friction)
-    duration = times[-1] + settle
-    at = np.arange(0, duration + 1e-9, 1 / _World.FREQUENCY)
+    physics = strategy.physics
+    world.add("tool", cast.tool, rest, "kinematic", physics.friction, physics.tool_density)
+    kind = "static" if physics.target_is_fixed else "dynamic"
+    world.add("target", cast.target, cast.world_from_target, kind, physics.friction, physics.target_density)
+    for item in cast.fixtures:
+        world.add(item.id, cast.shapes[item.id], item.world_from_object, "static", physics.friction)
+    settle = 2.0 if strategy.releases else 0.5
+    at = np.arange(0, times[-1] + settle + 1e-9, 1 / _World.FREQUENCY)
     commanded = transforms.interpolate(times, way, at)
-    poses: list[tuple[float, Array, Array]] = [(0.0, rest, world_from_target)]
+    moments = [Moment(0.0, rest, cast.world_from_target)]
     released = False
     for k, t in enumerate(at[1:], start=1):
         if strategy.releases and t > times[-1]:
@@ -372,59 +388,80 @@ def record_demonstration(
             world.move("tool", commanded[k])
         world.step()
         if k % round(POSE_PERIOD * _World.FREQUENCY) == 0:
-            poses.append((float(t), world.pose("tool"), world.pose("target")))
+            moments.append(Moment(float(t), world.pose("tool"), world.pose("target")))
+    return moments
 
+
+def pictured(moments: list[Moment], bare: Bare | None) -> list[Moment]:
+    """Those of which pictures are taken: by a bare hand at its rate, else a few while the tool lies and a few while it is used."""
+    if bare is not None:
+        return moments[:: max(1, round(1 / (bare.rate * POSE_PERIOD)))]
+    lying_still = np.linspace(0, REST, LYING_FRAMES + 1)[:-1] / POSE_PERIOD
+    in_use = np.linspace((REST + TAKE) / POSE_PERIOD, len(moments) - 1, DEMONSTRATION_FRAMES)
+    return [moments[k] for k in np.concatenate([lying_still, in_use]).round().astype(int)]
+
+
+def meshes_at(cast: Cast, moment: Moment, bare: Bare | None) -> list[Mesh]:
+    """What a camera sees, in the world: tool, target, fixtures, and the hand where there is one by then."""
+    meshes = [
+        cast.tool.mesh.transformed(moment.world_from_tool),
+        cast.target.mesh.transformed(moment.world_from_target),
+        *(item.mesh.transformed(item.world_from_object) for item in cast.fixtures),
+    ]
+    if bare is not None and moment.seconds > REST - HAND_COMES:
+        away = transforms.make(translation=coming(moment.seconds - REST + HAND_COMES, HAND_COMES))
+        meshes.append(hand(bare.thick).transformed(moment.world_from_tool @ bare.tool_from_grip @ away))
+    return meshes
+
+
+def record_demonstration(
+    path: Path, strategy: Strategy, seed: int, cameras: dict[str, Array], model: DepthModel, bare: Bare | None = None
+) -> None:
+    """The tool lying, taken up and in use: its pose and the target's over time, the target moved by physics, seen by both cameras.
+
+    bare: by a hand, all of the time and with nothing that tells the tool's pose.
+    """
+    cast = Cast.of(strategy)
+    moments = played(strategy, cast)
+    frames: list[RgbdFrame] = []
+    for index, moment in enumerate(pictured(moments, bare)):
+        caster = scene_raycaster(meshes_at(cast, moment, bare))
+        frames += [
+            capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=moment.stamp, raycaster=caster, model=model)
+            for number, (name, pose) in enumerate(cameras.items())
+        ]
+    known: list[SceneObject] = list(cast.fixtures)
+    if strategy.physics.target_is_fixed:
+        known.append(cast.target.as_object("rod", cast.world_from_target))
     with Recording(path) as bag:
-        events: list[tuple[float, object, tuple]] = []
-        first = None
-        seen = np.concatenate(
-            [
-                np.linspace(0, REST, LYING_FRAMES + 1)[:-1] / POSE_PERIOD,
-                np.linspace(begin / POSE_PERIOD, len(poses) - 1, DEMONSTRATION_FRAMES),
-            ]
-        )
-        if bare is not None:
-            seen = np.arange(0, len(poses), max(1, round(1 / (bare.rate * POSE_PERIOD))))
-        for index, k in enumerate(seen.round().astype(int)):
-            t, tool_pose, target_pose = poses[k]
-            meshes = [
-                tool.mesh.transformed(tool_pose),
-                target.mesh.transformed(target_pose),
-                *(i.mesh.transformed(i.world_from_object) for i in obstacles),
-            ]
-            if bare is not None and t > REST - HAND_COMES:
-                grip = tool_pose @ bare.tool_from_grip @ transforms.make(translation=coming(t - REST + HAND_COMES, HAND_COMES))
-                meshes.append(hand(bare.thick).transformed(grip))
-            caster = scene_raycaster(meshes)
-            frames = [
-                capture([], D435_SMALL, pose, [seed, index, number], camera=name, stamp=START + 0.1 + t, raycaster=caster, model=model)
-                for number, (name, pose) in enumerate(cameras.items())
-            ]
-            first = first or frames
-            events += [(f.stamp, bag.frame, (f,)) for f in frames]
-        for t, tool_pose, target_pose in poses:
-            stamp = START + 0.1 + t
-            if bare is None:
-                events.append((stamp, bag.pose, ("/demonstration/tool_pose", tool_pose, stamp)))
-                events.append((stamp, bag.pose, ("/demonstration/target_pose", target_pose, stamp)))
-            events.append((stamp, bag.joints, (stamp,)))
-        bag.cameras(first, START)
-        known: list[SceneObject] = list(obstacles)
-        if strategy.physics.target_is_fixed:
-            known.append(target.as_object("rod", world_from_target))
+        bag.cameras(frames[: len(cameras)], START)
         if known:
             bag.known_objects(known, START)
-        for _, action, arguments in sorted(events, key=lambda e: e[0]):
-            action(*arguments)
-    things = [Thing("tool", tool, poses[0][1]), Thing("target", target, world_from_target, strategy.physics.target_is_fixed)]
-    things += [Thing(item.id, shapes[item.id], item.world_from_object, True) for item in obstacles]
-    _write_truth(path, seed, things, poses if bare is not None else [])
+        events: list[tuple[float, Callable[..., None], tuple]] = [(frame.stamp, bag.frame, (frame,)) for frame in frames]
+        for moment in moments:
+            if bare is None:
+                events.append((moment.stamp, bag.pose, ("/demonstration/tool_pose", moment.world_from_tool, moment.stamp)))
+                events.append((moment.stamp, bag.pose, ("/demonstration/target_pose", moment.world_from_target, moment.stamp)))
+            events.append((moment.stamp, bag.joints, (moment.stamp,)))
+        _play(events)
+    things = [
+        Thing("tool", cast.tool, moments[0].world_from_tool),
+        Thing("target", cast.target, cast.world_from_target, strategy.physics.target_is_fixed),
+        *(Thing(item.id, cast.shapes[item.id], item.world_from_object, True) for item in cast.fixtures),
+    ]
+    _write_truth(path, seed, things, moments if bare is not None else [])
 
 
-def _write_truth(path: Path, seed: int, things: list[Thing], poses: Sequence[tuple[float, Array, Array]] = ()) -> None:
+def _play(events: list[tuple[float, Callable[..., None], tuple]]) -> None:
+    """Write what came at a stamp, each by its writer and what that takes, in the order of time."""
+    for _, write, arguments in sorted(events, key=lambda event: event[0]):
+        write(*arguments)
+
+
+def _write_truth(path: Path, seed: int, things: list[Thing], moments: Sequence[Moment] = ()) -> None:
     data: dict[str, object] = {"seed": seed, "objects": [t.truth() for t in things]}
-    if poses:
-        data["tool"] = [{"stamp": START + 0.1 + t, "world_from_object": pose_data(tool_pose)} for t, tool_pose, _ in poses]
+    if moments:
+        data["tool"] = [{"stamp": moment.stamp, "world_from_object": pose_data(moment.world_from_tool)} for moment in moments]
     (path / "truth.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
 
 
@@ -449,9 +486,7 @@ def record(name: str, out: Path, seed: int = 0, bare: bool = False) -> Path:
     out.mkdir(parents=True, exist_ok=True)
 
     def by_hand(strategy: Strategy) -> Bare | None:
-        made = strategy.environment["tool"]
-        tool = make(made["family"], made["seed"], **made["parameters"])
-        return Bare(*gripped(tool)) if bare else None
+        return Bare(*gripped(made(strategy.environment["tool"]))) if bare else None
 
     if name in SCENES:
         scene, cameras, model = SCENES[name]
