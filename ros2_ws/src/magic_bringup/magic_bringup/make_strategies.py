@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_bringup import handling, striking
-from magic_bringup.demonstrating import SAMPLE, UP, Poses, demonstrated, line, target_contact, target_view, through, unseen
+from magic_bringup.demonstrating import SAMPLE, UP, Poses, demonstrated, line, made_of, target_contact, target_view, through, unseen
 from magic_core import strategy as strategies
 from magic_core import transforms
 from magic_core.contact import OPPOSED
@@ -84,8 +84,8 @@ def hooking() -> Strategy:
                 "near_misses": ["letter:60001,glyph=I", "cylinder:0.04", "sphere:0.04"],
             },
             "world_from_target": pose_data(transforms.make(translation=[0.70, 0.0, 0.025])),
-            "tool": {"family": "l_hook", "seed": 0, "parameters": dict(tool.parameters)},
-            "target": {"family": "sphere", "seed": 0, "parameters": dict(target.parameters)},
+            "tool": made_of(tool),
+            "target": made_of(target),
         },
     )
 
@@ -154,8 +154,8 @@ def hanging() -> Strategy:
                 ],
             },
             "world_from_target": pose_data(rod_pose(target)),
-            "tool": {"family": "hanger", "seed": 2, "parameters": dict(tool.parameters)},
-            "target": {"family": "rod", "seed": 0, "parameters": dict(target.parameters)},
+            "tool": made_of(tool),
+            "target": made_of(target),
         },
     )
 
@@ -182,6 +182,13 @@ def scooped_ball(radius: float) -> NDArray[np.float64]:
     return transforms.make(translation=SCOOP_FROM + back + [0, 0, radius])
 
 
+#: Speed of the tool in scooping, m/s.
+SCOOP_SPEED = 0.08
+#: Where the tool's contact begins and how near it comes quickly (3,), m, in the frame of the target's contact. The deepest bowls reach round the ball before
+#: their bottoms touch it: the start leaves them room.
+BACK, NEAR = np.array([0.10, 0.0, 0.0]), np.array([0.06, 0.0, 0.0])
+
+
 def scooping() -> Strategy:
     """A spoon pushes a ball against a quarter pipe and turns it up."""
     radius = 0.035
@@ -205,30 +212,14 @@ def scooping() -> Strategy:
     direction, normal = np.round(turn_to_world @ [0.0, -1.0, 0.0], 12), np.round(turn_to_world @ [1.0, 0.0, 0.0], 12)
     seen = target_view(target, "section", direction)
     touched = target_contact(seen, radius * normal, normal, radius)
-
-    speed = 0.08
-    # The deepest bowls reach round the ball before their bottoms touch it: the start leaves them room.
-    back, near = np.array([0.10, 0.0, 0.0]), np.array([0.06, 0.0, 0.0])
-    times, slide = line([back, near, np.array([-SLIDE, 0.0, 0.0])], speed)
-    # Contact frame of the target: x against the slide, y up.
-    arm = TURN_RADIUS - radius
-    start = _stack(slide, 0.0)
-    angle_s = np.linspace(0, 1, int(1.5 * arm * np.pi / 2 / speed / SAMPLE) + 1)[1:]
-    angle = np.pi / 2 * (3 * angle_s**2 - 2 * angle_s**3)
-    turn_times = times[-1] + angle_s * 1.5 * arm * np.pi / 2 / speed
-    turn = np.stack([_spoke(np.array([-SLIDE, arm, 0.0]), arm, a) for a in angle])
-    lift_times, lift = line([turn[-1][:3, 3], turn[-1][:3, 3] + [0, LIFT, 0]], speed)
-    end = np.repeat(turn[-1:], len(lift) - 1, axis=0)
-    end[:, :3, 3] = lift[1:]
-    contacts = np.concatenate([start, turn, end])
-    times = np.concatenate([times, turn_times, turn_times[-1] + lift_times[1:]])
+    times, contacts, turned = _scoop(TURN_RADIUS - radius)
     waypoints = (
-        Waypoint("behind", back, "approach", speed),
-        Waypoint("near", near, "approach", speed),
-        Waypoint("touch", np.zeros(3), "contact", speed),
-        Waypoint("at_arc", np.array([-SLIDE, 0.0, 0.0]), "contact", speed),
-        Waypoint("scooped", turn[-1][:3, 3], "goal", speed),
-        Waypoint("lifted", end[-1][:3, 3], "goal", speed),
+        Waypoint("behind", BACK, "approach", SCOOP_SPEED),
+        Waypoint("near", NEAR, "approach", SCOOP_SPEED),
+        Waypoint("touch", np.zeros(3), "contact", SCOOP_SPEED),
+        Waypoint("at_arc", np.array([-SLIDE, 0.0, 0.0]), "contact", SCOOP_SPEED),
+        Waypoint("scooped", turned[:3, 3], "goal", SCOOP_SPEED),
+        Waypoint("lifted", contacts[-1][:3, 3], "goal", SCOOP_SPEED),
     )
     return Strategy(
         name="scooping",
@@ -250,24 +241,29 @@ def scooping() -> Strategy:
                 "near_misses": ["hammer:60001", "letter:60002,glyph=I", "mallet:60003"],
             },
             "world_from_target": pose_data(scooped_ball(radius)),
-            "tool": {"family": "spoon", "seed": 1, "parameters": dict(tool.parameters)},
-            "target": {"family": "sphere", "seed": 3, "parameters": dict(target.parameters)},
-            "fixtures": [
-                {
-                    "id": "arc",
-                    "family": "quarter_pipe",
-                    "seed": 0,
-                    "parameters": dict(arc.parameters),
-                    "from_target": pose_data(arc_from_target(arc)),
-                }
-            ],
+            "tool": made_of(tool),
+            "target": made_of(target),
+            "fixtures": [{"id": "arc", **made_of(arc), "from_target": pose_data(arc_from_target(arc))}],
         },
     )
 
 
-def _stack(offsets: NDArray[np.float64], angle: float) -> Poses:
-    turn = transforms.from_rotvec([0, 0, angle])
-    return np.stack([transforms.make(translation=offset) @ turn @ OPPOSED for offset in offsets])
+def _scoop(arm: float) -> tuple[NDArray[np.float64], Poses, NDArray[np.float64]]:
+    """The motion of scooping about an axis ``arm`` metres above the contact: times (T,) in s, target_contact_from_tool_contact (T, 4, 4), and that where the turn ends.
+
+    Contact frame of the target: x against the slide, y up.
+    """
+    times, places = line([BACK, NEAR, np.array([-SLIDE, 0.0, 0.0])], SCOOP_SPEED)
+    slide = np.stack([transforms.make(translation=place) @ OPPOSED for place in places])
+    # A smooth start and stop, as of a line.
+    duration = 1.5 * arm * np.pi / 2 / SCOOP_SPEED
+    share = np.linspace(0, 1, int(duration / SAMPLE) + 1)[1:]
+    turn = np.stack([_spoke(np.array([-SLIDE, arm, 0.0]), arm, angle) for angle in np.pi / 2 * (3 * share**2 - 2 * share**3)])
+    turn_times = times[-1] + share * duration
+    lift_times, heights = line([turn[-1][:3, 3], turn[-1][:3, 3] + [0, LIFT, 0]], SCOOP_SPEED)
+    lift = np.repeat(turn[-1:], len(heights) - 1, axis=0)
+    lift[:, :3, 3] = heights[1:]
+    return np.concatenate([times, turn_times, turn_times[-1] + lift_times[1:]]), np.concatenate([slide, turn, lift]), turn[-1]
 
 
 def _spoke(axis: NDArray[np.float64], arm: float, angle: float) -> NDArray[np.float64]:
