@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -325,7 +326,7 @@ def build_round(
         out = _standing_off(out, body)
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
         if len(out) > 0.02 * len(points) and np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010:
-            handle = handle_of(sights, out, body, parameters)
+            handle = handle_of(sights, out, body)
             if handle is None and len(out) > 0.15 * len(points):
                 return None
         elif len(out) > 0.2 * len(points):
@@ -335,19 +336,18 @@ def build_round(
     alone = Reconstruction(mesh, tuple(pieces), "round")
     if handle is None:
         return alone
-    bars, handle_pieces, hole = handle
     # A mouth tells of a cup, and a bar on it of a handle. Beside what is closed, or closed as far as is seen, it takes the hole between: what stands
     # close to a tin is no handle.
-    if not body.open and hole < HOLE:
+    if not body.open and handle.hole < HOLE:
         return alone
     try:
         import trimesh
 
-        joined = trimesh.boolean.union([mesh.to_trimesh(), *[b.to_trimesh() for b in bars]], engine="manifold")
+        joined = trimesh.boolean.union([mesh.to_trimesh(), *[bar.to_trimesh() for bar in handle.bars]], engine="manifold")
         mesh = Mesh(joined.vertices, joined.faces)
     except Exception:  # the boolean library refuses a degenerate solid: overlapping closed parts still bound the same solid
-        mesh = concatenate([mesh, *bars])
-    return Reconstruction(mesh, tuple(pieces + handle_pieces), "round with handle")
+        mesh = concatenate([mesh, *handle.bars])
+    return Reconstruction(mesh, tuple(pieces + handle.pieces), "round with handle")
 
 
 def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mesh]]:
@@ -390,6 +390,8 @@ def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[
     return mesh, pieces
 
 
+#: Edge of a cell of a handle's plane, m; cameras see it where they look at it no more askew than this cosine.
+CELL, SQUARELY = 0.001, 0.25
 #: Pixels around a round body within which a mask may be the body's own.
 EDGE = 3
 #: The largest width of a handle's bar, or of bar and hole where no camera sees through that, m: what is wider is a part of another form. (Handles of made
@@ -402,84 +404,137 @@ HOLE = 6e-5
 BOW = 0.2
 
 
-def handle_of(
-    sights: list[Sight], out: NDArray[np.float64], body: Body, parameters: Parameters
-) -> tuple[list[Mesh], list[Mesh], float] | None:
-    """A handle as bars in the upright plane through the body's axis: meshes, convex pieces and the largest hole that it encloses with the body, m^2;
-    ``None`` if nothing is left after carving."""
+@dataclass(frozen=True)
+class Handle:
+    """Bars beside a round body: their meshes and convex pieces, and the largest hole that they enclose with the body, m^2."""
+
+    bars: list[Mesh]
+    pieces: list[Mesh]
+    hole: float
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """The upright plane of a handle, which holds the body's axis, in cells of :data:`CELL`.
+
+    base (3,): where the axis meets the table; out, up, across (3,): unit vectors away from the axis, upwards, and along the normal; start: distance of the
+    first column of cells from the axis, m; s, z (Z, S): distances of the cells from the axis, and their heights, m.
+    """
+
+    base: NDArray[np.float64]
+    out: NDArray[np.float64]
+    up: NDArray[np.float64]
+    across: NDArray[np.float64]
+    start: float
+    s: NDArray[np.float64]
+    z: NDArray[np.float64]
+
+    @classmethod
+    def through(cls, points: NDArray[np.float64], along: NDArray[np.float64], body: Body) -> _Plane:
+        """The plane in the direction ``along`` (2,) from a body's axis, as large as a handle with these points (N, 3) may be."""
+        out, up = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
+        start = float(body.profile[:, 0].min()) - 0.004
+        top = float(max(body.profile[-1, 1], np.percentile(points[:, 2], 99))) + 0.004
+        # Farther out than its points: depth may have lost its bow.
+        end = float(np.percentile((points[:, :2] - body.axis) @ along, 99.5)) + 0.025
+        s, z = np.meshgrid(np.arange(start, end, CELL), np.arange(0.0, top, CELL))
+        return cls(np.array([*body.axis, 0.0]), out, up, np.cross(out, up), start, s, z)
+
+    @cached_property
+    def places(self) -> NDArray[np.float64]:
+        """(Z, S, 3): where the cells are."""
+        return self.base + self.s[..., None] * self.out + self.z[..., None] * self.up
+
+    @cached_property
+    def middle(self) -> NDArray[np.float64]:
+        """(3,)."""
+        return self.places.mean(axis=(0, 1))
+
+    def facing(self, sight: Sight) -> float:
+        """How squarely a camera looks at the plane: the cosine of the angle from its normal."""
+        return abs(float((self.middle - sight.eye) @ self.across)) / np.linalg.norm(self.middle - sight.eye)
+
+    def cells_of(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """(Z, S): 1 where points (N, 3) fall."""
+        cells = np.zeros(self.s.shape, np.uint8)
+        column = np.round(((points[:, :2] - self.base[:2]) @ self.out[:2] - self.start) / CELL).astype(int)
+        row = np.round(points[:, 2] / CELL).astype(int)
+        good = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
+        cells[row[good], column[good]] = 1
+        return cells
+
+    def seen(self, sight: Sight, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(Z, S): the cells that a camera sees in a mask (H, W) of its picture."""
+        return sight.look_up(self.places, mask.astype(np.float32)) > 0.5
+
+
+def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body) -> Handle | None:
+    """A handle as bars in the upright plane through the body's axis, from points (N, 3) beyond the body; ``None`` if nothing is left after carving."""
     local = out[:, :2] - body.axis
     along, thickness = _handle_plane(local, np.linalg.norm(local, axis=1) - body.radius(out[:, 2]))
-    e_s, e_z = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
-    e_n = np.cross(e_s, e_z)
-    cell = 0.001
-    start = float(body.profile[:, 0].min()) - 0.004
-    top = float(max(body.profile[-1, 1], np.percentile(out[:, 2], 99))) + 0.004
-    # Farther out than its points: depth may have lost its bow.
-    s = np.arange(start, float(np.percentile(local @ along, 99.5)) + 0.025, cell)
-    z = np.arange(0.0, top, cell)
-    grid_s, grid_z = np.meshgrid(s, z)
-    base = np.array([*body.axis, 0.0])
-    plane = base + grid_s[..., None] * e_s + grid_z[..., None] * e_z
-    facing = [
-        abs(float((plane.mean(axis=(0, 1)) - sight.eye) @ e_n)) / np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye) for sight in sights
-    ]
-    useful = [sight for sight, f in zip(sights, facing, strict=True) if f > 0.25]
-    covered = np.zeros(grid_s.shape, bool)
-    splat = np.zeros(grid_s.shape, np.uint8)
-    column = np.round((local @ along - start) / cell).astype(int)
-    row = np.round(out[:, 2] / cell).astype(int)
-    good = (column >= 0) & (column < len(s)) & (row >= 0) & (row < len(z))
-    splat[row[good], column[good]] = 1
-    near = cv2.dilate(splat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
+    plane = _Plane.through(out, along, body)
+    points = plane.cells_of(out)
+    near = cv2.dilate(points, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
+    covered = np.zeros(near.shape, bool)
+    useful = [sight for sight in sights if plane.facing(sight) > SQUARELY]
     if useful:
         # Where depth lost a thin bar, the mask beside the body's outline is the handle's.
         drawn = [_drawn(sight, body) for sight in useful]
-        beside = [sight.mask & ~_wider(body_there, EDGE) for sight, body_there in zip(useful, drawn, strict=True)]
-        thickness = min([thickness, *(_widest(sight, mask, plane) for sight, mask in zip(useful, beside, strict=True))])
-        seen = [sight.look_up(plane, mask.astype(np.float32)) > 0.5 for sight, mask in zip(useful, beside, strict=True)]
+        beside = [sight.mask & ~_wider(there, EDGE) for sight, there in zip(useful, drawn, strict=True)]
+        thickness = min([thickness, *(_widest(sight, mask, plane.middle) for sight, mask in zip(useful, beside, strict=True))])
+        seen = [plane.seen(sight, mask) for sight, mask in zip(useful, beside, strict=True)]
         near |= clusters.connected(near | np.any(seen, axis=0), near, 8)
-        # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
-        columns = [plane + n * e_n for n in np.linspace(-thickness / 4, thickness / 4, 3)]
-        # Of a bar no wider than the smear of depth a measurement a little behind it says nothing: only one far behind shows a hole.
-        # Where a camera has the body in its picture its mask says nothing of the handle.
-        told = [replace(sight, hidden=sight.hidden | body_there) for sight, body_there in zip(useful, drawn, strict=True)]
-        field = carve(told, columns, max(0.04, 1.5 * thickness), [f**2 for f in facing if f > 0.25])
-        # Before the body depth sees the handle, behind it nothing does; at the body's edge a mask may be the body's.
-        away = [bool((sight.eye[:2] - body.axis) @ along < 0) for sight in useful]
-        covered, beside_it = (
-            np.all(
-                [
-                    (sight.look_up(plane, there.astype(np.float32)) > 0.5) & far
-                    for sight, there, far in zip(useful, wide, away, strict=True)
-                ],
-                axis=0,
-            )
-            for wide in (drawn, [_wider(there, EDGE) for there in drawn])
-        )
-        covered |= beside_it & (field > 0.5)
+        field = _carved(plane, useful, drawn, thickness)
+        covered = _covered(plane, useful, drawn, body, field)
     else:
-        field = cv2.morphologyEx(splat, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
-    solid = _bars(field > 0.5, near, covered, grid_s, grid_z, body)
-    if 2 * cell * float(cv2.distanceTransform(solid, cv2.DIST_L2, 5).max()) > BAR:
+        field = cv2.morphologyEx(points, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
+    solid = _bars(field > 0.5, near, covered, plane.s, plane.z, body)
+    if 2 * CELL * float(cv2.distanceTransform(solid, cv2.DIST_L2, 5).max()) > BAR:
         return None
-    parts = [
-        p for p in polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([start, 0.0]), cell, simplify=0.0004) if p.area > 3e-5
-    ]
+    outlines = polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([plane.start, 0.0]), CELL, simplify=0.0004)
     # Only what reaches farther out than noise is a handle.
-    parts = [p for p in parts if p.bounds[2] - float(body.radius(np.array((p.bounds[1] + p.bounds[3]) / 2))) > 0.008]
+    parts = [p for p in outlines if p.area > 3e-5 and p.bounds[2] - float(body.radius(np.array((p.bounds[1] + p.bounds[3]) / 2))) > 0.008]
     if not parts:
         return None
-    frame = transforms.make(np.column_stack([e_s, e_z, e_n]), base)
-    bars = [polygons.extrude(p, -thickness / 2, thickness / 2).transformed(frame) for p in parts]
-    pieces = [
-        polygons.prism(ring, -thickness / 2, thickness / 2).transformed(frame)
-        for p in parts
-        for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)
-    ]
-    filled = (solid > 0) | ((grid_s < body.radius(grid_z)) & (grid_z < body.profile[-1, 1]))
+    frame = transforms.make(np.column_stack([plane.out, plane.up, plane.across]), plane.base)
+    low, high = -thickness / 2, thickness / 2
+    rings = [ring for p in parts for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)]
+    return Handle(
+        [polygons.extrude(p, low, high).transformed(frame) for p in parts],
+        [polygons.prism(ring, low, high).transformed(frame) for ring in rings],
+        _largest_hole(plane, solid, body),
+    )
+
+
+def _carved(plane: _Plane, sights: list[Sight], drawn: list[NDArray[np.bool_]], thickness: float) -> NDArray[np.float32]:
+    """(Z, S) 0..1: how solid the cells are by the masks and depths of cameras; drawn (H, W) of each: where it sees the body; thickness: of the handle, m."""
+    # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
+    columns = [plane.places + n * plane.across for n in np.linspace(-thickness / 4, thickness / 4, 3)]
+    # Where a camera has the body in its picture its mask says nothing of the handle.
+    told = [replace(sight, hidden=sight.hidden | there) for sight, there in zip(sights, drawn, strict=True)]
+    # Of a bar no wider than the smear of depth a measurement a little behind it says nothing: only one far behind shows a hole.
+    return carve(told, columns, max(0.04, 1.5 * thickness), [plane.facing(sight) ** 2 for sight in sights])
+
+
+def _covered(
+    plane: _Plane, sights: list[Sight], drawn: list[NDArray[np.bool_]], body: Body, field: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(Z, S): the cells that are behind the body for all cameras; drawn (H, W) of each camera: where it sees the body; field: as :func:`_carved` has it."""
+    # Before the body depth sees the handle, behind it nothing does; at the body's edge a mask may be the body's.
+    behind = [bool((sight.eye[:2] - body.axis) @ plane.out[:2] < 0) for sight in sights]
+
+    def behind_for_all(masks: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+        return np.all([plane.seen(sight, mask) & far for sight, mask, far in zip(sights, masks, behind, strict=True)], axis=0)
+
+    return behind_for_all(drawn) | (behind_for_all([_wider(there, EDGE) for there in drawn]) & (field > 0.5))
+
+
+def _largest_hole(plane: _Plane, solid: NDArray[np.uint8], body: Body) -> float:
+    """The largest area, m^2, that a handle's cells (Z, S) enclose with the body."""
+    filled = (solid > 0) | ((plane.s < body.radius(plane.z)) & (plane.z < body.profile[-1, 1]))
     _, holes, stats, _ = cv2.connectedComponentsWithStats(np.pad(~filled, 1, constant_values=True).view(np.uint8), connectivity=4)
     enclosed = np.delete(stats[:, cv2.CC_STAT_AREA], [0, holes[0, 0]])
-    return bars, pieces, float(enclosed.max(initial=0)) * cell**2
+    return float(enclosed.max(initial=0)) * CELL**2
 
 
 def _standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:
@@ -516,12 +571,12 @@ def _wider(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     return cv2.dilate(mask.view(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
 
 
-def _widest(sight: Sight, mask: NDArray[np.bool_], plane: NDArray[np.float64]) -> float:
-    """How wide a handle's bar is at its widest in a mask, metres at the handle's plane (Z, S, 3), and no less than 5 mm; a bar is about as thick."""
+def _widest(sight: Sight, mask: NDArray[np.bool_], place: NDArray[np.float64]) -> float:
+    """How wide a handle's bar is at its widest in a mask, metres at the handle's place (3,), and no less than 5 mm; a bar is about as thick."""
     if not mask.any():
         return float("inf")
     distance = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, 5)
-    away = float(np.linalg.norm(plane.mean(axis=(0, 1)) - sight.eye))
+    away = float(np.linalg.norm(place - sight.eye))
     return max(2 * float(distance.max()) * away / sight.intrinsics.fx, 0.005)
 
 
