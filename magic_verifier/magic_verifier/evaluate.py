@@ -42,6 +42,8 @@ TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 #: grasps are tried.
 PLANNING_TIME = 10.0
 ARM_ATTEMPTS = 3
+#: The method that takes the best candidate, whatever simulation says of it.
+ONLY_BEST = "no_simulation_verification"
 
 
 @lru_cache(maxsize=16)
@@ -121,6 +123,10 @@ class _Problem:
     layout: captured.Layout | None = None
     left_out: tuple[str, ...] = ()
 
+    def tool(self, tool_id: str) -> tuple[SceneObject, str]:
+        """The tool of that id, and what the case calls it."""
+        return {tool.id: (tool, name) for tool, name in zip(self.tools, self.names, strict=True)}[tool_id]
+
 
 def _as_given(options: Options, strategy: Strategy, case: Case) -> _Problem:
     """The meshes themselves, each tool beside the others and the target in a turn drawn by the seed."""
@@ -170,8 +176,6 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
     """Match, plan and verify one case; the answer is plain data for ``results.json``."""
     import torch
 
-    from magic_server.pipeline import Agenda
-
     _ready(options.variant)
     torch.set_num_threads(1)
     seconds = {"perceive": 0.0, "match": 0.0, "plan": 0.0, "verify": 0.0}
@@ -192,38 +196,16 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         problem = _as_seen(options, strategy, case, seconds, film) if options.source == "images" else _as_given(options, strategy, case)
         if problem.left_out:
             answer["left_out"] = list(problem.left_out)
-        only_best = options.method == "no_simulation_verification"
         if options.method not in BASELINES:
-            _matcher(options.features, options.weights, options.method).prepare(
-                _reference(strategy)
-            )  # once for a strategy, not for a problem
+            # Once for a strategy, not for a problem.
+            _matcher(options.features, options.weights, options.method).prepare(_reference(strategy))
         started = time.perf_counter()
-        candidates, answer["features"] = _candidates(options, strategy, problem, 1 if only_best else options.top_k)
+        top_k = 1 if options.method == ONLY_BEST else options.top_k
+        candidates, answer["features"] = _candidates(options, strategy, problem, top_k)
         seconds["match"] = time.perf_counter() - started
-        by_id = {tool.id: (tool, name) for tool, name in zip(problem.tools, problem.names, strict=True)}
-        attempts = ARM_ATTEMPTS if options.variant == "arm" and not only_best else 1
-        agenda = Agenda(candidates[: 1 if only_best else None], strategy.reflections[: 1 if only_best else None], attempts)
-        entries: dict[tuple[int, str], dict[str, Any]] = {}
-        while not answer["success"] and (following := agenda.next()) is not None:
-            promise, trial = following
-            tool, name = by_id[trial.candidate.tool_id]
-            entry, run = _try(options, _strategy(options, name), trial, tool, name, problem, seconds, answer)
-            if run is not None:
-                runs.append(run)
-            key = trial.index, trial.reflection
-            if key not in entries:
-                entries[key] = {"tool": short_name(name), "score": float(trial.candidate.score), "reflection": trial.reflection, **entry}
-                tried.append(entries[key])
-            elif entry["stage"] == "verify":  # where no further grasp is found, what the last one came to says more
-                entries[key].update(entry)
-            entries[key]["attempts"] = trial.attempt + 1
-            answer["success"] = entry["code"] == Code.OK.name
-            agenda.failed(promise, trial, Code[entry["code"]])
-        if not tried:
-            answer["reason"] = "NO_MATCH"
-        else:
-            # The reason of a failure is that of the best-scored candidate.
-            answer["reason"] = "OK" if answer["success"] else tried[0]["code"]
+        _try_all(options, strategy, problem, candidates, answer, runs)
+        # The reason of a failure is that of the best-scored candidate.
+        answer["reason"] = "NO_MATCH" if not tried else "OK" if answer["success"] else tried[0]["code"]
     except MagicError as error:
         answer["reason"] = error.code.name
         tried.append({"code": error.code.name, "message": error.message})
@@ -234,6 +216,33 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         _draw(film, runs[-1], problem)
     seconds["total"] = sum(seconds.values())
     return answer
+
+
+def _try_all(
+    options: Options, strategy: Strategy, problem: _Problem, candidates: Sequence[Any], answer: dict[str, Any], runs: list[_Tried]
+) -> None:
+    """Plan and verify candidates, those that promise most first, until one passes; each is told in the answer, and its motions are put to ``runs``."""
+    from magic_server.pipeline import Agenda
+
+    most = 1 if options.method == ONLY_BEST else None
+    attempts = ARM_ATTEMPTS if options.variant == "arm" and most is None else 1
+    agenda = Agenda(candidates[:most], strategy.reflections[:most], attempts)
+    entries: dict[tuple[int, str], dict[str, Any]] = {}
+    while not answer["success"] and (following := agenda.next()) is not None:
+        promise, trial = following
+        tool, name = problem.tool(trial.candidate.tool_id)
+        entry, run = _try(options, _strategy(options, name), trial, tool, name, problem, answer)
+        if run is not None:
+            runs.append(run)
+        key = trial.index, trial.reflection
+        if key not in entries:
+            entries[key] = {"tool": short_name(name), "score": float(trial.candidate.score), "reflection": trial.reflection, **entry}
+            answer["candidates"].append(entries[key])
+        elif entry["stage"] == "verify":  # where no further grasp is found, what the last one came to says more
+            entries[key].update(entry)
+        entries[key]["attempts"] = trial.attempt + 1
+        answer["success"] = entry["code"] == Code.OK.name
+        agenda.failed(promise, trial, Code[entry["code"]])
 
 
 def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: int) -> tuple[Sequence[Any], str]:
@@ -304,10 +313,9 @@ def _try(
     tool: SceneObject,
     name: str,
     problem: _Problem,
-    seconds: dict[str, float],
     answer: dict[str, Any],
 ) -> tuple[dict[str, Any], _Tried | None]:
-    """Plan and verify one trial: what is stored of it, and the motion if there was one."""
+    """Plan and verify one trial: what is stored of it, and the motion if there was one; the answer's seconds and simulations go on."""
     from magic_planner.budget import Budget
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
@@ -328,11 +336,11 @@ def _try(
     except MagicError as error:
         return {"code": error.code.name, "message": error.message, "stage": "plan"}, None
     finally:
-        seconds["plan"] += time.perf_counter() - started
+        answer["seconds"]["plan"] += time.perf_counter() - started
     limits = Limits(required_rate=options.required_rate)
     asked = (strategy, tool, target, obstacles, table, candidate, plan)
     verdict = verify(*asked, seed=options.seed, limits=limits, tried=answer["simulations"])
-    seconds["verify"] += verdict.seconds
+    answer["seconds"]["verify"] += verdict.seconds
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}
     entry = {"code": verdict.code.name, "message": verdict.message, "stage": "verify", "metrics": metrics}
@@ -477,25 +485,12 @@ def _work(options: Options, case: Case, folder: Path, films: bool) -> dict[str, 
 
 
 def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: bool = True, log: Any = print) -> dict[str, Any]:
-    """Run all cases that are not stored yet and write ``results.json``, ``summary.txt`` and the contact sheets."""
+    """Run all cases that are not stored yet and write ``results.json``, ``summary.txt`` and the contact sheets.  Raises BAD_REQUEST."""
     from joblib import Parallel, delayed
 
-    if options.method == "no_feature_pca_patch" and options.features != "dinov2":
-        raise MagicError(
-            Code.BAD_REQUEST,
-            f"features of the method {options.method}",
-            options.features,
-            "dinov2, which has a PCA and patches to leave out",
-        )
-    if not 0 <= options.required_rate < 1:
-        raise MagicError(Code.BAD_REQUEST, "required rate", options.required_rate, "0 or more, below 1")
+    _check(options)
     todo = all_cases(options)[: limit or None]
-    (out / "cases").mkdir(parents=True, exist_ok=True)
-    # What is stored belongs to these options only.
-    mark = hashlib.sha256(json.dumps(vars(options), sort_keys=True).encode()).hexdigest()[:16]
-    if (out / "options").exists() and (out / "options").read_text() != mark:
-        raise MagicError(Code.BAD_REQUEST, "output folder", str(out), "an empty folder, or one of an evaluation with the same options")
-    (out / "options").write_text(mark)
+    _take_folder(options, out)
     known = {case.name: stored for case in todo if (stored := _stored(out / "cases" / f"{_key(case.name)}.json")) is not None}
     waiting = [case for case in todo if case.name not in known]
     if known:
@@ -508,6 +503,45 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
     done = [known[case.name] for case in todo]
     summary = summarise(options, done)
     (out / "results.json").write_text(json.dumps({"cases": done, "summary": summary}, indent=1))
+    text = _summary_text(options, summary)
+    if options.source == "images":
+        text += _truth_text(summary["truth"], done) + _surface_text(done)
+        motions = judged(done)
+        title = f"{options.task}, {options.variant}: {len(motions)} motions (number at each point)"
+        said, true = "success rate in simulation", "share that truly succeeds"
+        reliability.draw(reliability.points(motions), out / "reliability.png", title, said, true)
+    (out / "summary.txt").write_text(text)
+    if films:
+        contact_sheet(out / "films", done, True, out / "successes.png")
+        contact_sheet(out / "films", done, False, out / "failures.png")
+    log(text)
+    return summary
+
+
+def _check(options: Options) -> None:
+    """Refuse what cannot be evaluated before any work."""
+    if options.method == "no_feature_pca_patch" and options.features != "dinov2":
+        raise MagicError(
+            Code.BAD_REQUEST,
+            f"features of the method {options.method}",
+            options.features,
+            "dinov2, which has a PCA and patches to leave out",
+        )
+    if not 0 <= options.required_rate < 1:
+        raise MagicError(Code.BAD_REQUEST, "required rate", options.required_rate, "0 or more, below 1")
+
+
+def _take_folder(options: Options, out: Path) -> None:
+    """Make the folder for the results, or take it up where it is of the same options: what is stored in it belongs to these alone."""
+    (out / "cases").mkdir(parents=True, exist_ok=True)
+    mark = hashlib.sha256(json.dumps(vars(options), sort_keys=True).encode()).hexdigest()[:16]
+    if (out / "options").exists() and (out / "options").read_text() != mark:
+        raise MagicError(Code.BAD_REQUEST, "output folder", str(out), "an empty folder, or one of an evaluation with the same options")
+    (out / "options").write_text(mark)
+
+
+def _summary_text(options: Options, summary: dict[str, Any]) -> str:
+    """How many cases passed, how long that took, and why the others did not."""
     low, high = summary["interval_95"]
     times = summary["mean_seconds"]
     text = (
@@ -521,38 +555,38 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
             f"impossible by geometry, not counted above: {len(summary['impossible'])}, of which {summary['impossible_successes']} passed\n"
         )
         text += "".join(f"  {name}: {reason}\n" for name, reason in summary["impossible"].items())
-    if "truth" in summary:
-        truth = summary["truth"]
-        verified = truth["verified_and_succeeds"] + truth["verified_but_fails"]
-        low, high = truth["verified_is_true_interval_95"]
-        share = f" = {100 * truth['verified_is_true']:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)" if verified else ""
-        text += (
-            f"on the true objects: {truth['verified_and_succeeds']} of {verified} verified motions succeed{share}; of those refused "
-            f"{truth['refused_but_would_succeed']} would have succeeded, {truth['refused_and_fails']} not\n"
-        )
-        motions = judged(done)
-        text += f"every simulated motion on the true objects:\n{reliability.table(motions)}\n"
-        title = f"{options.task}, {options.variant}: {len(motions)} motions (number at each point)"
-        said, true = "success rate in simulation", "share that truly succeeds"
-        reliability.draw(reliability.points(motions), out / "reliability.png", title, said, true)
-        for words, sure in (("above 0.5", True), ("up to 0.5", False)):
-            errors = [s["surface_error"] for c in done for s in c.get("seen", ()) if (s["confidence"] > 0.5) == sure]
-            if errors:
-                low, middle, high = 1000 * np.percentile(errors, [16, 50, 84])
-                text += (
-                    f"reconstructions of confidence {words}: surface error {middle:.1f} mm (the middle two thirds {low:.1f} to {high:.1f}) "
-                    f"of {len(errors)}\n"
-                )
-        told = [s for c in done for s in c.get("seen", ()) if s["stated_error"] > 0]
-        if told:
-            below, middle = sum(s["surface_error"] <= s["stated_error"] for s in told), 1000 * np.median([s["stated_error"] for s in told])
-            text += f"{below} of {len(told)} surface errors are below what was stated (5 of 6 are to be), {middle:.1f} mm in the middle\n"
-    (out / "summary.txt").write_text(text)
-    if films:
-        contact_sheet(out / "films", done, True, out / "successes.png")
-        contact_sheet(out / "films", done, False, out / "failures.png")
-    log(text)
-    return summary
+    return text
+
+
+def _truth_text(truth: dict[str, Any], done: list[dict[str, Any]]) -> str:
+    """What truly came of the motions, of the verified ones and of all that were simulated; truth: as :func:`truths` has it."""
+    verified = truth["verified_and_succeeds"] + truth["verified_but_fails"]
+    low, high = truth["verified_is_true_interval_95"]
+    share = f" = {100 * truth['verified_is_true']:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)" if verified else ""
+    return (
+        f"on the true objects: {truth['verified_and_succeeds']} of {verified} verified motions succeed{share}; of those refused "
+        f"{truth['refused_but_would_succeed']} would have succeeded, {truth['refused_and_fails']} not\n"
+        f"every simulated motion on the true objects:\n{reliability.table(judged(done))}\n"
+    )
+
+
+def _surface_text(done: list[dict[str, Any]]) -> str:
+    """How far the surfaces of the reconstructed tools are off, of those that perception was sure of and of the others, and against what was stated."""
+    seen = [item for case in done for item in case.get("seen", ())]
+    text = ""
+    for range_, sure in (("above 0.5", True), ("up to 0.5", False)):
+        errors = [item["surface_error"] for item in seen if (item["confidence"] > 0.5) == sure]
+        if errors:
+            low, middle, high = 1000 * np.percentile(errors, [16, 50, 84])
+            text += (
+                f"reconstructions of confidence {range_}: surface error {middle:.1f} mm (the middle two thirds {low:.1f} to {high:.1f}) "
+                f"of {len(errors)}\n"
+            )
+    told = [item for item in seen if item["stated_error"] > 0]
+    if told:
+        below, middle = sum(s["surface_error"] <= s["stated_error"] for s in told), 1000 * np.median([s["stated_error"] for s in told])
+        text += f"{below} of {len(told)} surface errors are below what was stated (5 of 6 are to be), {middle:.1f} mm in the middle\n"
+    return text
 
 
 def main(args: list[str] | None = None) -> None:
