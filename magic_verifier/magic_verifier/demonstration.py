@@ -108,21 +108,9 @@ def replay(
     """
     settings = settings or Settings(frequency=480.0)
     table = np.array([0.0, 0.0, 1.0, 0.0]) if table is None else table
-    times = np.asarray(strategy.times, dtype=float)
-    times = times - times[0]
-    world_from_tool = target.world_from_object @ strategy.target_from_tool
-    if len(times) < 2:
-        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", f"{len(times)} poses", "two or more timed poses")
-    if not phases:
-        phases = (Phase("approach", 0.0, times[-1] / 2), Phase("goal", times[-1] / 2, float(times[-1])))
     releases = strategy.releases and strategy.physics.target_is_fixed
-    if releases:
-        # The tool is let go where the demonstration ends, or at the release phase, and hangs for a second.
-        start = next((p.start for p in phases if p.name == "release"), float(times[-1]))
-        phases = (*(p for p in phases if p.end <= start), Phase("release", start, start + 1.0))
-        keep = times <= start + 1e-9
-        times, world_from_tool = np.append(times[keep], start + 1.0), np.concatenate([world_from_tool[keep], world_from_tool[keep][-1:]])
-    setup = make_setup(replace(tool, world_from_object=world_from_tool[0]), target, obstacles, table, strategy.physics, settings)
+    motion = _motion(strategy, target, phases, releases)
+    setup = make_setup(replace(tool, world_from_object=motion.world_from_tool[0]), target, obstacles, table, strategy.physics, settings)
     if not releases:
         # A few millimetres are what is asked for: the flats of convex pieces would be seen in them.
         setup = replace(setup, tool=replace(setup.tool, mesh=tool.mesh))
@@ -130,37 +118,13 @@ def replay(
     if held:
         # PhysX tells of no contact between a led and a static body: the target is a free one, heavy, and put back after each step.
         setup = replace(setup, target_kind=DYNAMIC, physics=replace(setup.physics, target_density=HELD_DENSITY))
-    run = FloatingRun(setup, MotionPlan("fg", ToolMotion(times, world_from_tool, phases)))
+    run = FloatingRun(setup, MotionPlan("fg", motion))
     watched = "release" if releases else watched
-    if watched not in {p.name for p in phases}:
-        raise MagicError(Code.BAD_REQUEST, "phase to read contacts in", watched, [p.name for p in phases])
-    # A ball rolls under the tool: its contact is a place on it as it stood, not on its turning surface.
-    world_from_still = target.world_from_object.copy()
-    target_from_start = transforms.inverse(target.world_from_object)
-    stretches: list[_Stretch] = []
-    count, touched, looked = 0, 0, 0
-    while run.time < run.duration:
-        run.advance()
-        if held:
-            run.world.place(TARGET, target.world_from_object)
-        run.world.check((TOOL,) if releases else (TOOL, TARGET))
-        if run.phase != watched:
-            continue
-        looked += 1
-        touches = [t for t in run.world.touches(TOOL, TARGET, TOUCH) if np.linalg.norm(t.impulse) > 0]
-        touched += bool(touches)
-        world_from_still[:3, 3] = run.world.position(TARGET)
-        tool_from_world, target_from_world = transforms.inverse(run.world.pose(TOOL)), transforms.inverse(world_from_still)
-        if touches and (not stretches or run.time - stretches[-1].last > APART):
-            stretches.append(_Stretch(run.time))
-        for touch in touches:
-            moved = target_from_start[:3, :3] @ world_from_still[:3, 3] + target_from_start[:3, 3]
-            # The contact's normal points towards the tool: out of the target's surface.
-            points = (tool_from_world @ [*touch.position, 1.0])[:3], (target_from_world @ [*touch.position, 1.0])[:3]
-            normals = -tool_from_world[:3, :3] @ touch.normal, target_from_world[:3, :3] @ touch.normal
-            stretches[-1].add(run.time, float(np.linalg.norm(touch.impulse)), points, normals, moved)
-            count += 1
-    if count == 0:
+    names = [phase.name for phase in motion.phases]
+    if watched not in names:
+        raise MagicError(Code.BAD_REQUEST, "phase to read contacts in", watched, names)
+    stretches, share = _contacts(run, watched, target, held, (TOOL,) if releases else (TOOL, TARGET))
+    if not stretches:
         raise MagicError(
             Code.LOST_CONTACT,
             f"contacts in the {watched} phase of the demonstration {strategy.name}",
@@ -168,15 +132,66 @@ def replay(
             "at least one contact that carries a force",
         )
     whole = _Stretch.joined(stretches)
-    return Replay(*whole.read(), touched / max(looked, 1), count, whole.first, whole.last, tuple(s.meeting() for s in stretches))
+    return Replay(*whole.read(), share, whole.points, whole.first, whole.last, tuple(stretch.meeting() for stretch in stretches))
+
+
+def _motion(strategy: Shown, target: SceneObject, phases: tuple[Phase, ...], releases: bool) -> ToolMotion:
+    """The demonstrated motion in the world, from 0 s on; releases: the tool is let go where it ends, or at the phase of that name, and hangs for a second."""
+    times = np.asarray(strategy.times, dtype=float)
+    times = times - times[0]
+    world_from_tool = target.world_from_object @ strategy.target_from_tool
+    if len(times) < 2:
+        raise MagicError(Code.BAD_STRATEGY, f"trajectory of {strategy.name}", f"{len(times)} poses", "two or more timed poses")
+    if not phases:
+        phases = (Phase("approach", 0.0, times[-1] / 2), Phase("goal", times[-1] / 2, float(times[-1])))
+    if not releases:
+        return ToolMotion(times, world_from_tool, phases)
+    start = next((p.start for p in phases if p.name == "release"), float(times[-1]))
+    phases = (*(p for p in phases if p.end <= start), Phase("release", start, start + 1.0))
+    keep = times <= start + 1e-9
+    return ToolMotion(np.append(times[keep], start + 1.0), np.concatenate([world_from_tool[keep], world_from_tool[keep][-1:]]), phases)
+
+
+def _contacts(run: FloatingRun, watched: str, target: SceneObject, held: bool, checked: tuple[str, ...]) -> tuple[list[_Stretch], float]:
+    """The stretches in which tool and target press on each other in the watched phase, and the share of it in which they do.
+
+    target: as it stood; held: it is put back there after each step; checked: the bodies whose state has to be sound.
+    """
+    # A ball rolls under the tool: its contact is a place on it as it stood, not on its turning surface.
+    world_from_still = target.world_from_object.copy()
+    target_from_start = transforms.inverse(target.world_from_object)
+    stretches: list[_Stretch] = []
+    touched, looked = 0, 0
+    while run.time < run.duration:
+        run.advance()
+        if held:
+            run.world.place(TARGET, target.world_from_object)
+        run.world.check(checked)
+        if run.phase != watched:
+            continue
+        looked += 1
+        touches = [t for t in run.world.touches(TOOL, TARGET, TOUCH) if np.linalg.norm(t.impulse) > 0]
+        touched += bool(touches)
+        world_from_still[:3, 3] = run.world.position(TARGET)
+        tool_from_world, target_from_world = transforms.inverse(run.world.pose(TOOL)), transforms.inverse(world_from_still)
+        moved = target_from_start[:3, :3] @ world_from_still[:3, 3] + target_from_start[:3, 3]
+        if touches and (not stretches or run.time - stretches[-1].last > APART):
+            stretches.append(_Stretch(run.time))
+        for touch in touches:
+            # The contact's normal points towards the tool: out of the target's surface.
+            points = (tool_from_world @ [*touch.position, 1.0])[:3], (target_from_world @ [*touch.position, 1.0])[:3]
+            normals = -tool_from_world[:3, :3] @ touch.normal, target_from_world[:3, :3] @ touch.normal
+            stretches[-1].add(run.time, float(np.linalg.norm(touch.impulse)), points, normals, moved)
+    return stretches, touched / max(looked, 1)
 
 
 @dataclass
 class _Stretch:
-    """What adds up to a meeting, each point weighted by its force."""
+    """What adds up to a meeting, so many points, each weighted by its force."""
 
     first: float
     last: float = 0.0
+    points: int = 0
     weight: float = 0.0
     sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 3)))
     moved: list[NDArray[np.float64]] = field(default_factory=list)
@@ -190,15 +205,19 @@ class _Stretch:
         moved: NDArray[np.float64],
     ) -> None:
         """Points and outward normals of tool and target, each in its own frame."""
-        self.last, self.weight = time, self.weight + force
+        self.last, self.points, self.weight = time, self.points + 1, self.weight + force
         self.sums += force * np.stack([points[0], normals[0], points[1], normals[1]])
         self.moved = [*self.moved[:1], moved]
 
     @staticmethod
     def joined(stretches: list[_Stretch]) -> _Stretch:
         """All of them as one."""
-        weight, sums = sum(s.weight for s in stretches), np.sum([s.sums for s in stretches], axis=0)
-        return _Stretch(stretches[0].first, stretches[-1].last, weight, sums)
+        points, weight, sums = (
+            sum(s.points for s in stretches),
+            sum(s.weight for s in stretches),
+            np.sum([s.sums for s in stretches], axis=0),
+        )
+        return _Stretch(stretches[0].first, stretches[-1].last, points, weight, sums)
 
     def read(self) -> tuple[NDArray[np.float64], ...]:
         """Mean point and normal on the tool, then on the target."""
