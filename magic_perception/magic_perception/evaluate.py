@@ -19,7 +19,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from magic_core.rendering import Raycaster
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.views import find_view, holes_of
 from magic_perception import coverage, measures, speed
-from magic_perception.parameters import Parameters
+from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmentation import Looked, Segmenter, _frame_on, find_table, look
 from magic_perception.segmenters import make_segmenter
@@ -272,46 +272,53 @@ def meshes(
             view = find_view(truth)
             row: dict[str, object] = {"mesh": f"{path.parent.name}/{path.stem}", "turn": turn}
             drawn = [view.image]
-            for method in ("completed", "paper"):
-                report = Report()
-                start = time.process_time()
-                scene = perceive(frames, parameters=Parameters(method=method), segmenter=segmenter, report=report)
-                row[f"{method}_cpu_seconds"] = round(time.process_time() - start, 3)
-                item = nearest(scene.objects, truth)
-                if item is None:
-                    row[method] = None
-                    continue
-                if method == "completed":
-                    row["objects"] = len(scene.objects)
-                    label = sorted(set(np.unique(np.concatenate([i[i > 0] for i in report.labels]))))[
-                        [o.id for o in scene.objects].index(item.id)
-                    ]
-                    row["mask_iou"] = round(float(np.mean([overlap(m, i == label) for m, i in zip(masks, report.labels, strict=True)])), 4)
-                    row["pieces"] = len(item.pieces)
-                    row["shape"] = report.shapes[item.id]
-                found = item.mesh.transformed(item.world_from_object)
-                volume = shared_volume(truth, found)
-                total, opened = open_holes(truth, view, found)
-                row[method] = {
-                    "chamfer_mm": round(1000 * chamfer(truth, found), 2),
-                    "volume_iou": None if volume is None else round(volume, 3),
-                    "holes": total,
-                    "open": opened,
-                }
-                shown = Raycaster([replace(found, colors=None)]).orthographic(
-                    view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0
-                )[0]
-                drawn.append(
-                    np.where(
-                        (shown.ids >= 0)[..., None], (90 + 150 * np.abs(shown.normals @ transforms.unit([0.3, 0.4, 0.86])))[..., None], 0
-                    )
-                    .astype(np.uint8)
-                    .repeat(3, axis=2)
-                )
+            for method in METHODS:
+                cells, picture = _reconstructed(method, frames, masks, truth, view, segmenter)
+                row |= cells
+                drawn += [picture] if picture is not None else []
             rows.append(row)
             if turn == 0:
                 pictures.append(strip(frames, masks, truth, drawn))
     return {"rows": rows, **summary(rows)}, pictures
+
+
+def _reconstructed(
+    method: str, frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], truth: Mesh, view: CanonicalView, segmenter: Segmenter
+) -> tuple[dict[str, object], NDArray[np.uint8] | None]:
+    """What one method makes of captures of a mesh: its part of the row, and its picture in the true object's view.
+
+    masks (H, W): where each frame truly shows it.  What is the same by both methods, which get the same masks, is told by the first.
+    """
+    report = Report()
+    start = time.process_time()
+    scene = perceive(frames, parameters=Parameters(method=method), segmenter=segmenter, report=report)
+    cells: dict[str, object] = {f"{method}_cpu_seconds": round(time.process_time() - start, 3)}
+    item = nearest(scene.objects, truth)
+    if item is None:
+        return {**cells, method: None}, None
+    if method == METHODS[0]:
+        label = report.numbers[item.id]
+        cells["objects"] = len(scene.objects)
+        cells["mask_iou"] = round(float(np.mean([overlap(m, i == label) for m, i in zip(masks, report.labels, strict=True)])), 4)
+        cells["pieces"] = len(item.pieces)
+        cells["shape"] = report.shapes[item.id]
+    found = item.mesh.transformed(item.world_from_object)
+    volume = shared_volume(truth, found)
+    total, opened = open_holes(truth, view, found)
+    cells[method] = {
+        "chamfer_mm": round(1000 * chamfer(truth, found), 2),
+        "volume_iou": None if volume is None else round(volume, 3),
+        "holes": total,
+        "open": opened,
+    }
+    return cells, _shaded(found, view)
+
+
+def _shaded(mesh: Mesh, view: CanonicalView) -> NDArray[np.uint8]:
+    """A mesh in grey on black, as large as a view and seen as in it."""
+    shown = Raycaster([replace(mesh, colors=None)]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0]
+    grey = (90 + 150 * np.abs(shown.normals @ transforms.unit([0.3, 0.4, 0.86])))[..., None]
+    return np.where((shown.ids >= 0)[..., None], grey, 0).astype(np.uint8).repeat(3, axis=2)
 
 
 def nearest(objects: tuple[SceneObject, ...], truth: Mesh) -> SceneObject | None:
@@ -330,7 +337,7 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
         "one_object": sum(r["objects"] == 1 for r in seen),
         "mask_iou": round(float(np.mean([r["mask_iou"] for r in seen])), 4),
     }
-    for method in ("completed", "paper"):
+    for method in METHODS:
         cells = [r[method] for r in rows if isinstance(r.get(method), dict)]
         volumes = [c["volume_iou"] for c in cells if c["volume_iou"] is not None]
         result[method] = {
@@ -362,85 +369,102 @@ def strip(
 
 
 def markdown(result: dict) -> str:
-    """The tables."""
+    """The tables of what was measured."""
     lines = ["# Perception, measured", ""]
-    if "osd" in result:
-        part = result["osd"]
-        lines += [
-            f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects of {len(part['scenes'])} scenes; above 0.75: {part['above_0.75']:.1%}.",
-            *(
-                "{}, mean of the scenes, in percent: overlap P {:.1f}, R {:.1f}, F {:.1f}; boundary P {:.1f}, R {:.1f}, F {:.1f}; F@.75 {:.1f}.".format(
-                    where,
-                    *(100 * m[f"{kind}_{what}"] for kind in ("overlap", "boundary") for what in ("precision", "recall", "f")),
-                    100 * m["detected"],
-                )
-                for where, m in (("Whole pictures", part["measures"]), ("Where there is depth, as the labels are", part["with_depth"]))
-            ),
-            "",
-            "| scene | objects | found | best IoU | CPU s |",
-            "| --- | --- | --- | --- | --- |",
-        ]
-        lines += [
+    for part, table in TABLES.items():
+        if part in result:
+            lines += table(result[part])
+    return "\n".join(lines) + "\n"
+
+
+def _osd_table(part: dict) -> list[str]:
+    """Lines of :func:`osd`'s figures."""
+
+    def measured(where: str, m: dict) -> str:
+        overlaps, boundary = ([100 * m[f"{kind}_{what}"] for what in ("precision", "recall", "f")] for kind in ("overlap", "boundary"))
+        return (
+            "{}, mean of the scenes, in percent: overlap P {:.1f}, R {:.1f}, F {:.1f}; boundary P {:.1f}, R {:.1f}, F {:.1f}; F@.75 {:.1f}."
+        ).format(where, *overlaps, *boundary, 100 * m["detected"])
+
+    return [
+        f"OSD: mean best IoU {part['mean_best_iou']:.3f} over {part['objects']} objects of {len(part['scenes'])} scenes; above 0.75: {part['above_0.75']:.1%}.",
+        measured("Whole pictures", part["measures"]),
+        measured("Where there is depth, as the labels are", part["with_depth"]),
+        "",
+        "| scene | objects | found | best IoU | CPU s |",
+        "| --- | --- | --- | --- | --- |",
+        *(
             f"| {n} | {s['objects']} | {s['found']} | {', '.join(f'{x:.2f}' for x in s['best_iou'])} | {s['cpu_seconds']:.2f} |"
             for n, s in part["scenes"].items()
-        ] + [""]
-    if "views" in result:
-        lines.append(coverage.markdown(result["views"]))
-    if "speed" in result:
-        lines.append(speed.markdown(result["speed"]))
-    if "captures" in result:
-        alone = [row["one_object"] for row in result["captures"].values() if "one_object" in row]
-        lines += [
-            f"{sum(alone)} of {len(alone)} real captures in which one thing can fall apart show it as one.",
-            "",
-            "| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |",
-            "| --- | --- | --- | --- | --- | --- |",
-        ]
-        for name, row in result["captures"].items():
-            size = " x ".join(f"{x:.0f}" for x in row["sizes_mm"][0]) if row["sizes_mm"] else ""
-            lines.append(
-                f"| {name}{' (one object)' if row.get('one_object') else ' (not one object)' if 'one_object' in row else ''} | {row['objects']} | {size} | {' x '.join(map(str, row.get('read_mm', [])))} | {row.get('largest_error_mm', '')} | {row['cpu_seconds']:.2f} |"
-            )
-        lines.append("")
-    if "meshes" in result:
-        part = result["meshes"]
-        lines += [
-            f"Ray-cast captures: {part['captures']}, found {part['found']}, as one object {part['one_object']}; mean mask IoU {part['mask_iou']:.3f}.",
-            "",
-        ]
-        lines += ["| method | Chamfer, mm: mean | median | volumetric IoU | holes open |", "| --- | --- | --- | --- | --- |"]
-        for method in ("completed", "paper"):
-            m = part[method]
-            lines.append(
-                f"| {method} | {m['chamfer_mm']:.2f} | {m['chamfer_mm_median']:.2f} | {m['volume_iou']:.3f} (of {m['volumes']}) | {m['holes_open']} of {m['holes']} |"
-            )
-        lines += [
-            "",
-            "| mesh | mask IoU | shape | pieces | Chamfer, mm: completed, paper | volumetric IoU: completed, paper | holes open: completed, paper |",
-            "| --- | --- | --- | --- | --- | --- | --- |",
-        ]
-        for name in dict.fromkeys(r["mesh"] for r in part["rows"]):
-            mine = [r for r in part["rows"] if r["mesh"] == name and r.get("mask_iou") is not None]
-            if not mine:
-                lines.append(f"| {name} | not found | | | | | |")
-                continue
+        ),
+        "",
+    ]
 
-            def pair(key: str, mine: list = mine) -> str:
-                return ", ".join(
-                    "-"
-                    if not (v := [r[m][key] for r in mine if isinstance(r.get(m), dict) and r[m][key] is not None])
-                    else f"{np.mean(v):.2f}"
-                    for m in ("completed", "paper")
-                )
 
-            holes = ", ".join(
-                f"{sum(r[m]['open'] for r in mine if isinstance(r.get(m), dict))}/{sum(r[m]['holes'] for r in mine if isinstance(r.get(m), dict))}"
-                for m in ("completed", "paper")
-            )
-            lines.append(
-                f"| {name} | {np.mean([r['mask_iou'] for r in mine]):.3f} | {', '.join(dict.fromkeys(r['shape'] for r in mine))} | {max(r['pieces'] for r in mine)} | {pair('chamfer_mm')} | {pair('volume_iou')} | {holes} |"
-            )
-    return "\n".join(lines) + "\n"
+def _captures_table(part: dict) -> list[str]:
+    """Lines of :func:`captures`' figures."""
+
+    def line(name: str, row: dict) -> str:
+        size = " x ".join(f"{x:.0f}" for x in row["sizes_mm"][0]) if row["sizes_mm"] else ""
+        one = "" if "one_object" not in row else " (one object)" if row["one_object"] else " (not one object)"
+        read, error = " x ".join(map(str, row.get("read_mm", []))), row.get("largest_error_mm", "")
+        return f"| {name}{one} | {row['objects']} | {size} | {read} | {error} | {row['cpu_seconds']:.2f} |"
+
+    alone = [row["one_object"] for row in part.values() if "one_object" in row]
+    return [
+        f"{sum(alone)} of {len(alone)} real captures in which one thing can fall apart show it as one.",
+        "",
+        "| real capture | objects | size of the largest, mm | read from the image, mm | largest error, mm | CPU s |",
+        "| --- | --- | --- | --- | --- | --- |",
+        *(line(name, row) for name, row in part.items()),
+        "",
+    ]
+
+
+def _meshes_table(part: dict) -> list[str]:
+    """Lines of :func:`meshes`' figures: of both methods, and of each mesh over its turns."""
+
+    def method_line(method: str) -> str:
+        m = part[method]
+        volumes, holes = f"{m['volume_iou']:.3f} (of {m['volumes']})", f"{m['holes_open']} of {m['holes']}"
+        return f"| {method} | {m['chamfer_mm']:.2f} | {m['chamfer_mm_median']:.2f} | {volumes} | {holes} |"
+
+    def mesh_line(name: str) -> str:
+        rows = [r for r in part["rows"] if r["mesh"] == name and r.get("mask_iou") is not None]
+        if not rows:
+            return f"| {name} | not found | | | | | |"
+        cells = [[r[method] for r in rows if isinstance(r.get(method), dict)] for method in METHODS]
+
+        def mean(key: str) -> str:
+            told = [[c[key] for c in of_method if c[key] is not None] for of_method in cells]
+            return ", ".join(f"{np.mean(values):.2f}" if values else "-" for values in told)
+
+        holes = ", ".join(f"{sum(c['open'] for c in of_method)}/{sum(c['holes'] for c in of_method)}" for of_method in cells)
+        iou, shapes = np.mean([r["mask_iou"] for r in rows]), ", ".join(dict.fromkeys(r["shape"] for r in rows))
+        pieces = max(r["pieces"] for r in rows)
+        return f"| {name} | {iou:.3f} | {shapes} | {pieces} | {mean('chamfer_mm')} | {mean('volume_iou')} | {holes} |"
+
+    return [
+        f"Ray-cast captures: {part['captures']}, found {part['found']}, as one object {part['one_object']}; mean mask IoU {part['mask_iou']:.3f}.",
+        "",
+        "| method | Chamfer, mm: mean | median | volumetric IoU | holes open |",
+        "| --- | --- | --- | --- | --- |",
+        *(method_line(method) for method in METHODS),
+        "",
+        "| mesh | mask IoU | shape | pieces | Chamfer, mm: completed, paper | volumetric IoU: completed, paper | holes open: completed, paper |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        *(mesh_line(name) for name in dict.fromkeys(r["mesh"] for r in part["rows"])),
+    ]
+
+
+#: What writes the lines of each part of a result, in their order in the report.
+TABLES: dict[str, Callable[[dict], list[str]]] = {
+    "osd": _osd_table,
+    "views": lambda part: [coverage.markdown(part)],
+    "speed": lambda part: [speed.markdown(part)],
+    "captures": _captures_table,
+    "meshes": _meshes_table,
+}
 
 
 def main(args: list[str] | None = None) -> None:

@@ -55,7 +55,7 @@ class Settings:
 
 def read(node: Node) -> Settings:
     """Declare and read the parameters but those of the robot.  Raises BAD_REQUEST."""
-    p = partial(parameter, node, read_only=True)
+    p = partial(parameter, node)
     cameras = tuple(p("cameras", ["left", "right"], "names of the cameras, used in their topics"))
     if not cameras or len(set(cameras)) != len(cameras):
         raise MagicError(Code.BAD_REQUEST, "parameter cameras", list(cameras), "at least one name, none twice")
@@ -98,7 +98,7 @@ def read(node: Node) -> Settings:
 
 def _algorithm(node: Node) -> Parameters:
     """The parameters that :func:`magic_perception.pipeline.perceive` is told."""
-    p = partial(parameter, node, read_only=True)
+    p = partial(parameter, node)
     low = p("region_low", list(WORKSPACE["region_low"]), "lower corner of the workspace box, m: x and y in `frame`, z from the table found")
     high = p(
         "region_high",
@@ -123,7 +123,7 @@ def _extrinsics(node: Node, camera: str) -> NDArray[np.float64] | None:
     """world_from_camera (4, 4) of a camera as parameters give it; None: it comes from TF."""
     name = f"extrinsics.{camera}"
     text = f"pose of {camera}'s colour optical frame in `frame`: x y z qx qy qz qw; all 0: from TF"
-    numbers = list(parameter(node, name, [0.0] * 7, text, read_only=True))
+    numbers = list(parameter(node, name, [0.0] * 7, text))
     if not any(numbers):
         return None
     if len(numbers) != 7 or not 0.9 < np.linalg.norm(numbers[3:]) < 1.1:
@@ -134,7 +134,7 @@ def _extrinsics(node: Node, camera: str) -> NDArray[np.float64] | None:
 def read_robot(node: Node, slack: float) -> RobotInView | None:
     """Declare and read the parameters of the arm that is cut out of the pictures; ``None``: there is none to cut.  slack: by so much, s, a colour and a depth image of one
     picture may be apart.  Raises BAD_REQUEST."""
-    p = partial(parameter, node, read_only=True)
+    p = partial(parameter, node)
     cuts = p("self_filter", True, "cut the robot (parameters robot.*) out of the pictures by joint_states; false where there is no arm")
     age = p("joint_state_age", 0.2, "how far a joint state may be from a picture's stamp, s", low=0.001, high=2.0)
     space = p("robot_margin", 0.01, "how much wider than its shapes the robot is cut: calibration, cables, m", low=0.0, high=0.1)
