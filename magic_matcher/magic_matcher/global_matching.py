@@ -76,9 +76,7 @@ class PreparedGlobal:
     views: Views
 
 
-def view_matrix(
-    rotation: float, flipped: bool, size: tuple[int, int], centre: NDArray[np.float64], out: int, scale: float
-) -> NDArray[np.float64]:
+def view_matrix(rotation: float, flipped: bool, centre: NDArray[np.float64], out: int, scale: float) -> NDArray[np.float64]:
     """The affine map (2, 3) from picture pixels to those of a turned, mirrored, square view of side ``out``."""
     c, s = np.cos(rotation), np.sin(rotation)
     linear = scale * np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if flipped else 1.0, 1.0])
@@ -108,7 +106,7 @@ def draw(view: CanonicalView, views: Views, out: int) -> tuple[NDArray[np.uint8]
     image = cv2.bitwise_and(view.image, view.image, mask=view.mask.view(np.uint8))
     pictures, masks, maps = [], [], []
     for rotation, flipped in zip(views.rotation, views.flipped, strict=True):
-        matrix = view_matrix(float(rotation), bool(flipped), view.mask.shape, centre, out, scale)
+        matrix = view_matrix(float(rotation), bool(flipped), centre, out, scale)
         pictures.append(cv2.warpAffine(image, matrix, (out, out), flags=cv2.INTER_LINEAR))
         masks.append(cv2.warpAffine(soft, matrix, (out, out), flags=cv2.INTER_LINEAR))
         maps.append(matrix)

@@ -16,7 +16,7 @@ from magic_matcher import global_matching as gm
 def turned(view, angle, flipped=False):
     """A view turned and mirrored in the picture, and the map of its pixels."""
     size = view.mask.shape[0]
-    matrix = gm.view_matrix(angle, flipped, view.mask.shape, np.full(2, (size - 1) / 2), size, 0.95)
+    matrix = gm.view_matrix(angle, flipped, np.full(2, (size - 1) / 2), size, 0.95)
     mask = cv2.warpAffine(view.mask.astype(np.float32), matrix, (size, size)) > 0.5
     return CanonicalView(cv2.warpAffine(view.image, matrix, (size, size)), mask, view.metres_per_pixel, np.eye(4)), matrix
 

@@ -167,7 +167,7 @@ def check_arm(motion: ArmMotion, robot: Description) -> None:
         columns[what] = values
     _check_limits(times, columns, robot)
     _check_rest(motion, times, columns["velocities"], columns["accelerations"], robot)
-    _check_grasp(motion, float(times[-1]), robot)
+    _check_grasp(motion, robot)
 
 
 def _check_limits(times: Array, columns: dict[str, Array], robot: Description) -> None:
@@ -259,7 +259,7 @@ def _check_rest(motion: ArmMotion, times: Array, speed: Array, pull: Array, robo
         )
 
 
-def _check_grasp(motion: ArmMotion, end: float, robot: Description) -> None:
+def _check_grasp(motion: ArmMotion, robot: Description) -> None:
     grasp = np.asarray(motion.tool_from_tcp, dtype=float)
     if grasp.shape != (4, 4) or not np.all(np.isfinite(grasp)) or np.abs(grasp[:3, :3] @ grasp[:3, :3].T - np.eye(3)).max() > SLACK:
         raise MagicError(Code.BAD_MOTION, "grasp (tool_from_tcp)", grasp.tolist(), "a finite rigid transform")

@@ -69,7 +69,7 @@ class Robot(Server, Protocol):
 
     def look(self) -> Look | None: ...
 
-    def world(self, claim: Claim) -> World: ...
+    def world(self) -> World: ...
 
     def get_clock(self) -> Any: ...
 
@@ -214,7 +214,7 @@ class ClosedLoop:
             told = [joint.came for name, joint in self._server.joints.all().items() if name in asked.joints]
             if told and min(told) <= began and time.monotonic() - min(told) <= self._limits.state_age:
                 raise NotYet(Code.STALE_DATA, "joint_states have not come since the last move ended")
-            world = self._server.world(asked)
+            world = self._server.world()
             claim = asked if world.scene is None else replace(asked, carried=self._tool_at(world.scene.stamp))
             permit(claim, replace(world, servers={**world.servers, **self._arm.servers()}), self._limits, Purpose.MOVE)
 

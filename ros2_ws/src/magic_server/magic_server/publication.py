@@ -27,7 +27,7 @@ class Publication:
     ``world()`` gives what there is at that moment.
     """
 
-    def __init__(self, outlet: Outlet, world: Callable[[Claim], World], limits: Limits) -> None:
+    def __init__(self, outlet: Outlet, world: Callable[[], World], limits: Limits) -> None:
         self._outlet, self._world, self._limits = outlet, world, limits
         self._lock = threading.RLock()
         self._standing: Claim | None = None
@@ -44,7 +44,7 @@ class Publication:
         with self._lock:
             if self._closed:
                 raise MagicError(Code.CANCELED, "the strategy server ends")
-            notes = permit(claim, self._world(claim), self._limits, Purpose.PUBLISH)
+            notes = permit(claim, self._world(), self._limits, Purpose.PUBLISH)
             self.take_back("another motion is published instead")
             self._outlet.publish(claim, notes)
             self._standing = claim
@@ -57,7 +57,7 @@ class Publication:
             if claim is None:
                 return
             try:
-                permit(claim, self._world(claim), self._limits, Purpose.STAND)
+                permit(claim, self._world(), self._limits, Purpose.STAND)
             except MagicError as error:
                 self.take_back(error.message)
             except Exception as error:  # what cannot be judged does not stand

@@ -337,7 +337,7 @@ class StrategyServer(LifecycleNode):
         found = {r.server: r.servers() for r in (self.matcher, self.planner, self.verifier)}
         return {**found, "strategy server": servers_of(self, self._server_name + SEND_GOAL)}
 
-    def world(self, claim: Claim) -> World:
+    def world(self) -> World:
         """What there is at this moment."""
         token = self._token
         return World(

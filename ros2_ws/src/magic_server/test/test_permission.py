@@ -310,7 +310,7 @@ class Events:
         """Also after kill -9: nothing is left of the run; what the shelf holds is from before."""
         self.run = self.exchange = self.verdict = None
         self.lay_down()
-        self.publication = Publication(self.shelf, lambda claim: self.world(), LIMITS)
+        self.publication = Publication(self.shelf, self.world, LIMITS)
         assert self.shelf.standing is None
 
     def there(self):

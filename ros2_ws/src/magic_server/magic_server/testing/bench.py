@@ -95,10 +95,6 @@ class Bench:
             assert time.monotonic() < deadline
             time.sleep(0.005)
 
-    def wait_for_match(self, publisher):
-        """Wait until somebody listens to a publisher."""
-        self.until(lambda: publisher.get_subscription_count() > 0)
-
     def send(self, **goal):
         goal = {"strategy": "fake", "variant": "fg", "target_id": "object_2", **goal}
         future = self.client.send_goal_async(RunStrategy.Goal(**goal), feedback_callback=lambda m: self.feedback.append(m.feedback))
