@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Least difference of two things' middle colours, in the two colour axes or in lightness (OpenCV's Lab of 8 bits): sides in the shade differ in lightness.
 HUE, LIGHTNESS = 12.0, 60.0
+#: What is darker than this, of 255, has noise for a colour.
+DARK = 40.0
 #: So many of the shortest ways between two parts are looked at in a picture, and such a share of the pixels on them is of neither thing.
 WAYS, CLEAR = 12, 0.9
 #: What has the table's colour within a mask may be a gap where it is so many pixels wide, and not so near (of 255, R, G, B) to a mixture of the
@@ -43,7 +45,7 @@ def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], le
             values, counts = np.unique(region[own], return_counts=True)
             large = values[counts >= least]
             if len(large) > number:
-                groups = _groups(looks[i], found.masks[i], regions[i], large)
+                groups = _groups(looks[i], found.masks[i], found.fixed[i], regions[i], large)
                 if groups.max() + 1 > number:
                     best, number = (own, large, groups), int(groups.max()) + 1
         if best is None:
@@ -63,22 +65,33 @@ def _regions(mask: NDArray[np.bool_], table: NDArray[np.bool_]) -> NDArray[np.in
     return cv2.connectedComponents((mask & (gap == 0)).view(np.uint8), connectivity=4)[1]
 
 
-def _groups(look: Looked, mask: NDArray[np.bool_], regions: NDArray[np.int32], large: NDArray[np.int32]) -> NDArray[np.int64]:
+def _groups(
+    look: Looked, mask: NDArray[np.bool_], fixed: NDArray[np.bool_], regions: NDArray[np.int32], large: NDArray[np.int32]
+) -> NDArray[np.int64]:
     """For each region its group (from 0): regions of one colour, or with something else than the table between, are one group."""
     lab = cv2.cvtColor(look.frame.color, cv2.COLOR_RGB2LAB)
     colors = [np.median(lab[regions == number], axis=0).astype(float) for number in large]
     group = np.arange(len(large))
     for i in range(len(large)):
         for j in range(i + 1, len(large)):
-            light, *hue = np.abs(colors[i] - colors[j])
-            differ = np.hypot(*hue) > HUE or light > LIGHTNESS
-            if not (differ and _table_between(look, mask, regions, (int(large[i]), int(large[j])))):
+            differ = _differ(colors[i], colors[j])
+            if not (differ and _table_between(look, mask, fixed, regions, (int(large[i]), int(large[j])))):
                 group[group == group[j]] = group[i]
     return np.unique(group, return_inverse=True)[1]
 
 
-def _table_between(look: Looked, mask: NDArray[np.bool_], regions: NDArray[np.int32], pair: tuple[int, int]) -> bool:
-    """Whether the shortest ways between two regions of a picture cross what is no thing, not blind, and within the mask no mixture of their colours."""
+def _differ(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether two colours (3,), of Lab in 8 bits, are those of two things; in the shade a colour is as much paler as it is darker."""
+    middle = max((one[0] + other[0]) / 2, 1.0)
+    hue = (one[1:] - 128) * middle / max(one[0], DARK) - (other[1:] - 128) * middle / max(other[0], DARK)
+    return bool(np.hypot(*hue) > HUE or abs(one[0] - other[0]) > LIGHTNESS)
+
+
+def _table_between(
+    look: Looked, mask: NDArray[np.bool_], fixed: NDArray[np.bool_], regions: NDArray[np.int32], pair: tuple[int, int]
+) -> bool:
+    """Whether the shortest ways between two regions of a picture cross what is no thing, nothing known (``fixed``, behind which a thing may go on), not blind,
+    and within the mask no mixture of their colours."""
     one, other = (regions == number for number in pair)
     x, y, w, h = cv2.boundingRect((one | other).view(np.uint8))
     cut = (slice(y, y + h), slice(x, x + w))
@@ -98,7 +111,7 @@ def _table_between(look: Looked, mask: NDArray[np.bool_], regions: NDArray[np.in
     way = second - first
     share = np.clip((met - first) @ way / max(float(way @ way), 1.0), 0, 1)
     mixed = mask[cut][v, u] & (np.linalg.norm(met - first - share[..., None] * way, axis=-1) < MIXED)
-    free = inner & ~mixed & (regions[cut][v, u] == 0) & look.open[cut][v, u]
+    free = inner & ~mixed & (regions[cut][v, u] == 0) & (look.open & ~fixed)[cut][v, u]
     return bool(inner.any()) and float(free.sum()) >= CLEAR * float(inner.sum())
 
 
