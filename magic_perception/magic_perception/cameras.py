@@ -143,9 +143,9 @@ def _steady(
 
 
 def _contradictions(
-    one: _Witness, other: _Witness, moved: NDArray[np.float64], turned: NDArray[np.float64], gate: float
+    other: _Witness, moved: NDArray[np.float64], turned: NDArray[np.float64], gate: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """How points (N, 3) with normals (N, 3) of one camera contradict another: metres (N,) beside its masks (0 where nothing is told), and
+    """How points ``moved`` (N, 3) with normals ``turned`` (N, 3) that one camera saw contradict another camera: metres (N,) beside its masks (0 where nothing is told), and
     off its surface (NaN where the two do not see the same side within ``gate``), with the normals (N, 3) there."""
     k, pose = other.look.frame.intrinsics, other.camera_from_world
     local = moved @ pose[:3, :3].T + pose[:3, 3]
@@ -195,12 +195,12 @@ def _told(
     them, the normals (N, 3) along which they are off, and by how much the motion must still carry ``second`` (N,)."""
     back = transforms.inverse(motion)
     moved = transforms.apply(motion, second.points)
-    beside, gap, normal = _contradictions(second, first, moved, second.normals @ motion[:3, :3].T, gate)
+    beside, gap, normal = _contradictions(first, moved, second.normals @ motion[:3, :3].T, gate)
     cost = float(_cost(beside, gap))
     seen = np.isfinite(gap)
     places, normals, offsets = [moved[seen]], [normal[seen]], [gap[seen]]
     moved = transforms.apply(back, first.points)
-    beside, gap, normal = _contradictions(first, second, moved, first.normals @ back[:3, :3].T, gate)
+    beside, gap, normal = _contradictions(second, moved, first.normals @ back[:3, :3].T, gate)
     cost += float(_cost(beside, gap))
     seen = np.isfinite(gap)
     # A point of the first above the surface of the second: the second must move along its normal by as much.
@@ -225,7 +225,7 @@ def _solve(
     for one, other, sign in ((second, first, 1), (first, second, -1)):
         points, normals = one.points[::FEW], one.normals[::FEW]
         moved = (points[None] + sign * world[:, None]).reshape(-1, 3)
-        beside, gap, _ = _contradictions(one, other, moved, np.tile(normals, (len(world), 1)), 0.02)
+        beside, gap, _ = _contradictions(other, moved, np.tile(normals, (len(world), 1)), 0.02)
         total = total + _cost(beside.reshape(len(world), -1), gap.reshape(len(world), -1))
     starts = [np.zeros(3), np.append(shifts[int(np.argmin(total))], 0.0)]
     found = [solved for x in starts if (solved := _refined(first, second, world_from_table, x, centre)) is not None]

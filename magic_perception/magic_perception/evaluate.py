@@ -234,7 +234,7 @@ def shared_volume(a: Mesh, b: Mesh, count: int = 60000) -> float | None:
     return overlap(*inside)
 
 
-def open_holes(truth: Mesh, view: CanonicalView, found: Mesh, least: float = 6e-5) -> tuple[int, int]:
+def open_holes(view: CanonicalView, found: Mesh, least: float = 6e-5) -> tuple[int, int]:
     """Holes of at least ``least`` square metres in the true object's view, and how many of them are at least half open and enclosed in ``found``."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(holes_of(view.mask).astype(np.uint8), connectivity=4)
     shown = Raycaster([found]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0].ids >= 0
@@ -278,7 +278,7 @@ def meshes(
                 drawn += [picture] if picture is not None else []
             rows.append(row)
             if turn == 0:
-                pictures.append(strip(frames, masks, truth, drawn))
+                pictures.append(strip(frames, masks, drawn))
     return {"rows": rows, **summary(rows)}, pictures
 
 
@@ -304,7 +304,7 @@ def _reconstructed(
         cells["shape"] = report.shapes[item.id]
     found = item.mesh.transformed(item.world_from_object)
     volume = shared_volume(truth, found)
-    total, opened = open_holes(truth, view, found)
+    total, opened = open_holes(view, found)
     cells[method] = {
         "chamfer_mm": round(1000 * chamfer(truth, found), 2),
         "volume_iou": None if volume is None else round(volume, 3),
@@ -351,9 +351,7 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     return result
 
 
-def strip(
-    frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], truth: Mesh, views: list[NDArray[np.uint8]], size: int = 150
-) -> NDArray[np.uint8]:
+def strip(frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], views: list[NDArray[np.uint8]], size: int = 150) -> NDArray[np.uint8]:
     """One row of pictures: the left camera's cut-out, then the true view, this reconstruction and the paper's."""
     rows, columns = np.nonzero(masks[0])
     middle = (int(rows.mean()), int(columns.mean()))

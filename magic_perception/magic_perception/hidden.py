@@ -50,7 +50,7 @@ def veil(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray[n
     for look, image in zip(looks, labels, strict=True):
         if look.frame.blind is None:
             continue
-        ends = _ends(look, image, top)
+        ends = _ends(look, image)
         for a, b in ((a, b) for i, a in enumerate(ends) for b in ends[i + 1 :]):
             if a.label != b.label and a.place == b.place and joined[a.label] != joined[b.label] and _one_thing(a, b, looks, labels):
                 joined[joined == max(joined[a.label], joined[b.label])] = min(joined[a.label], joined[b.label])
@@ -137,7 +137,8 @@ class _End:
         self.color = cv2.cvtColor(np.ascontiguousarray(colors), cv2.COLOR_RGB2LAB)[0].astype(float).mean(axis=0)
 
 
-def _ends(look: Looked, labels: NDArray[np.int32], top: int) -> list[_End]:
+def _ends(look: Looked, labels: NDArray[np.int32]) -> list[_End]:
+    """Where things end at blind places."""
     blind = (labels == ROBOT).view(np.uint8)
     count, places = cv2.connectedComponents(blind, connectivity=8)
     beside = cv2.dilate(blind, np.ones((13, 13), np.uint8)).view(bool) & (labels > 0) & np.isfinite(look.heights)

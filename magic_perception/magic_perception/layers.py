@@ -11,7 +11,6 @@ from shapely.geometry import Polygon
 
 from magic_core.errors import Code, MagicError
 from magic_perception import polygons
-from magic_perception.parameters import Parameters
 from magic_perception.sight import Sight, silhouette, surface
 from magic_perception.solids import Reconstruction, loft_pieces, lofted
 
@@ -51,7 +50,7 @@ def upright_axis(sights: list[Sight], fronts: list[NDArray[np.float64]], start: 
     return middle
 
 
-def build_layers(sights: list[Sight], points: NDArray[np.float64], height: float, parameters: Parameters) -> Reconstruction:
+def build_layers(sights: list[Sight], points: NDArray[np.float64], height: float) -> Reconstruction:
     """A standing thing of any form: convex outlines of layers, joined.
 
     A layer holds what was seen of it, away from the mask's edge, where depth is not to be trusted, and the same turned by

@@ -488,7 +488,8 @@ class Perception(Node):
         return streams
 
     def place(self, stream: Stream, now: float) -> tuple[list[Placed], float, MagicError | None]:
-        """A camera's pairs with where it was at their stamps; the first stamp whose transform may still come (infinite: none); why it no longer may for a later pair than these."""
+        """A camera's pairs with where it was at their stamps; the first stamp, s, whose transform may still come (infinite: none); and why it no longer may for a later
+        pair than these."""
         found: list[Placed] = []
         pending = math.inf
         wrong: MagicError | None = None

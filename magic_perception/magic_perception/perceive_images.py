@@ -15,13 +15,14 @@ from magic_core import depth as depths
 from magic_core import devices, images, transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
+from magic_core.scene import Scene
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmenters import SEGMENTERS, make_segmenter
 from magic_perception.table import camera_over_table
 
 
-def write(scene_dir: Path, frame: RgbdFrame, scene, report: Report, seconds: float) -> None:
+def write(scene_dir: Path, frame: RgbdFrame, scene: Scene, report: Report, seconds: float) -> None:
     """labels.png, objects.json, and object_N.ply and object_N_view.png for each object."""
     scene_dir.mkdir(parents=True, exist_ok=True)
     labels = np.zeros(frame.depth.shape, np.uint16)
@@ -65,8 +66,8 @@ def write(scene_dir: Path, frame: RgbdFrame, scene, report: Report, seconds: flo
     (scene_dir / "objects.json").write_text(json.dumps(content, indent=1))
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point; exit status 1 with one line on stderr where the input cannot be used."""
+def options() -> argparse.ArgumentParser:
+    """The command line."""
     parser = argparse.ArgumentParser(description="Objects from one colour and one depth image that is registered to it.")
     parser.add_argument("--color", required=True, type=Path, help="colour image (PNG, JPEG)")
     parser.add_argument("--depth", required=True, type=Path, help="depth image of the same size (16-bit PNG, TIFF, EXR, npy)")
@@ -89,35 +90,43 @@ def main(args: list[str] | None = None) -> None:
     )
     parser.add_argument("--no-split", action="store_true", help="do not part touching objects at concave seams")
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
-    given = parser.parse_args(args)
+    return parser
+
+
+def perceived(given: argparse.Namespace, report: Report) -> Scene:
+    """Look at the two images, and write what is on the table into the folder.  Raises what the input is at fault for."""
+    start = time.perf_counter()
+    picture = images.read_rgbd(given.color, given.depth, given.intrinsics, given.depth_unit)
+    report.notes += picture.notes
+    if given.camera_pose:
+        try:
+            numbers = [float(x) for x in given.camera_pose.split(",")]
+            pose = transforms.from_numbers(numbers) @ picture.stored_from_shown
+        except ValueError as error:
+            raise MagicError(Code.NO_TRANSFORM, "--camera-pose", given.camera_pose, f"x,y,z,qx,qy,qz,qw; {error}") from None
+    else:
+        pose = camera_over_table(picture.intrinsics.unproject(picture.depth)[::3, ::3], notes=report.notes)
+    frame = RgbdFrame(picture.color, picture.depth, picture.intrinsics, pose, "camera")
+    depths.check_pose(frame, picture.unit, images.REMEDY)
+    # The world of a pose that is given need not begin below the camera.
+    reach = np.inf if given.camera_pose else given.max_distance
+    parameters = Parameters(
+        region_low=(-reach, -reach, -0.05), region_high=(reach, reach, 0.6), method=given.method, split=not given.no_split
+    )
+    segmenter = make_segmenter(given.segmenter, given.weights, given.device)
+    scene = perceive([frame], parameters=parameters, segmenter=segmenter, report=report)
+    sizes = [float(max(item.box_extents)) for item in scene.objects]
+    depths.check_sizes(float(np.nanmedian(frame.depth)), sizes, picture.unit, picture.told, images.REMEDY)
+    write(given.out, frame, scene, report, time.perf_counter() - start)
+    return scene
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point; exit status 1 with one line on stderr where the input cannot be used."""
+    given = options().parse_args(args)
     report = Report()
     try:
-        start = time.perf_counter()
-        picture = images.read_rgbd(given.color, given.depth, given.intrinsics, given.depth_unit)
-        report.notes += picture.notes
-        if given.camera_pose:
-            try:
-                numbers = [float(x) for x in given.camera_pose.split(",")]
-                pose = transforms.from_numbers(numbers) @ picture.stored_from_shown
-            except ValueError as error:
-                raise MagicError(Code.NO_TRANSFORM, "--camera-pose", given.camera_pose, f"x,y,z,qx,qy,qz,qw; {error}") from None
-        else:
-            pose = camera_over_table(picture.intrinsics.unproject(picture.depth)[::3, ::3], notes=report.notes)
-        frame = RgbdFrame(picture.color, picture.depth, picture.intrinsics, pose, "camera")
-        depths.check_pose(frame, picture.unit, images.REMEDY)
-        reach = given.max_distance
-        parameters = Parameters(
-            region_low=(-reach, -reach, -0.05) if not given.camera_pose else (-np.inf, -np.inf, -0.05),
-            region_high=(reach, reach, 0.6) if not given.camera_pose else (np.inf, np.inf, 0.6),
-            method=given.method,
-            split=not given.no_split,
-        )
-        scene = perceive(
-            [frame], parameters=parameters, segmenter=make_segmenter(given.segmenter, given.weights, given.device), report=report
-        )
-        sizes = [float(max(item.box_extents)) for item in scene.objects]
-        depths.check_sizes(float(np.nanmedian(frame.depth)), sizes, picture.unit, picture.told, images.REMEDY)
-        write(given.out, frame, scene, report, time.perf_counter() - start)
+        scene = perceived(given, report)
     except MagicError as error:
         print(f"perceive_images: {error}", file=sys.stderr)
         sys.exit(1)

@@ -49,8 +49,8 @@ TOUCHING, THERE, LEVEL, SHADE = 0.003, 0.02, 0.005, 0.02
 class Report:
     """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of all processors.
 
-    labels: of the frames; numbers: the label of each object, by its id in the scene.  cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer
-    ones contradict it.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
+    labels (H, W): of the frames; by id in the scene: numbers, the label of each object, shapes, pixels in the camera that saw most of it, evidence and departures.
+    cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer ones contradict it.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -294,8 +294,8 @@ def _about_glass(views: _Views) -> list[str]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What all frames saw of one thing: how each saw it that saw enough of it, in the table frame; points (N, 3) of the world, without strays, and their colors (N, 3); counts:
-    its pixels in each of the frames."""
+    """What all frames saw of one thing: the sights, in the table frame, of those that saw enough of it; its points (N, 3) of the world without strays, and their
+    colors (N, 3); counts: its pixels in each of the frames."""
 
     sights: list[Sight]
     points: NDArray[np.float64]
@@ -305,8 +305,8 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Built:
-    """The label of a thing, its solid in the table frame, the cleaned cloud (N, 3) of the world with its colours, the mask in the camera that saw most of it, its pixels there,
-    and the picture (h, w, 3) about it."""
+    """The label of a thing, its solid in the table frame, the points (N, 3) of the world that were seen of it with their colors (N, 3), the mask (H, W) in the camera that
+    saw most of it, its pixels there, and the picture (h, w, 3) about it; what speaks for the solid; whether nothing carries it."""
 
     label: int
     solid: Reconstruction

@@ -93,7 +93,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         # What stands and may have a handle gives way to another only where that is clearly better.
         return max(agreeing, key=lambda pair: pair[0] + (_CLEARLY if pair[1].mesh is standing else 0.0))[1]
     if stands and height > 0.65 * length:  # a ladle's stem rises, but it lies
-        return _freest([lambda: turned, lambda: build_layers(sights, points, height, parameters)], sights, noise)
+        return _freest([lambda: turned, lambda: build_layers(sights, points, height)], sights, noise)
     try:
         laid = lay(sights, noise, parameters)
     except MagicError:

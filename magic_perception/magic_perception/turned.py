@@ -298,29 +298,12 @@ def build_round(
     # Out of an open one something may stick.
     if lid and height > body.profile[-1, 1] + STICKS:
         return None
-    fitted = fit_to_silhouettes(body, sights)
-    if lid or not seen_into(sights, fitted, noise):
-        # A lid that depth shows is where it is: the masks' edges tell the sides alone.
-        level = fitted.profile[:, 1] * (body.profile[-1, 1] / fitted.profile[-1, 1])
-        fitted = replace(fitted, profile=np.column_stack([fitted.profile[:, 0], level]))
-    else:
-        fitted = replace(fitted, open=True)
-    body = fitted
-    # Of a band some part of the table inside shows to some camera, through its open top.
-    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    spots = np.array(
-        [[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)]
-    )
-    if body.open and max(float(np.mean((carve([sight], [spots]) < 0.3) & _through_the_top(body, sight, spots))) for sight in sights) > 0.12:
-        body = replace(body, through=True)
-    top = body.profile[-1, 1]
-    away = points[:, :2] - body.axis
-    rho = np.linalg.norm(away, axis=1)
-    beyond = rho - body.radius(points[:, 2])
-    out = points[beyond > max(0.005, 2.5 * noise)]
-    over = points[(points[:, 2] > top + STICKS) & (beyond < 0)]
+    body = _to_the_masks(body, lid, sights, noise)
+    beyond = np.linalg.norm(points[:, :2] - body.axis, axis=1) - body.radius(points[:, 2])
+    over = points[(points[:, 2] > body.profile[-1, 1] + STICKS) & (beyond < 0)]
     if len(over) > 0.08 * len(points):
         return None  # more than a body of revolution with a flat end, a bottle's neck say
+    out = points[beyond > max(0.005, 2.5 * noise)]
     handle = None
     if len(out) > 20:
         out = _standing_off(out, body)
@@ -331,23 +314,43 @@ def build_round(
                 return None
         elif len(out) > 0.2 * len(points):
             return None
-    wall = max(parameters.wall, 0.0035)
-    mesh, pieces = turned_body(body, wall)
-    alone = Reconstruction(mesh, tuple(pieces), "round")
-    if handle is None:
-        return alone
+    mesh, pieces = turned_body(body, max(parameters.wall, 0.0035))
     # A mouth tells of a cup, and a bar on it of a handle. Beside what is closed, or closed as far as is seen, it takes the hole between: what stands
     # close to a tin is no handle.
-    if not body.open and handle.hole < HOLE:
-        return alone
-    try:
-        import trimesh
+    if handle is None or (not body.open and handle.hole < HOLE):
+        return Reconstruction(mesh, tuple(pieces), "round")
+    return Reconstruction(_united(mesh, handle.bars), tuple(pieces + handle.pieces), "round with handle")
 
-        joined = trimesh.boolean.union([mesh.to_trimesh(), *[bar.to_trimesh() for bar in handle.bars]], engine="manifold")
-        mesh = Mesh(joined.vertices, joined.faces)
+
+def _to_the_masks(body: Body, lid: bool, sights: list[Sight], noise: float) -> Body:
+    """The body fitted to the masks' edges, open or closed as it was seen to be, or a band; lid: depth shows that it is closed."""
+    fitted = fit_to_silhouettes(body, sights)
+    if lid or not seen_into(sights, fitted, noise):
+        # A lid that depth shows is where it is: the masks' edges tell the sides alone.
+        level = fitted.profile[:, 1] * (body.profile[-1, 1] / fitted.profile[-1, 1])
+        return replace(fitted, profile=np.column_stack([fitted.profile[:, 0], level]))
+    fitted = replace(fitted, open=True)
+    return replace(fitted, through=True) if _seen_through(fitted, sights) else fitted
+
+
+def _seen_through(body: Body, sights: list[Sight]) -> bool:
+    """Whether some part of the table inside an open body shows to some camera through its top, as of a band."""
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    spots = np.array(
+        [[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)]
+    )
+    return max(float(np.mean((carve([sight], [spots]) < 0.3) & _through_the_top(body, sight, spots))) for sight in sights) > 0.12
+
+
+def _united(mesh: Mesh, bars: list[Mesh]) -> Mesh:
+    """One closed mesh of a body and its handle's bars."""
+    import trimesh
+
+    try:
+        joined = trimesh.boolean.union([mesh.to_trimesh(), *[bar.to_trimesh() for bar in bars]], engine="manifold")
+        return Mesh(joined.vertices, joined.faces)
     except Exception:  # the boolean library refuses a degenerate solid: overlapping closed parts still bound the same solid
-        mesh = concatenate([mesh, *handle.bars])
-    return Reconstruction(mesh, tuple(pieces + handle.pieces), "round with handle")
+        return concatenate([mesh, *bars])
 
 
 def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[Mesh]]:

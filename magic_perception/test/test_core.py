@@ -457,8 +457,8 @@ def test_measures_against_known_truths():
     from magic_core.views import find_view
 
     view = find_view(ring)
-    assert open_holes(ring, view, ring) == (1, 1)
-    assert open_holes(ring, view, ring.convex_hull()) == (1, 0)
+    assert open_holes(view, ring) == (1, 1)
+    assert open_holes(view, ring.convex_hull()) == (1, 0)
 
 
 # ---------------------------------------------------------------- parting

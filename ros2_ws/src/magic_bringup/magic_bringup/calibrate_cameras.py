@@ -176,7 +176,7 @@ def on_table(x: float, y: float, z: float, yaw: float) -> NDArray[np.float64]:
     return transforms.from_rpy(np.pi, 0.0, np.radians(yaw), (x, y, z))
 
 
-def robot_of(path: Path | None, package_root: str = "") -> Description:
+def robot_of(path: Path | None) -> Description:
     """The arm of a parameters file (its ``robot.*``), or the Panda."""
     values: dict[str, Any] = {}
     if path is not None:
