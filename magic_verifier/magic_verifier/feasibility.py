@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_core.scene import CanonicalView
+from magic_core.scene import CanonicalView, SceneObject
 from magic_core.strategy import Strategy
 from magic_verifier.subjects import Case, load_object, scene_for
 
@@ -238,18 +238,13 @@ def _impossible(strategy: Strategy, name: str, target_name: str) -> str:
 
 
 def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
+    """What by geometry keeps a tool from reaching the goal with a target; empty where nothing does, or nobody can tell."""
     mesh, pieces, shape, _ = load_object(name, strategy.view)
     target, _, meeting = scene_for(strategy, target_name)
     asked = list(strategy.goal.tree.nodes())
-    hangs_on = [node for node in asked if node.kind == "below_support"]
     if any(node.kind in ("touching_only", "held_by") and (node.args["what"], node.args["whom"]) == ("target", "tool") for node in asked):
-        radius = _round_radius(target.mesh)
-        if radius is None:
-            return ""
-        depth = basin(mesh, radius, SCOOP_RISE)
-        if depth >= SCOOP_RISE:
-            return ""
-        return f"a ball of {1000 * radius:.0f} mm lies {1000 * depth:.1f} mm deep in it (needed: {1000 * SCOOP_RISE:.1f} mm)"
+        return _why_not_scooped(mesh, target)
+    hangs_on = any(node.kind == "below_support" for node in asked)
     if not hangs_on and not any(node.kind == "encloses" for node in asked):
         return ""
     if strategy.target_outline != "outer":  # what is met in its hole encloses the tool, whatever its shape
@@ -263,20 +258,42 @@ def _looked_at(strategy: Strategy, name: str, target_name: str) -> str:
         first = find_view(mesh, pieces, strategy.view)
         views = [first, *own_views(mesh, pieces, strategy.view, first.direction)]
     if not hangs_on:
-        radius = _round_radius(target.mesh)
-        if radius is None:
-            return ""
-        areas = (area for view in views for area in outlines(mesh, view.direction, -view.object_from_view[:3, 1]))
-        turn = max((pocket(area, radius) for area in areas), default=0.0)
-        if turn >= HOOK_TURN:
-            return ""
-        return f"nothing in it turns around a disc of {1000 * radius:.0f} mm by more than {turn:.0f} degrees (needed: {HOOK_TURN:g})"
-    radius = strategy.target_contact.radius if meeting is None else meeting.radius
+        return _why_not_pulled(mesh, views, target)
     if meeting is None:
+        radius = strategy.target_contact.radius
         top = float(transforms.apply(target.world_from_object, target.mesh.vertices)[:, 2].max())
     else:
+        radius = meeting.radius
         top = float(transforms.apply(target.world_from_object, meeting.point[None])[0, 2])
     drop = top - max((node.args["height"] for node in asked if node.kind == "above" and node.args["what"] == "tool"), default=-np.inf)
+    return _why_not_hung(mesh, views, radius, drop)
+
+
+def _why_not_scooped(mesh: Mesh, target: SceneObject) -> str:
+    """Why a ball does not lie in a tool; empty where it does, or the target is no ball."""
+    radius = _round_radius(target.mesh)
+    if radius is None:
+        return ""
+    depth = basin(mesh, radius, SCOOP_RISE)
+    if depth >= SCOOP_RISE:
+        return ""
+    return f"a ball of {1000 * radius:.0f} mm lies {1000 * depth:.1f} mm deep in it (needed: {1000 * SCOOP_RISE:.1f} mm)"
+
+
+def _why_not_pulled(mesh: Mesh, views: list[CanonicalView], target: SceneObject) -> str:
+    """Why a tool that is seen in these views does not hold a round target; empty where it does, or the target is not round."""
+    radius = _round_radius(target.mesh)
+    if radius is None:
+        return ""
+    areas = (area for view in views for area in outlines(mesh, view.direction, -view.object_from_view[:3, 1]))
+    turn = max((pocket(area, radius) for area in areas), default=0.0)
+    if turn >= HOOK_TURN:
+        return ""
+    return f"nothing in it turns around a disc of {1000 * radius:.0f} mm by more than {turn:.0f} degrees (needed: {HOOK_TURN:g})"
+
+
+def _why_not_hung(mesh: Mesh, views: list[CanonicalView], radius: float, drop: float) -> str:
+    """Why a tool that is seen in these views does not hang on a rod of a radius, m, or not with its middle no more than ``drop`` m below the rod's top; empty where it does."""
     solid = mesh.to_trimesh()
     weight = np.stack([solid.center_mass if solid.is_volume else solid.centroid, mesh.bounds.mean(axis=0)])
     lower = False
