@@ -19,6 +19,9 @@ import yaml
 
 from magic_bringup import reference
 from magic_bringup.graph import NODES
+from magic_perception import parameters as perceived
+from magic_ros2cli.main import VERBS
+from magic_verifier import cases as evaluated
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [
@@ -294,3 +297,15 @@ def test_files_for_containers_name_what_is_there():
     wanted = set(re.findall(r":(lib[\w.+-]+)", (ROOT / "ros2_ws/setup.sh").read_text()))
     assert wanted <= packages, wanted - packages
     assert sys.version_info >= (3, 10)
+
+
+def test_every_verb_of_the_small_ros2_stands_in_the_readme():
+    told = (ROOT / "README.md").read_text()
+    for command, verbs in VERBS.items():
+        assert f"`{command} {'|'.join(sorted(verbs))}`".replace(" `", "`") in told
+
+
+def test_methods_that_the_documents_name_are_methods():
+    for path in [*DOCUMENTS, *sorted(ROOT.glob("magic_*/docs/*.md"))]:
+        named = set(re.findall(r"--method (\w+)", path.read_text()))
+        assert named <= {*evaluated.METHODS, *perceived.METHODS}, path

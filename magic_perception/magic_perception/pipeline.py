@@ -91,7 +91,7 @@ def perceive(
 
     What the robot holds (``RgbdFrame.held``) is an object of its own.
 
-    Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has depth in the region of interest, ``NO_TABLE``,
+    Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has :data:`LEAST` pixels with depth, ``NO_TABLE``,
     ``CAMERAS_DISAGREE`` where the cameras' poses contradict each other by more than may be corrected.
     An empty table is a scene without objects.
     """
