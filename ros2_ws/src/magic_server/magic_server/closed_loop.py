@@ -97,12 +97,36 @@ class Job:
     held: Held | None = None
 
 
+@dataclass(frozen=True)
+class Goal:
+    """What is carried out: by which strategy, as the pipeline was asked for it, what cancels it, and the run that it is."""
+
+    strategy: Strategy
+    request: pipeline.Request
+    token: Token
+    run: str
+
+
+@dataclass(frozen=True)
+class Calls:
+    """What the loop leaves to others.
+
+    plan(request, stages, reflections, spent): a run of the pipeline.  claim(outcome, stages): what the rule is to know of it.  allowed(ask): what ``ask`` returns, once
+    that is allowed.  begun(): the arm is about to move.  tell(job, text): how far a job has come.
+    """
+
+    plan: Callable[[pipeline.Request, Stages, Sequence[str], Callable[[Any], int]], pipeline.Outcome]
+    claim: Callable[[pipeline.Outcome, Stages], Claim]
+    allowed: Callable[[Callable[[], Any]], Any]
+    begun: Callable[[], None]
+    tell: Callable[[Job, str], None]
+
+
 class ClosedLoop:
     """Carries one goal out, looks, and goes on from what there is; :meth:`execute` raises what it ends with, unless that is success.
 
-    work(request, stages, reflections, spent): a run of the pipeline.  claim_of(outcome, stages): what the rule is to know of it.
-    allowed(ask): what ``ask`` returns, once that is allowed.  Afterwards ``jobs`` holds what was carried out, the last one last,
-    ``tried`` all outcomes of planning, ``executed`` whether the last was carried out to its end, and ``notes`` what is to be told.
+    first: what is carried out first.  Afterwards ``jobs`` holds what was carried out, the last one last, ``tried`` all outcomes of planning, ``executed`` whether
+    the last was carried out to its end, and ``notes`` what is to be told.
     """
 
     def __init__(
@@ -111,20 +135,12 @@ class ClosedLoop:
         arm: Arm,
         settings: LoopSettings,
         limits: Limits,
-        strategy: Strategy,
-        request: pipeline.Request,
-        token: Token,
+        goal: Goal,
         first: Job,
-        run: str,
-        work: Callable[[pipeline.Request, Stages, Sequence[str], Callable[[Any], int]], pipeline.Outcome],
-        claim_of: Callable[[pipeline.Outcome, Stages], Claim],
-        allowed: Callable[[Callable[[], Any]], Any],
-        begun: Callable[[], None],
-        tell: Callable[[Job, str], None],
+        calls: Calls,
     ) -> None:
         self._server, self._arm, self._settings, self._limits = server, arm, settings, limits
-        self._strategy, self._request, self._token, self._run = strategy, request, token, run
-        self._work, self._claim_of, self._allowed, self._begun, self._tell = work, claim_of, allowed, begun, tell
+        self._goal, self._calls = goal, calls
         self.jobs, self.tried = [first], [first.outcome]
         self.notes: list[str] = []
         self.executed = False
@@ -191,12 +207,12 @@ class ClosedLoop:
         self._held, self._touched, self._may_touch = job.held, False, False
         self._carried = None if job.held is None else Carried(job.held)
         self.executed = False
-        self._arm.execute(job.outcome.plan, self._token, self._say, self, job.held is not None, self._settings.look)
+        self._arm.execute(job.outcome.plan, self._goal.token, self._say, self, job.held is not None, self._settings.look)
         self.executed = True
         return self._judge(job) if self._settings.judge else ""
 
     def _say(self, text: str) -> None:
-        self._tell(self.jobs[-1], text)
+        self._calls.tell(self.jobs[-1], text)
 
     # ------------------------------------------------------------ what the arm asks (magic_server.arm.Guard)
 
@@ -218,8 +234,8 @@ class ClosedLoop:
             claim = asked if world.scene is None else replace(asked, carried=self._tool_at(world.scene.stamp))
             permit(claim, replace(world, servers={**world.servers, **self._arm.servers()}), self._limits, Purpose.MOVE)
 
-        self._allowed(allowed)
-        self._begun()
+        self._calls.allowed(allowed)
+        self._calls.begun()
 
     def _meant(self) -> set[str]:
         """The ids of what the motion has moved so far, or may have."""
@@ -351,7 +367,7 @@ class ClosedLoop:
         """Wait until ``done()``, at most so many seconds by the clock of the stamps, which in a simulation may be slow; returns it."""
         end, patience = self._now() + seconds, SLOWEST * seconds if self._simulated else seconds
         over = (lambda: self._now() >= end) if self._simulated else (lambda: False)
-        self._token.wait(lambda: done() or over(), time.monotonic() + patience, alive=lambda: None)
+        self._goal.token.wait(lambda: done() or over(), time.monotonic() + patience, alive=lambda: None)
         return done()
 
     def _fresh(self, since: float | None = None) -> SceneObjectArray | None:
@@ -400,16 +416,16 @@ class ClosedLoop:
 
     def _left(self) -> pipeline.Request:
         """The request with the time that is left of the whole."""
-        left = max(1.0, min(self._request.timeout, self._bounds.end - time.monotonic()))
-        return replace(self._request, timeout=left)
+        left = max(1.0, min(self._goal.request.timeout, self._bounds.end - time.monotonic()))
+        return replace(self._goal.request, timeout=left)
 
     def _corrected(self, job: Job, held: Held) -> Job:
         """The rest of the motion, planned anew from the tool's pose as it is: the same contact first."""
         trial = job.outcome.reports[-1].trial
         stages = self._stages_in_hand(held, job.stages)
-        others = [r for r in self._strategy.reflections if r != trial.reflection]
+        others = [r for r in self._goal.strategy.reflections if r != trial.reflection]
         worse = {id(c): index for index, c in enumerate(job.stages.matches.candidates)}
-        outcome = self._work(
+        outcome = self._calls.plan(
             replace(self._left(), tool_id=job.outcome.tool_id, target_id=job.outcome.target_id),
             stages,
             [trial.reflection, *others],
@@ -421,24 +437,31 @@ class ClosedLoop:
     def _anew(self) -> Job:
         """A motion from the state as it is: everything looked at and planned again."""
         held, request, last = self._held, self._left(), self.jobs[-1].outcome
-        needs = self._strategy.simulatable
+        needs = self._goal.strategy.simulatable
         since = self._now() + SETTLED
         if held is None:
-            stages = Stages(self._server, self._token, self._run, needs, heatmap=False, since=since)
+            stages = Stages(self._server, self._goal.token, self._goal.run, needs, heatmap=False, since=since)
         else:
             request = replace(request, tool_id=last.tool_id, target_id=last.target_id)
             known = self.jobs[-1].claim.scene.objects
-            stages = HeldStages(self._server, self._token, self._run, needs, held, known, since)
-        outcome = self._work(request, stages, self._strategy.reflections, self._made)
+            stages = HeldStages(self._server, self._goal.token, self._goal.run, needs, held, known, since)
+        outcome = self._calls.plan(request, stages, self._goal.strategy.reflections, self._made)
         return Job(outcome, stages, self._claim(outcome, stages), held)
 
     def _stages_in_hand(self, held: Held, before: Stages) -> HeldStages:
         return HeldStages(
-            self._server, self._token, self._run, self._strategy.simulatable, held, self.jobs[-1].claim.scene.objects, -math.inf, before
+            self._server,
+            self._goal.token,
+            self._goal.run,
+            self._goal.strategy.simulatable,
+            held,
+            self.jobs[-1].claim.scene.objects,
+            -math.inf,
+            before,
         )
 
     def _claim(self, outcome: pipeline.Outcome, stages: Stages) -> Claim:
-        return self._claim_of(outcome, stages) if outcome.code == Code.OK else self.jobs[-1].claim
+        return self._calls.claim(outcome, stages) if outcome.code == Code.OK else self.jobs[-1].claim
 
     def _spend(self, job: Job, code: Code) -> None:
         """Remember what has failed: a grasp, or where the task was not done a contact with all its grasps."""
@@ -463,7 +486,7 @@ class ClosedLoop:
     def _judge(self, job: Job) -> str:
         """Look whether the goal is met, twice, so that what moves is seen to move, and on while what may come to rest is all that speaks against it, the tool is
         not well enough seen, or one pair of looks alone says that it is missed; raises GOAL_MISSED, GOAL_UNSEEN."""
-        settle, apart = seen_goal.patience(self._strategy, self._settings.accuracy)
+        settle, apart = seen_goal.patience(self._goal.strategy, self._settings.accuracy)
         self._say("looking whether the goal is met")
         begin = self._now()
         look, missed = self._fresh(begin + max(settle, SETTLED)), False
@@ -501,7 +524,7 @@ class ClosedLoop:
         found = []
         for now in seconds:
             looks = before, min(firsts, key=lambda sight: sight.apart(now, outcome.tool_id)), now
-            found.append(seen_goal.judge(self._strategy, names, phases, looks, table, hand, accuracy))
+            found.append(seen_goal.judge(self._goal.strategy, names, phases, looks, table, hand, accuracy))
         return seen_goal.SeenGoal.of_all(found)
 
     def _arm_surface(self) -> NDArray[np.float64]:

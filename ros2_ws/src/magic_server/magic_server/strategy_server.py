@@ -41,7 +41,7 @@ from magic_server import interop, markers, pipeline
 from magic_server import settings as parameters
 from magic_server.ahead import Ahead
 from magic_server.arm import SLOW, Arm
-from magic_server.closed_loop import ClosedLoop, Job
+from magic_server.closed_loop import Calls, ClosedLoop, Goal, Job
 from magic_server.held import Held, HeldStages
 from magic_server.joints import JointStates
 from magic_server.outlet import Motion, Outlet
@@ -562,17 +562,16 @@ class StrategyServer(LifecycleNode):
             arm,
             self._loop,
             self._limits,
-            asked.strategy,
-            asked.request,
-            asked.token,
+            Goal(asked.strategy, asked.request, asked.token, self._run_id),
             first,
-            self._run_id,
-            partial(self._plan, asked),
-            claim_of=lambda outcome, stages: self._claim(outcome, stages, waived),
-            allowed=lambda ask: self._when_allowed(ask, asked.token),
-            # Nobody else is to begin what is being carried out.
-            begun=lambda: self.publication.take_back("the strategy server carries it out itself", first.claim.run),
-            tell=tell,
+            Calls(
+                plan=partial(self._plan, asked),
+                claim=lambda outcome, stages: self._claim(outcome, stages, waived),
+                allowed=lambda ask: self._when_allowed(ask, asked.token),
+                # Nobody else is to begin what is being carried out.
+                begun=lambda: self.publication.take_back("the strategy server carries it out itself", first.claim.run),
+                tell=tell,
+            ),
         )
 
     def _other_look(self, stages: Stages, token: Token) -> bool:

@@ -25,8 +25,7 @@ def loop_of(told):
         tell_held=told.append, hand=lambda: np.eye(4), get_parameter=lambda name: SimpleNamespace(value=False), get_clock=lambda: clock
     )
     job = Job(outcome, SimpleNamespace(scene=scene), SimpleNamespace())
-    rest = dict.fromkeys(("arm", "limits", "strategy", "request", "token", "work", "claim_of", "allowed", "begun", "tell"))
-    return ClosedLoop(server, settings=LoopSettings(), first=job, run="run", **rest), scene.objects[0]
+    return ClosedLoop(server, None, LoopSettings(), None, None, job, None), scene.objects[0]
 
 
 def test_the_tool_is_told_from_closing_to_opening():
