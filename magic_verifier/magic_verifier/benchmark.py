@@ -17,8 +17,14 @@ import numpy as np
 
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
-from magic_core.strategy import find
+from magic_core.strategy import Strategy, find
 from magic_core.threads import one_thread
+from magic_planner.arm import ArmPlanner
+from magic_planner.benchmark import TASKS, Case, make_case
+from magic_planner.budget import Budget
+from magic_planner.giving_way import GAP, GAP_IN_HAND
+from magic_planner.object_motion import plan_tool_motion
+from magic_planner.robot import Robot
 from magic_verifier import verification
 from magic_verifier.workers import Workers
 
@@ -37,6 +43,12 @@ class Timing:
     passed: int
     count: int
 
+    def __str__(self) -> str:
+        return (
+            f"{self.everything:.2f} s for {self.count} rollouts ({self.busy:.2f} s of this process), {self.first:.2f} s for the first alone; "
+            f"{self.passed} passed"
+        )
+
 
 def measured(task: verification.Task, name: str, count: int, pool: Workers) -> Timing | None:
     """The rollouts of one task, timed; ``None`` where the scene as given fails, after which there are none."""
@@ -51,12 +63,27 @@ def measured(task: verification.Task, name: str, count: int, pool: Workers) -> T
     return Timing(name, alone, time.perf_counter() - started, time.process_time() - busy, passed, count)
 
 
+def planned(strategy: Strategy, case: Case, variant: str, planner: ArmPlanner | None) -> MotionPlan:
+    """The motion of a case; planner: of the variant arm.  Raises what planning does."""
+    scene = (strategy, case.tool, case.target, case.candidate, "keep")
+    motion = plan_tool_motion(*scene, TABLE, case.obstacles, GAP if variant == "fg" else GAP_IN_HAND)
+    if planner is None or variant == "fg":
+        return MotionPlan("fg", motion)
+    return planner.plan(*scene, motion, TABLE, case.obstacles, budget=Budget(10.0))
+
+
+def summary(timings: list[Timing], rollouts: int) -> str:
+    """How long the cases of a task took."""
+    seconds = np.array([row.everything for row in timings])
+    return (
+        f"{len(timings)} cases: {rollouts} rollouts take {seconds.mean():.2f} s in the mean, "
+        f"median {np.median(seconds):.2f} s, longest {seconds.max():.2f} s; the first alone "
+        f"{np.mean([row.first for row in timings]):.2f} s; this process is busy for {np.mean([row.busy for row in timings]):.2f} s"
+    )
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of ``ros2 run magic_verifier benchmark``."""
-    from magic_planner.benchmark import TASKS, make_case
-    from magic_planner.giving_way import GAP, GAP_IN_HAND
-    from magic_planner.object_motion import plan_tool_motion
-
     parser = argparse.ArgumentParser(prog="benchmark", description="Measure the rollouts of a verdict on procedural objects.")
     parser.add_argument("--strategies", type=Path, default=None, help="folder of strategies; the installed ones by default")
     parser.add_argument("--task", nargs="*", default=list(TASKS), choices=list(TASKS))
@@ -67,13 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first object and of the draws")
     options = parser.parse_args(arguments)
     one_thread()
-    planner = None
-    if "arm" in options.variant:
-        from magic_planner.arm import ArmPlanner
-        from magic_planner.budget import Budget
-        from magic_planner.robot import Robot
-
-        planner = ArmPlanner(Robot())
+    planner = ArmPlanner(Robot()) if "arm" in options.variant else None
     pool = Workers(options.workers)
     try:
         print(f"load of the machine before: {os.getloadavg()[0]:.1f} of {os.cpu_count()} cores")
@@ -81,41 +102,21 @@ def main(arguments: list[str] | None = None) -> None:
             strategy, families = find(task, options.strategies), TASKS[task][0]
             rows: dict[str, list[Timing]] = {variant: [] for variant in options.variant}
             for number in range(options.count):
-                family, region = families[number % len(families)]
-                case = make_case(strategy, family, region, options.seed + number)
-                scene = (strategy, case.tool, case.target)
+                case = make_case(strategy, *families[number % len(families)], options.seed + number)
                 for variant in options.variant:
                     label = f"{task:9} {variant:3} {case.name:28}"
                     try:
-                        gap = GAP if variant == "fg" else GAP_IN_HAND
-                        motion = plan_tool_motion(*scene, case.candidate, "keep", TABLE, case.obstacles, gap)
-                        plan = MotionPlan("fg", motion)
-                        if variant == "arm":
-                            assert planner is not None
-                            plan = planner.plan(*scene, case.candidate, "keep", motion, TABLE, case.obstacles, budget=Budget(10.0))
-                        found = measured(
-                            verification.make_task(*scene, case.obstacles, TABLE, plan, options.seed), case.name, options.rollouts, pool
-                        )
+                        plan = planned(strategy, case, variant, planner)
+                        scene = (strategy, case.tool, case.target, case.obstacles, TABLE)
+                        found = measured(verification.make_task(*scene, plan, options.seed), case.name, options.rollouts, pool)
                     except MagicError as error:
                         print(f"{label} {error}")
                         continue
-                    if found is None:
-                        print(f"{label} fails in the scene as given")
-                        continue
-                    rows[variant].append(found)
-                    print(
-                        f"{label} {found.everything:.2f} s for {found.count} rollouts ({found.busy:.2f} s of this process), {found.first:.2f} s for the first alone; "
-                        f"{found.passed} passed",
-                        flush=True,
-                    )
+                    print(f"{label} {found if found is not None else 'fails in the scene as given'}", flush=True)
+                    rows[variant] += [found] if found is not None else []
             for variant, timings in rows.items():
                 if timings:
-                    seconds = np.array([row.everything for row in timings])
-                    print(
-                        f"{task:9} {variant:3} {len(timings)} cases: {options.rollouts} rollouts take {seconds.mean():.2f} s in the mean, "
-                        f"median {np.median(seconds):.2f} s, longest {seconds.max():.2f} s; the first alone "
-                        f"{np.mean([row.first for row in timings]):.2f} s; this process is busy for {np.mean([row.busy for row in timings]):.2f} s"
-                    )
+                    print(f"{task:9} {variant:3} {summary(timings, options.rollouts)}")
     finally:
         pool.close()
 
