@@ -8,6 +8,7 @@ controller makes of them between the points (:mod:`magic_core.interpolation`).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,7 @@ def _check_phases(phases: tuple[Phase, ...], end: float) -> None:
 
 
 def _check_poses(motion: ToolMotion) -> None:
+    """The tool's poses are rigid, and no farther from each other than they may be, in way, turn and speed."""
     poses, times = motion.world_from_tool, motion.times
     turns = poses[:, :3, :3]
     off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -165,94 +167,122 @@ def check_arm(motion: ArmMotion, robot: Description) -> None:
                 Code.BAD_MOTION, f"{what} of {names[j]} at waypoint {i} ({times[i]:.2f} s)", float(values[i, j]), "finite numbers"
             )
         columns[what] = values
-    _check_limits(times, columns, robot)
-    _check_rest(motion, times, columns["velocities"], columns["accelerations"], robot)
+    course = _Course(robot, times, *columns.values())
+    _check_range(course)
+    _check_samples(course)
+    _check_braking(course)
+    _check_course(course)
+    _check_between(course)
+    _check_rest(motion, course)
     _check_grasp(motion, robot)
 
 
-def _check_limits(times: Array, columns: dict[str, Array], robot: Description) -> None:
-    q, speed, pull = columns["positions"], columns["velocities"], columns["accelerations"]
-    lower, upper = (np.array([getattr(joint, side) for joint in robot.arm]) for side in ("lower", "upper"))
-    fastest, hardest, sharpest = robot.velocity, robot.acceleration, robot.jerk
+@dataclass(frozen=True)
+class _Course:
+    """The joints of an arm over T waypoints: times (T,), s; q, speed and pull (T, N): positions, velocities and accelerations, rad or m."""
+
+    robot: Description
+    times: Array
+    q: Array
+    speed: Array
+    pull: Array
+
+    def beyond(self, code: Code, what: str, i: int, j: int, value: float, allowed: str, per: str) -> MagicError:
+        """What is wrong with joint j at waypoint i; per: what the unit of ``value`` is beside rad or m."""
+        unit = ("m" if self.robot.arm[j].sliding else "rad") + per
+        where = f"{what} of {self.robot.names[j]} at waypoint {i} ({self.times[i]:.2f} s)"
+        return MagicError(code, where, f"{value:.4f} {unit}", f"{allowed} {unit}")
+
+
+def _check_range(course: _Course) -> None:
+    """Each joint stays in its range."""
+    q, arm = course.q, course.robot.arm
+    lower, upper = (np.array([getattr(joint, side) for joint in arm]) for side in ("lower", "upper"))
     over = np.argwhere((q < lower - SLACK) | (q > upper + SLACK))
     if len(over):
         i, j = over[0]
-        raise _beyond(Code.JOINT_LIMIT, "position", robot, times, i, j, q[i, j], f"{lower[j]:.4f} to {upper[j]:.4f}", "")
-    dt = np.diff(times)[:, None]
-    moved, gained = np.diff(q, axis=0), np.diff(speed, axis=0)
+        raise course.beyond(Code.JOINT_LIMIT, "position", i, j, q[i, j], f"{lower[j]:.4f} to {upper[j]:.4f}", "")
+
+
+def _check_samples(course: _Course) -> None:
+    """What is told of the waypoints, and the means from one to the next, are within the limits."""
+    fastest, hardest = course.robot.velocity, course.robot.acceleration
+    dt = np.diff(course.times)[:, None]
     for values, most, what, per in (
-        (speed, fastest, "velocity", "/s"),
-        (moved / dt, fastest, "velocity between waypoints", "/s"),
-        (pull, hardest, "acceleration", "/s^2"),
-        (gained / dt, hardest, "acceleration between waypoints", "/s^2"),
+        (course.speed, fastest, "velocity", "/s"),
+        (np.diff(course.q, axis=0) / dt, fastest, "velocity between waypoints", "/s"),
+        (course.pull, hardest, "acceleration", "/s^2"),
+        (np.diff(course.speed, axis=0) / dt, hardest, "acceleration between waypoints", "/s^2"),
     ):
         over = np.argwhere(np.abs(values) > most * (1 + SLACK) + SLACK)
         if len(over):
             i, j = over[0]
-            raise _beyond(
-                Code.DYNAMIC_LIMIT, what, robot, times, i + len(times) - len(values), j, values[i, j], f"up to {most[j]:g} either way", per
-            )
-    if robot.braking is not None:
-        slowest, quickest = robot.braking.velocities(q)
-        over = np.argwhere((speed < slowest - SLACK) | (speed > quickest + SLACK))
-        if len(over):
-            i, j = over[0]
-            allowed = f"{slowest[i, j]:.3f} to {quickest[i, j]:.3f} this near to the end of its range"
-            raise _beyond(Code.DYNAMIC_LIMIT, "velocity", robot, times, i, j, speed[i, j], allowed, "/s")
+            waypoint = i + len(course.times) - len(values)
+            raise course.beyond(Code.DYNAMIC_LIMIT, what, waypoint, j, values[i, j], f"up to {most[j]:g} either way", per)
+
+
+def _check_braking(course: _Course) -> None:
+    """Near the end of its range a joint is slow enough to stop before it, where the arm asks that."""
+    if course.robot.braking is None:
+        return
+    slowest, quickest = course.robot.braking.velocities(course.q)
+    over = np.argwhere((course.speed < slowest - SLACK) | (course.speed > quickest + SLACK))
+    if len(over):
+        i, j = over[0]
+        allowed = f"{slowest[i, j]:.3f} to {quickest[i, j]:.3f} this near to the end of its range"
+        raise course.beyond(Code.DYNAMIC_LIMIT, "velocity", i, j, course.speed[i, j], allowed, "/s")
+
+
+def _check_course(course: _Course) -> None:
+    """Velocities are those of the positions."""
+    dt, moved, speed = np.diff(course.times)[:, None], np.diff(course.q, axis=0), course.speed
     # Within its acceleration a joint can between two samples leave the straight course of its velocities by a quarter of a t^2.
     gap = np.abs(moved - dt * (speed[1:] + speed[:-1]) / 2)
-    allowed = hardest * dt**2 / 4 + 1e-4
+    allowed = course.robot.acceleration * dt**2 / 4 + 1e-4
     over = np.argwhere(gap > allowed)
     if len(over):
         i, j = over[0]
-        mean = (speed[i, j] + speed[i + 1, j]) / 2
-        raise _beyond(
-            Code.BAD_MOTION,
-            "velocities and positions contradict each other: mean velocity",
-            robot,
-            times,
-            i + 1,
-            j,
-            mean,
-            f"{moved[i, j] / dt[i, 0]:.4f} +- {allowed[i, j] / dt[i, 0]:.4f} by the positions",
-            "/s",
-        )
-    fast, strong, sharp = interpolation.extremes(times, q, speed, pull)
+        what = "velocities and positions contradict each other: mean velocity"
+        by_positions = f"{moved[i, j] / dt[i, 0]:.4f} +- {allowed[i, j] / dt[i, 0]:.4f} by the positions"
+        raise course.beyond(Code.BAD_MOTION, what, i + 1, j, (speed[i, j] + speed[i + 1, j]) / 2, by_positions, "/s")
+
+
+def _check_between(course: _Course) -> None:
+    """What a controller makes of the waypoints is within the limits between them as well."""
+    robot = course.robot
+    fast, strong, sharp = interpolation.extremes(course.times, course.q, course.speed, course.pull)
     for values, most, what, per in (
-        (fast, fastest, "velocity", "/s"),
-        (strong, hardest, "acceleration", "/s^2"),
-        (sharp, sharpest, "jerk", "/s^3"),
+        (fast, robot.velocity, "velocity", "/s"),
+        (strong, robot.acceleration, "acceleration", "/s^2"),
+        (sharp, robot.jerk, "jerk", "/s^3"),
     ):
         over = np.argwhere(values > most * (1 + SLACK) + SLACK)
         if len(over):
             i, j = over[0]
             what = f"{what} that a controller makes of it up to the next"
-            raise _beyond(Code.DYNAMIC_LIMIT, what, robot, times, i, j, values[i, j], f"up to {most[j]:g} either way", per)
+            raise course.beyond(Code.DYNAMIC_LIMIT, what, i, j, values[i, j], f"up to {most[j]:g} either way", per)
 
 
-def _beyond(code: Code, what: str, robot: Description, times: Array, i: int, j: int, value: float, allowed: str, per: str) -> MagicError:
-    unit = ("m" if robot.arm[j].sliding else "rad") + per
-    return MagicError(code, f"{what} of {robot.names[j]} at waypoint {i} ({times[i]:.2f} s)", f"{value:.4f} {unit}", f"{allowed} {unit}")
-
-
-def _check_rest(motion: ArmMotion, times: Array, speed: Array, pull: Array, robot: Description) -> None:
+def _check_rest(motion: ArmMotion, course: _Course) -> None:
+    """The arm rests at the start, the end, the grasp and the release."""
+    times, limit = course.times, course.robot.acceleration
     moments = {"start": 0.0, "end": float(times[-1]), "grasp": float(motion.grasp_time)}
     if motion.release_time is not None:
         moments["release"] = float(motion.release_time)
     for name, when in moments.items():
         if not (np.isfinite(when) and 0 <= when <= times[-1] + SLACK):
             raise MagicError(Code.BAD_MOTION, f"time of the {name}", f"{when:g} s", f"0 to {times[-1]:.6g} s")
-        fastest = np.array([np.interp(when, times, np.abs(speed[:, j])) for j in range(speed.shape[1])])
+        i = int(np.abs(times - when).argmin())
+        fastest, pulled = (
+            np.array([np.interp(when, times, np.abs(column)) for column in values.T]) for values in (course.speed, course.pull)
+        )
         j = int(fastest.argmax())
         if fastest[j] > REST:
-            i = int(np.abs(times - when).argmin())
-            raise _beyond(Code.BAD_MOTION, f"velocity at the {name}", robot, times, i, j, float(fastest[j]), f"rest, up to {REST:g}", "/s")
-        pulled = np.array([np.interp(when, times, np.abs(pull[:, j])) for j in range(pull.shape[1])])
-        j = int((pulled / robot.acceleration).argmax())
-        if pulled[j] > REST_PULL * robot.acceleration[j]:
-            i = int(np.abs(times - when).argmin())
-            most = f"rest, up to {REST_PULL * robot.acceleration[j]:g}"
-            raise _beyond(Code.BAD_MOTION, f"acceleration at the {name}", robot, times, i, j, float(pulled[j]), most, "/s^2")
+            raise course.beyond(Code.BAD_MOTION, f"velocity at the {name}", i, j, float(fastest[j]), f"rest, up to {REST:g}", "/s")
+        j = int((pulled / limit).argmax())
+        if pulled[j] > REST_PULL * limit[j]:
+            most = f"rest, up to {REST_PULL * limit[j]:g}"
+            raise course.beyond(Code.BAD_MOTION, f"acceleration at the {name}", i, j, float(pulled[j]), most, "/s^2")
     if motion.release_time is not None and not motion.grasp_time < motion.release_time:
         raise MagicError(
             Code.BAD_MOTION, "time of the release", f"{motion.release_time:g} s", f"after the grasp at {motion.grasp_time:g} s"
