@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,68 +71,104 @@ def joined(clouds: list[NDArray[np.float64]], tolerance: float = 0.001, most: in
     Two are joined where the volume that their common hull fills, over half of its surface, is at most ``tolerance``
     metres; with more than ``most`` left the tolerance grows up to ``limit``.
     """
-    import heapq
+    joining = _Joining(clouds, limit)
+    joining.join(tolerance, most)
+    return [mesh for part in joining.parts.values() if (mesh := hull_of(part.corners)) is not None]
 
-    from manifold3d import Manifold
-    from scipy.spatial import ConvexHull, QhullError
 
-    def solid(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
+@dataclass(frozen=True)
+class _Hull:
+    """A convex hull: its corners (N, 3), volume (m^3) and surface (m^2)."""
+
+    corners: NDArray[np.float64]
+    volume: float
+    area: float
+
+    @classmethod
+    def of(cls, points: NDArray[np.float64]) -> _Hull | None:
+        """Of points (N, 3); ``None`` where they are flat."""
+        from scipy.spatial import ConvexHull, QhullError
+
         try:
             hull = ConvexHull(points)
         except (QhullError, ValueError):
             return None
-        return points[hull.vertices], hull.volume, hull.area
+        return cls(points[hull.vertices], hull.volume, hull.area)
 
-    parts: dict[int, tuple[NDArray[np.float64], float, float]] = {}
-    filled: dict[int, float] = {}
-    boxes = np.empty((2 * len(clouds), 2, 3))
-    for cloud in clouds:
-        made = solid(cloud)
-        if made is not None:
-            i = len(parts)
-            parts[i], filled[i], boxes[i] = made, made[1], (made[0].min(axis=0), made[0].max(axis=0))
-    # What fills how much at least, its exact value not known before it is the least of all: most pairs never are.
-    queue: list[tuple[float, int, int]] = []
-    hulls: dict[tuple[int, int], tuple[NDArray[np.float64], float, float]] = {}
+    @property
+    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Its lowest and highest coordinates (3,)."""
+        return self.corners.min(axis=0), self.corners.max(axis=0)
 
-    def excess_of(i: int, j: int, volume: float, area: float) -> float:
-        return (volume - filled[i] - filled[j]) / (area / 2)
 
-    def offer(i: int, others: list[int]) -> None:
+class _Joining:
+    """Hulls that are being joined two by two, by number; a joined one gets the next number.
+
+    limit: pairs whose common hull fills more than this, m, are never joined.
+    """
+
+    def __init__(self, clouds: list[NDArray[np.float64]], limit: float) -> None:
+        self.parts: dict[int, _Hull] = {}
+        self._limit = limit
+        # The volume of the clouds' own hulls in each part, and its box.
+        self._own: dict[int, float] = {}
+        self._boxes = np.empty((2 * len(clouds), 2, 3))
+        # What fills how much at least, its exact value not known before it is the least of all: most pairs never are.
+        self._queue: list[tuple[float, int, int]] = []
+        self._common: dict[tuple[int, int], _Hull] = {}
+        for hull in (_Hull.of(cloud) for cloud in clouds):
+            if hull is not None:
+                self._add(len(self.parts), hull, hull.volume)
+        for i in list(self.parts):
+            self._offer(i, [j for j in self.parts if j > i])
+
+    def join(self, tolerance: float, most: int) -> None:
+        """Join while a pair fills at most ``tolerance`` m, or more than ``most`` are left."""
+        following = len(self.parts)
+        while self._queue:
+            excess, i, j = heapq.heappop(self._queue)
+            if i not in self.parts or j not in self.parts:
+                self._common.pop((i, j), None)
+                continue
+            if excess > tolerance and len(self.parts) <= most:
+                break
+            if (i, j) not in self._common:
+                self._measure(i, j)
+                continue
+            self._add(following, self._common.pop((i, j)), self._own[i] + self._own[j])
+            for gone in (i, j):
+                del self.parts[gone], self._own[gone]
+            self._offer(following, [other for other in self.parts if other != following])
+            following += 1
+
+    def _add(self, number: int, hull: _Hull, own: float) -> None:
+        self.parts[number], self._own[number], self._boxes[number] = hull, own, hull.box
+
+    def _excess(self, i: int, j: int, volume: float, area: float) -> float:
+        """How much a common hull of two parts fills over half of its surface, m."""
+        return (volume - self._own[i] - self._own[j]) / (area / 2)
+
+    def _offer(self, i: int, others: list[int]) -> None:
+        """Queue a part with each of the others that is near, by what their common hull fills at least."""
+        from manifold3d import Manifold
+
         if not others:
             return
-        box = boxes[others]
-        near = np.all((box[:, 0] < boxes[i][1] + 5e-4) & (box[:, 1] > boxes[i][0] - 5e-4), axis=1)
+        box = self._boxes[others]
+        near = np.all((box[:, 0] < self._boxes[i][1] + 5e-4) & (box[:, 1] > self._boxes[i][0] - 5e-4), axis=1)
         for j in np.array(others)[near].tolist():
-            both = Manifold.hull_points(np.concatenate([parts[i][0], parts[j][0]]))
+            both = Manifold.hull_points(np.concatenate([self.parts[i].corners, self.parts[j].corners]))
             area = both.surface_area()
-            least = excess_of(i, j, both.volume(), area) - _QUICK if area > 0 else -np.inf
-            if least < limit:
-                heapq.heappush(queue, (least, i, j))
+            least = self._excess(i, j, both.volume(), area) - _QUICK if area > 0 else -np.inf
+            if least < self._limit:
+                heapq.heappush(self._queue, (least, i, j))
 
-    for i in list(parts):
-        offer(i, [j for j in parts if j > i])
-    following = len(parts)
-    while queue:
-        excess, i, j = heapq.heappop(queue)
-        if i not in parts or j not in parts:
-            hulls.pop((i, j), None)
-            continue
-        if excess > tolerance and len(parts) <= most:
-            break
-        if (i, j) not in hulls:
-            found = solid(np.concatenate([parts[i][0], parts[j][0]]))
-            if found is not None and (excess := excess_of(i, j, found[1], found[2])) < limit:
-                hulls[i, j] = found
-                heapq.heappush(queue, (excess, i, j))
-            continue
-        made = hulls.pop((i, j))
-        k, following = following, following + 1
-        parts[k], filled[k], boxes[k] = made, filled[i] + filled[j], (made[0].min(axis=0), made[0].max(axis=0))
-        for gone in (i, j):
-            del parts[gone], filled[gone]
-        offer(k, [m for m in parts if m != k])
-    return [mesh for points, _, _ in parts.values() if (mesh := hull_of(points)) is not None]
+    def _measure(self, i: int, j: int) -> None:
+        """Queue a pair once more, by what its common hull truly fills."""
+        hull = _Hull.of(np.concatenate([self.parts[i].corners, self.parts[j].corners]))
+        if hull is not None and (excess := self._excess(i, j, hull.volume, hull.area)) < self._limit:
+            self._common[i, j] = hull
+            heapq.heappush(self._queue, (excess, i, j))
 
 
 def extruded(parts: list[Polygon], height: float, shape: str, tolerance: float = 0.0004) -> Reconstruction:
