@@ -92,6 +92,7 @@ class _Witness:
 
 
 def _witness(look: Looked, labels: NDArray[np.int32], count: int, rng: np.random.Generator) -> _Witness | None:
+    """What one camera tells by at most so many points, drawn at random, of the things that are labelled (H, W); ``None`` where it sees next to nothing of any."""
     mask = labels > 0
     x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
     if w == 0:

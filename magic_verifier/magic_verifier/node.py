@@ -107,6 +107,7 @@ class VerifierNode(Node):
         self.get_logger().info(f"arm {self._robot.urdf.stem} ready after {time.monotonic() - started:.2f} s")
 
     def _answer(self, handle: Any, result: VerifyMotion.Result) -> None:
+        """Write the verdict on a goal into its result."""
         verdict, film = self._verify(handle, time.monotonic())
         result.code, result.message = int(verdict.code), verdict.message
         result.success = verdict.success
@@ -120,6 +121,7 @@ class VerifierNode(Node):
         result.film = film
 
     def _verify(self, handle: Any, started: float) -> tuple[Verdict, Image]:
+        """The verdict on a goal that came at ``started`` (s, monotonic), and its film, empty where none was asked for."""
         goal, given = handle.request, self._given
         asked = self._read(goal)
         mark = asked.mark(goal)

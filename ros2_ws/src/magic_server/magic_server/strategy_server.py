@@ -415,6 +415,7 @@ class StrategyServer(LifecycleNode):
         return CancelResponse.ACCEPT
 
     def _execute(self, handle: Any) -> RunStrategy.Result:
+        """One goal from acceptance to its result, whatever comes between; no exception leaves."""
         result = RunStrategy.Result()
         key = bytes(handle.goal_id.uuid)
         token = Token()
