@@ -432,8 +432,8 @@ class Demo:
         self.record.scene = watcher.scene
 
 
-def parse(argv: list[str] | None = None) -> Options:
-    """The command line."""
+def _parser() -> argparse.ArgumentParser:
+    """The options of the command line."""
     parser = argparse.ArgumentParser(prog="demo.sh", description="From a recorded bag to a trajectory that physics has agreed to.")
     parser.add_argument("--strategy", default="hooking", help="hooking, hanging, scooping, or the folder of a strategy (default hooking)")
     parser.add_argument("--variant", default="arm", choices=VARIANTS, help="fg: a floating gripper; arm: the Panda (default arm)")
@@ -470,6 +470,12 @@ def parse(argv: list[str] | None = None) -> Options:
     )
     parser.add_argument("--version", action="version", version=f"magic_bringup {version('magic_bringup')}")
     parser.add_argument("--root", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
+    return parser
+
+
+def parse(argv: list[str] | None = None) -> Options:
+    """The command line, checked; ends the process where it makes no sense."""
+    parser = _parser()
     given = sys.argv[1:] if argv is None else argv
     a = parser.parse_args(given)
     if a.rerun:
@@ -480,28 +486,11 @@ def parse(argv: list[str] | None = None) -> Options:
         except MagicError as error:
             parser.error(error.message)
     if a.launch:
-        if not Path(a.launch[0]).is_file():
-            parser.error(f"--launch: {a.launch[0]}: no such file")
-        beside = [
-            o
-            for o in ("features", "weights", "cameras", *(f"{n}_params" for n in (*FILES, "robot")))
-            if getattr(a, o) != parser.get_default(o)
-        ]
-        if beside:
-            parser.error(f"--launch: not together with --{beside[0].replace('_', '-')}: give the launch file's own arguments (NAME:=VALUE)")
+        _check_launch(parser, a)
     topics = [tuple(rule.split(":=")) for rule in a.topics]
     for rule in topics:
         if len(rule) != 2 or not all(name.startswith("/") and len(name) > 1 for name in rule):
             parser.error(f"--topics: {':='.join(rule)!r} (allowed: /RECORDED:=/PLAYED)")
-    files: dict[str, list[Path]] = {}
-    for option, nodes in (*FILES.items(), ("robot", ROBOT_NODES)):
-        path = getattr(a, f"{option}_params")
-        if path is not None:
-            problem = _no_parameters(path)
-            if problem:
-                parser.error(f"--{option}-params: {path}: {problem}")
-            for node in nodes:
-                files.setdefault(node, []).append(path.resolve())
     name = Path(a.strategy).name
     return Options(
         strategy=str(Path(a.strategy).resolve()) if "/" in a.strategy else a.strategy,
@@ -518,9 +507,34 @@ def parse(argv: list[str] | None = None) -> Options:
         launch=(str(Path(a.launch[0]).resolve()), *a.launch[1:]) if a.launch else (),
         cameras=tuple(a.cameras),
         topics=tuple(topics),
-        files=files,
+        files=_parameter_files(parser, a),
         rerun=a.rerun,
     )
+
+
+def _check_launch(parser: argparse.ArgumentParser, a: argparse.Namespace) -> None:
+    """Refuse a launch file that is not there, and options that only nodes started by the demo would get."""
+    if not Path(a.launch[0]).is_file():
+        parser.error(f"--launch: {a.launch[0]}: no such file")
+    own = ("features", "weights", "cameras", *(f"{node}_params" for node in (*FILES, "robot")))
+    beside = [option for option in own if getattr(a, option) != parser.get_default(option)]
+    if beside:
+        parser.error(f"--launch: not together with --{beside[0].replace('_', '-')}: give the launch file's own arguments (NAME:=VALUE)")
+
+
+def _parameter_files(parser: argparse.ArgumentParser, a: argparse.Namespace) -> dict[str, list[Path]]:
+    """The parameters files of each node, the arm's after its own; refuses what is none."""
+    files: dict[str, list[Path]] = {}
+    for option, nodes in (*FILES.items(), ("robot", ROBOT_NODES)):
+        path = getattr(a, f"{option}_params")
+        if path is None:
+            continue
+        problem = _no_parameters(path)
+        if problem:
+            parser.error(f"--{option}-params: {path}: {problem}")
+        for node in nodes:
+            files.setdefault(node, []).append(path.resolve())
+    return files
 
 
 def _typed(arguments: Sequence[str]) -> list[str]:
