@@ -9,7 +9,8 @@ may touch all the same where not all of them is seen: a thing of which a part is
 short of a fixture, to which perception counts what is as near to it as it may be wrong.
 
 What only a simulation can try (pushes, pulls to the side), and masses and impulses, no look tells; they were asked when the motion was
-verified.  In a plain 'all' they are left out, and the answer says so; below an 'any' or a 'not' they cannot be told.
+verified.  In a plain 'all' they are left out, and the answer says so; below an 'any' or a 'not' they cannot be told.  That one body is in another, which a
+simulation may show, no true ones are.
 """
 
 from __future__ import annotations
@@ -363,6 +364,9 @@ class _Asked:
         parts = 0.0 if now.whole and first.whole else float(np.abs(now.extents - first.extents).max()) / 2
         exact = self.accuracy + float(max(parts, now.unseen.max(), first.unseen.max()))
         return self.at_least(-way, -below * seconds, exact, f"the {what} moved {1000 * way:.0f} mm in {seconds:.1f} s")
+
+    def _overlap(self, what: str, whom: str, below: float) -> _Told:
+        return _Told(True, "")  # bodies are in each other in a simulation alone
 
     def _released(self) -> _Told:
         return _Told(self.hand.released, "the tool was let go" if self.hand.released else "the tool is in the hand")

@@ -359,3 +359,9 @@ def test_what_is_measured_by_the_target_asks_that_it_was_seen():
     ):
         found = asked(tree(test), before, BESIDE)
         assert found.met is None and "object_2 is not seen" in found.message
+
+
+def test_bodies_are_in_each_other_in_simulations_alone():
+    """What a simulation asks lest a ball stick in a bowl's wall hinders no answer of what is seen."""
+    into = {"overlap": {"what": "target", "whom": "tool", "below": 0.001}}
+    assert asked(tree({"all": [FAR, into]}), BESIDE, {**BESIDE, "object_2": at(0.29)}).met is True
