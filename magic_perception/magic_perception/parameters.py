@@ -32,7 +32,8 @@ class Parameters:
     resolution: cell of the occupancy grids that outlines come from.
     wall: assumed wall thickness of things that are seen to be hollow from above.
     use_color: refine masks by the colour difference to the table.
-    split: part touching objects where what is measured at a concave seam says that they are two (:mod:`magic_perception.seams`).
+    split: part touching objects where what is measured at a concave seam, or at an upright plane between colours, says that they are two
+    (:mod:`magic_perception.seams`, :mod:`magic_perception.cuts`).
     max_objects: the largest ones are kept.  workers: threads for cameras and objects; most of the
     work holds Python's lock, so that one is the quickest and needs the least memory.
     method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.

@@ -20,7 +20,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_core.mesh import Mesh
-from magic_perception import attached, between, clusters, convexity, smear
+from magic_perception import attached, between, clusters, convexity, cuts, smear
 from magic_perception.parameters import Parameters
 from magic_perception.seams import Judge, learned
 from magic_perception.table import Plane, fit_plane, supports
@@ -561,21 +561,22 @@ def surfaces(looks: list[Looked], found: Clusters) -> Surfaces:
 
 
 class DepthSegmenter:
-    """Table plane, table colour, clusters: no weights but those of a few criteria of seams.
+    """Table plane, table colour, clusters: no weights but those of a few criteria of seams and of upright planes.
 
-    judge: what tells whether a seam parts two things, instead of the weights that ship with the package.
+    judge, cut: what tells whether a seam parts two things, and whether an upright plane does, instead of the weights that ship with the package.
     """
 
     name = "depth"
 
-    def __init__(self, judge: Judge | None = None) -> None:
+    def __init__(self, judge: Judge | None = None, cut: cuts.Judge | None = None) -> None:
         self._judge = judge or learned()
+        self._cut = cut or cuts.learned()
 
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`Segmenter`."""
         found = clustered(looks, known, parameters)
         instance = (
-            between.parted(looks, found, _parted(looks, found, self._judge), parameters.min_pixels) if parameters.split else found.instance
+            cuts.parted(looks, found, uncut(looks, found, self._judge, parameters), self._cut) if parameters.split else found.instance
         )
         labels = []
         start = 0
@@ -591,6 +592,11 @@ class DepthSegmenter:
             image[fixed | _beside(fixed, mask & (image == 0) & ~np.isfinite(looked.frame.depth))] = -1
         labels = _behind_one(_attached(labels, looks, parameters), looks, parameters)
         return [_on_surfaces(image, looked) for image, looked in zip(labels, looks, strict=True)]
+
+
+def uncut(looks: list[Looked], found: Clusters, judge: Judge, parameters: Parameters) -> NDArray[np.int64]:
+    """The instances (N,) parted at the seams between things and where the table shows between them, before :mod:`magic_perception.cuts`."""
+    return between.parted(looks, found, _parted(looks, found, judge), parameters.min_pixels)
 
 
 def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.int64]:

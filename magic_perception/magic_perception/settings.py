@@ -113,7 +113,11 @@ def _algorithm(node: Node) -> Parameters:
         region_high=tuple(high),
         method=p("method", "completed", "reconstruction", choices=METHODS),
         use_color=p("use_color", True, "refine masks by the colour difference to the table"),
-        split=p("split", True, "part touching objects at concave seams where their forms say that they are two"),
+        split=p(
+            "split",
+            True,
+            "part touching objects at concave seams, and at upright planes between colours, where their forms say that they are two",
+        ),
         known_margin=p("known_margin", 0.012, "points this near to a known object belong to it, m", low=0.0, high=0.1),
         min_height=p("min_height", 0.004, "least height above the table that depth alone may call an object, m", low=0.001, high=0.1),
         seed=p("seed", 0, "seed of the random choices", low=0, high=2**31 - 1),

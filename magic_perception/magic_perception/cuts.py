@@ -1,0 +1,269 @@
+"""Things of different colours that stand beside each other in one cluster, parted by the upright plane between them.
+
+Two convex things on a table are on the two sides of some upright plane.  Where stereo fills the gap between them, or they touch with faces that go on in one
+plane, no seam bends inward, and low things have none that tells; but colour changes all along that plane, and either side alone is nearer to a convex body
+than both are together.  The colour of one printed thing changes as well, and so do those of a head and its handle: the chance of two things is a logistic
+function of what is measured at the plane (:data:`CRITERIA`), and what is one convex body stays one thing, whatever its colours.  ``cuts.json`` holds the
+weights, made by ``python -m magic_perception.learn_cuts`` from procedural scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_perception import clusters, logistic
+
+if TYPE_CHECKING:
+    from magic_perception.segmentation import Clusters, Looked
+
+#: What is measured at an upright plane between two sides of a cluster, and what it means.
+CRITERIA = {
+    "contrast": "log of one and the change of colour across the plane, in squared standard deviations",
+    "own": "share of points that are nearer in colour to their own side's mean than to the other's, less a half",
+    "hull": "log of the share of the plan's convex hull that is in neither side's, over 0.03",
+    "block": "the same of the upright blocks on these hulls, each as high as what is in it",
+    "breadth": "log of the lesser breadth of the sides in plan, over 40 mm",
+    "slim": "lesser ratio of breadth and length of the sides in plan",
+    "share": "log of the smaller side's share of the points",
+    "filled": "share of their hull in plan that both sides fill",
+}
+
+#: Directions that are looked in, and the steps of the plane along them, m; what is compared across a plane lies so near to it, m.
+DIRECTIONS, STEP, BESIDE = 24, 0.004, 0.016
+#: Spread of colour (lightness, two colour axes; OpenCV's Lab of 8 bits), which light and noise make, and of height, m, that a surface has.
+SPREAD, ROUGH = np.array([12.0, 5.0, 5.0]), 0.004
+#: Least change of colour across a plane that is looked at, in squared standard deviations; least share of the points on a side, and number of those near the
+#: plane; what a change of height counts beside one of colour.
+LITTLE, SMALL, FEW, STEPPED = 0.3, 0.03, 20, 0.5
+#: So many planes of a cluster are judged, by so many of its points; two differ by so many degrees, or by so much beside each other, m.
+PLANES, POINTS, TURNED, MOVED = 4, 3000, 20.0, 0.010
+#: A side has at least so many points, and is so broad in plan, m.
+LEAST, NARROW = 120, 0.012
+#: Cells of the plan, and how near to the plane what is seen may be the other side's, m.
+CELL, UNSURE = 0.004, 0.004
+#: What lies so near to the plane, m, is the side's whose colour is nearer by this factor.
+NEAR, CLEAR = 0.008, 0.6
+
+#: Told the criteria (C,) of a plane: the logarithm of the odds that its sides are two things.
+Judge = Callable[[NDArray[np.float64]], float]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points: place (N, 2) in plan and height (N,) above the table, m; lab (N, 3): colour, OpenCV's Lab of 8 bits."""
+
+    place: NDArray[np.float64]
+    height: NDArray[np.float64]
+    lab: NDArray[np.float64]
+
+    def of(self, index: NDArray[np.int64]) -> Points:
+        """Some of them."""
+        return Points(self.place[index], self.height[index], self.lab[index])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A cluster: some :data:`POINTS` of its points, and the area in plan that all of them cover, m2."""
+
+    points: Points
+    covered: float
+
+    @classmethod
+    def of(cls, points: Points) -> Seen:
+        """By all points of the cluster."""
+        cells = np.floor(points.place / CELL).astype(np.int64)
+        cells -= cells.min(axis=0)
+        covered = len(np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1])) * CELL**2
+        return cls(points.of(np.arange(0, len(points.place), max(1, len(points.place) // POINTS))), covered)
+
+
+class Plane(NamedTuple):
+    """An upright plane: the angle of its normal in plan, its offset along that, m, and the change of colour across it, in squared standard deviations."""
+
+    angle: float
+    offset: float
+    change: float
+
+    def distance(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of places (N, 2) in plan, m, negative on the first side."""
+        return place @ [np.cos(self.angle), np.sin(self.angle)] - self.offset
+
+
+def planes(points: Points) -> list[Plane]:
+    """The planes across which colour changes most, and height, the best first."""
+    centre = points.place.mean(axis=0)
+    place, cell = clusters.thin(np.column_stack([points.place - centre, np.zeros(len(points.place))]), CELL)
+    values = np.column_stack([points.lab / SPREAD, points.height / ROUGH])
+    # Of each cell of the plan the number of its points, their sums and sums of squares; then of each step along each direction.
+    columns = np.vstack([np.bincount(cell), *(np.bincount(cell, column) for column in (*values.T, *(values**2).T))])
+    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    distance = np.column_stack([np.cos(angles), np.sin(angles)]) @ place[:, :2].T
+    low = float(distance.min())
+    index = ((distance - low) / STEP).astype(int)
+    steps = int(index.max()) + 1
+    index += np.arange(DIRECTIONS)[:, None] * steps
+    sums = np.stack([np.bincount(index.ravel(), np.tile(column, DIRECTIONS), DIRECTIONS * steps) for column in columns])
+    total = np.zeros((len(columns), DIRECTIONS, steps + 1))
+    np.cumsum(sums.reshape(len(columns), DIRECTIONS, steps), axis=2, out=total[:, :, 1:])
+    edges, width = np.arange(1, steps), round(BESIDE / STEP)
+    before = total[:, :, edges] - total[:, :, np.maximum(edges - width, 0)]
+    after = total[:, :, np.minimum(edges + width, steps)] - total[:, :, edges]
+    share = total[0, :, edges].T / len(points.place)
+    enough = (before[0] > FEW) & (after[0] > FEW) & (share > SMALL) & (share < 1 - SMALL)
+    one, two = (window[1:] / np.maximum(window[0], 1) for window in (before, after))
+    spread = np.maximum(one[4:] - one[:4] ** 2, 0) + np.maximum(two[4:] - two[:4] ** 2, 0)
+    change = np.where(enough, (one[:4] - two[:4]) ** 2 / (spread + 2), 0)
+    color = change[:3].sum(axis=0)
+    score = color + STEPPED * change[3]
+    wide = np.pad(score, ((0, 0), (1, 1)))
+    peaks = np.argwhere((color > LITTLE) & (score >= wide[:, :-2]) & (score >= wide[:, 2:]))
+    kept: list[tuple[NDArray[np.float64], float]] = []
+    result = []
+    for i, k in peaks[np.argsort(-score[tuple(peaks.T)], kind="stable")]:
+        way, offset = np.array([np.cos(angles[i]), np.sin(angles[i])]), low + float(edges[k]) * STEP
+        turns = [float(way @ other) for other, _ in kept]
+        if any(
+            abs(turn) > np.cos(np.radians(TURNED)) and abs(offset * np.sign(turn) - beside) < MOVED
+            for turn, (_, beside) in zip(turns, kept, strict=True)
+        ):
+            continue
+        kept.append((way, offset))
+        result.append(Plane(float(angles[i]), offset + float(centre @ way), float(color[i, k])))
+        if len(kept) == PLANES:
+            break
+    return result
+
+
+def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
+    """The :data:`CRITERIA` (C,) of a plane; ``None`` where a side is too small."""
+    points = seen.points
+    distance = plane.distance(points.place)
+    first = distance < 0
+    sides = (first, ~first)
+    counts = [np.count_nonzero(side) for side in sides]
+    # What lies nearer to the plane than it is known may be the other side's, and makes a narrow side as broad as that.
+    clear = [points.place[side & (np.abs(distance) > UNSURE)] for side in sides]
+    if min(counts) < LEAST // 3 or min(len(place) for place in clear) < 3:
+        return None
+    outlines = [_hull(place) for place in clear]
+    boxes = [_extents(place) for place in clear]
+    if min(box[0] for box in boxes) < NARROW:
+        return None
+    whole = _hull(np.concatenate(clear))
+    area = max(float(cv2.contourArea(whole)), 1e-6)
+    areas = [max(float(cv2.contourArea(outline)), 1e-6) for outline in outlines]
+    strip = 2 * UNSURE * _chord(whole, plane)
+    tops = [max(float(np.percentile(points.height[side], 95)), 1e-3) for side in sides]
+    scaled = points.lab / SPREAD
+    away = [np.linalg.norm(scaled - scaled[side].mean(axis=0), axis=1) for side in sides]
+    return np.array([
+        np.log1p(plane.change),
+        min(float(np.mean(away[i][side] < away[1 - i][side])) for i, side in enumerate(sides)) - 0.5,
+        np.log(max(1 - (sum(areas) + strip) / area, 0.004) / 0.03),
+        np.log(max(1 - (areas[0] * tops[0] + areas[1] * tops[1] + strip * np.mean(tops)) / (area * max(tops)), 0.004) / 0.03),
+        np.log(min(box[0] for box in boxes) / 0.040),
+        min(float(box[0] / max(box[1], box[0])) for box in boxes),
+        np.log(min(counts) / len(first)),
+        seen.covered / area,
+    ])  # fmt: skip
+
+
+def convex(row: NDArray[np.float64]) -> bool:
+    """Whether by the criteria (C,) of a plane both sides are as good as one convex body."""
+    names = list(CRITERIA)
+    return row[names.index("hull")] <= 0 and row[names.index("block")] <= 0
+
+
+def _extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Breadth and length (2,) of most of the places (N, 2), m: a handle stays slim with a bit of its head beside it."""
+    local = place - place.mean(axis=0)
+    axes = np.linalg.eigh(local.T @ local)[1]
+    return np.subtract(*np.percentile(local @ axes, [95, 5], axis=0)) / 0.9
+
+
+def _chord(outline: NDArray[np.float32], plane: Plane) -> float:
+    """How long a plane is within a convex outline (N, 1, 2) in plan, m."""
+    ring = outline[:, 0].astype(float)
+    distance, run = plane.distance(ring), ring @ [-np.sin(plane.angle), np.cos(plane.angle)]
+    after, beyond = np.roll(distance, -1), np.roll(run, -1)
+    cut = (distance < 0) != (after < 0)
+    at = run[cut] + distance[cut] / (distance[cut] - after[cut]) * (beyond[cut] - run[cut])
+    return float(np.ptp(at)) if len(at) else 0.0
+
+
+def _hull(place: NDArray[np.float64]) -> NDArray[np.float32]:
+    return cv2.convexHull(np.ascontiguousarray(place, np.float32)[:, None])
+
+
+def judge_by(model: logistic.Logistic) -> Judge:
+    """The judge by the weights of the :data:`CRITERIA`."""
+    return model.odds
+
+
+@cache
+def learned() -> Judge:
+    """The judge by the weights that ship with the package."""
+    return judge_by(logistic.load(Path(__file__).with_name("cuts.json"), CRITERIA))
+
+
+def best(seen: Seen, judge: Judge) -> Plane | None:
+    """The plane that is likeliest to part two things; ``None`` where none is likelier to than not."""
+    found, most = None, 0.0
+    for plane in planes(seen.points):
+        row = measured(seen, plane)
+        if row is not None and not convex(row) and (odds := judge(row)) > most:
+            found, most = plane, odds
+    return found
+
+
+def points_of(looks: list[Looked], found: Clusters) -> Points:
+    """All points of the clusters (N,)."""
+    height = np.concatenate([look.heights[where] for look, where in zip(looks, found.spots, strict=True)])
+    lab = np.concatenate([cv2.cvtColor(look.frame.color, cv2.COLOR_RGB2LAB)[where] for look, where in zip(looks, found.spots, strict=True)])
+    return Points(found.cloud[:, :2].astype(float), height.astype(float), lab.astype(float))
+
+
+def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
+    """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things."""
+    instance = instance.copy()
+    points = points_of(looks, found)
+    todo = list(range(int(instance.max(initial=-1)) + 1))
+    while todo:
+        label = todo.pop()
+        mine = np.nonzero(instance == label)[0]
+        if len(mine) < 2 * LEAST:
+            continue
+        own = points.of(mine)
+        plane = best(Seen.of(own), judge)
+        if plane is None:
+            continue
+        first = _first(own, plane)
+        if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST:
+            continue
+        new = int(instance.max()) + 1
+        instance[mine[first]] = new
+        todo += [label, new]
+    return instance
+
+
+def _first(points: Points, plane: Plane) -> NDArray[np.bool_]:
+    """Which points (N,) are on the first side of a plane; of those near it by the colour of what lies beside it, where that tells."""
+    distance = plane.distance(points.place)
+    first = distance < 0
+    beside = (np.abs(distance) > NEAR) & (np.abs(distance) < BESIDE)
+    if not (np.any(beside & first) and np.any(beside & ~first)):
+        return first
+    scaled = points.lab / SPREAD
+    one, two = (np.linalg.norm(scaled - np.median(scaled[beside & side], axis=0), axis=1) for side in (first, ~first))
+    near = np.abs(distance) <= NEAR
+    first[near & (one < CLEAR * two)] = True
+    first[near & (two < CLEAR * one)] = False
+    return first
