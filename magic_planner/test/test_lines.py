@@ -5,6 +5,7 @@ import planner_scenes as scenes
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from magic_core import transforms
 from magic_planner.collision import solid
 from magic_planner.lines import crossings, through
