@@ -10,34 +10,29 @@ is kept with its stage, and the failure that came furthest is the one reported.
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
-from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
-from magic_core.motion import TOOL_SPEED, TOOL_TURN, Margin, MotionPlan, ToolMotion
-from magic_core.scene import SceneObject
-from magic_core.strategy import Strategy
+from magic_core.motion import MotionPlan, ToolMotion
 from magic_planner import timing
 from magic_planner.budget import Budget
 from magic_planner.choice import GraspChoice
 from magic_planner.cloud import CloudSettings, unexplained
 from magic_planner.collision import shell, solid_pieces
 from magic_planner.free_motion import FreeMotion
-from magic_planner.grasps import GraspSettings
+from magic_planner.grasps import Grasp, GraspSettings
 from magic_planner.hand_moves import HandMoves
 from magic_planner.held import grasp_in_hand
-from magic_planner.margins import margins
-from magic_planner.object_motion import placed_contact_frame, table_plane, turning, waypoint_times
-from magic_planner.request import ArmSettings, Branch, Failures, Request, StageError
+from magic_planner.object_motion import placed_contact_frame, table_plane, waypoint_times
+from magic_planner.pace import Pace
+from magic_planner.request import ArmSettings, Branch, Failures, Problem, Request, StageError
 from magic_planner.robot import Robot
-from magic_planner.schedule import Schedule, slowed
+from magic_planner.schedule import Schedule
 from magic_planner.task_path import TaskPath, key_poses
 from magic_planner.workspace import Workspace
 
@@ -46,9 +41,6 @@ Array = NDArray[np.float64]
 WAYS = 3
 #: A tool that is tipped by more (rad) from how it lies to how it is used asks for a grasp that serves both attitudes.
 TIPPED = np.deg2rad(20.0)
-#: A tool that the arm can carry too fast for grip, joints or the tool's own speed is carried so many times as slowly at most; and so many
-#: times as slowly nothing is left of its inertia.
-GENTLEST, AT_REST = 3.0, 100.0
 #: What becomes of a request for which there is no such grasp.
 _REACHES = (Code.NO_GRASP, Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION)
 
@@ -80,24 +72,13 @@ class ArmPlanner:
 
     def plan(
         self,
-        strategy: Strategy,
-        tool: SceneObject,
-        target: SceneObject,
-        candidate: ContactCandidate,
-        reflection: str,
-        motion: ToolMotion,
-        table: Array | Sequence[float] = (0.0, 0.0, 1.0, 0.0),
-        obstacles: Sequence[SceneObject] = (),
-        start: Array | None = None,
-        attempt: int = 0,
-        seed: int = 0,
+        problem: Problem,
         budget: Budget | None = None,
         feedback: Callable[[str, str], None] = lambda stage, message: None,
     ) -> MotionPlan:
-        """The arm's motion that takes the tool from where it lies along ``motion``.
+        """The arm's motion that solves a problem; ``feedback`` hears each stage and what is done in it.
 
-        start (J,): where the arm is (default: home).  attempt: 0 for the best grasp, n for the n-th next that differs from
-        those before.  A tool's retreat that the arm cannot follow is left out.
+        A tool's retreat that the arm cannot follow is left out.
 
         A tool that hangs (``tool.hanging``) is in the hand, where its pose and ``start`` put it: it is not grasped anew but raised
         where something is beneath it, and carried on; the gripper of such a plan closes at 0 s.
@@ -106,15 +87,13 @@ class ArmPlanner:
         TIME_PARAMETERISATION, PLANNING_TIMEOUT, CANCELED, each naming the stage and the waypoint, pair or limit, and by how much a tool
         has to be tipped that lies otherwise than it is used.
         """
-        budget = budget or Budget()
-        if tool.hanging and start is None:
+        tool = problem.tool
+        if tool.hanging and problem.start is None:
             raise MagicError(Code.BAD_REQUEST, f"start, with {tool.id} in the hand", "none", "where the arm is")
-        given = (strategy, tool, target, candidate, reflection)
-        rest = (table, obstacles, start, attempt, seed, budget, feedback)
         try:
-            return self._with_ending(strategy, given, motion, rest, feedback)
+            return self._with_ending(problem, budget or Budget(), feedback)
         except MagicError as error:
-            angle = tipping(tool.world_from_object, motion.world_from_tool[0])
+            angle = tipping(tool.world_from_object, problem.motion.world_from_tool[0])
             if error.code not in _REACHES or angle < TIPPED:
                 raise
             raise MagicError(
@@ -123,20 +102,14 @@ class ArmPlanner:
                 "and is not set down on the way to be grasped anew: one grasp has to serve both",
             ) from error
 
-    def _with_ending(
-        self,
-        strategy: Strategy,
-        given: tuple[Any, ...],
-        motion: ToolMotion,
-        rest: tuple[Any, ...],
-        feedback: Callable[[str, str], None],
-    ) -> MotionPlan:
+    def _with_ending(self, problem: Problem, budget: Budget, feedback: Callable[[str, str], None]) -> MotionPlan:
         """The plan of the whole motion, or without the tool's retreat where that is what fails."""
         try:
-            return self._plan(*given, motion, *rest)
+            return self._solved(problem, budget, feedback)
         except MagicError as error:
+            motion = problem.motion
             ending = next((p for p in motion.phases if p.name == "retreat"), None)
-            if ending is None or strategy.releases or error.code not in (Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION):
+            if ending is None or problem.strategy.releases or error.code not in (Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION):
                 raise
             # What the tool is for is done by then: better to stop there than not to act.
             feedback("task", f"without the tool's retreat, as {error.message}")
@@ -147,50 +120,44 @@ class ArmPlanner:
                 tuple(p for p in motion.phases if p.end <= ending.start + 1e-9),
                 tuple(m for m in motion.marks if m[1] <= ending.start + 1e-9),
             )
-            return self._plan(*given, shorter, *rest)
+            return self._solved(replace(problem, motion=shorter), budget, feedback)
 
-    def _plan(
-        self,
-        strategy: Strategy,
-        tool: SceneObject,
-        target: SceneObject,
-        candidate: ContactCandidate,
-        reflection: str,
-        motion: ToolMotion,
-        table: Array | Sequence[float],
-        obstacles: Sequence[SceneObject],
-        start: Array | None,
-        attempt: int,
-        seed: int,
-        budget: Budget,
-        feedback: Callable[[str, str], None],
-    ) -> MotionPlan:
+    def _solved(self, problem: Problem, budget: Budget, feedback: Callable[[str, str], None]) -> MotionPlan:
         robot = self.robot
-        start = robot.home.copy() if start is None else np.asarray(start, dtype=float)
-        if start.shape != (robot.count,) or not np.all(np.isfinite(start)):
-            raise MagicError(Code.BAD_REQUEST, "start configuration", start.tolist(), f"{robot.count} finite joint positions")
-        over = np.flatnonzero((start < robot.chain.lower - 1e-3) | (start > robot.chain.upper + 1e-3))
-        if len(over):
-            j = int(over[0])
-            raise MagicError(
-                Code.JOINT_LIMIT,
-                f"start, {robot.chain.names[j]}",
-                round(float(start[j]), 4),
-                f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad",
-            )
+        request = self._request(problem, budget, feedback)
+        self.space.build(request)
+        held = grasp_in_hand(robot, request.tool, request.start) if request.tool.hanging else None
+        if held is None:
+            robot.open_to(robot.config.opening)
+        else:
+            self.space.carry_off(request, held)
+        pair = robot.collision(request.start)
+        if pair is not None:
+            raise MagicError(Code.START_IN_COLLISION, "stage approach: the arm at its start", str(pair), "a start clear of everything")
+        feedback("grasp", "looking for grasps that serve the whole motion" if held is None else "the tool is in the hand")
+        tool_from_contact = placed_contact_frame(problem.strategy, problem.candidate, problem.reflection)
+        choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact)
+        pace = Pace(robot, choice.grasping, request.tool, tool_from_contact)
+        return _Search(self, request, held, pace, problem.attempt).plan(choice.lots() if held is None else iter([[held]]))
+
+    def _request(self, problem: Problem, budget: Budget, feedback: Callable[[str, str], None]) -> Request:
+        """What all parts of the planner work on.  Raises BAD_REQUEST and JOINT_LIMIT for a start at which the arm cannot be."""
+        start = self._start(problem.start)
+        strategy, tool, target, motion = problem.strategy, problem.tool, problem.target, problem.motion
+        obstacles = tuple(problem.obstacles)
         release = next((p.start for p in motion.phases if p.name == "release"), None) if strategy.releases else None
         count = len(motion.times) if release is None else int(np.searchsorted(motion.times, release + 1e-9))
         times, poses = motion.times[:count], motion.world_from_tool[:count]
-        plane = table_plane(table)
-        request = Request(
+        plane = table_plane(problem.table)
+        return Request(
             strategy=strategy,
             tool=tool,
             target=target,
-            obstacles=tuple(obstacles),
+            obstacles=obstacles,
             motion=motion,
             plane=plane,
             start=start,
-            seed=seed,
+            seed=problem.seed,
             budget=budget,
             feedback=feedback,
             times=times,
@@ -203,136 +170,123 @@ class ArmPlanner:
             searches=self.settings.searches,
             roomy_searches=self.settings.searches,
         )
-        self.space.build(request)
-        held = grasp_in_hand(robot, tool, start) if tool.hanging else None
-        if held is None:
-            robot.open_to(robot.config.opening)
-        else:
-            self.space.carry_off(request, held)
-        pair = robot.collision(start)
-        if pair is not None:
-            raise MagicError(Code.START_IN_COLLISION, "stage approach: the arm at its start", str(pair), "a start clear of everything")
 
-        feedback("grasp", "looking for grasps that serve the whole motion" if held is None else "the tool is in the hand")
-        failures = Failures()
-        tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
-        choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact)
-        lots = choice.lots() if held is None else iter([[held]])
-        chosen: list[Array] = []  # grasps of the attempts before, in order
-        spare: list[Branch] = []  # those that close where one of these does, only from another side
-        tried = 0
-        for number, lot in enumerate(itertools.chain(lots, [None])):
-            quick = 0
-            if lot is None:
-                branches = spare
-            else:
-                budget.check("task")
-                if number:  # what cannot be picked up is not followed; the best few are left to be looked at when their turn comes
-                    lot = self.hand.reached(request, lot, failures)
-                feedback("task", f"following the task with {len(lot)} grasps")
-                branches = self.task.branches(request, lot, failures) if lot else []
-            for grasp, ways in self.task.clear(request, branches, failures):
-                if quick >= self.settings.quick_tries:
-                    break
-                frame = grasp.tool_from_tcp
-                if lot is not None and any(_same_place(frame, other, robot.closing) for other in chosen):
-                    spare += [branch for branch in branches if branch.grasp is grasp]
-                    continue
-                if any(_alike(frame, other) for other in chosen):
-                    continue
-                for branch in itertools.islice(ways, WAYS):
-                    if tried >= self.settings.tries:
-                        raise failures.error()
-                    tried += 1
-                    try:
-                        plan = self._complete(request, branch, len(chosen) < attempt, held is not None)
-                        if plan is not None:
-                            plan = self._bearable(request.tool, choice.grasping, tool_from_contact, plan)
-                    except StageError as failure:
-                        failures.add(failure.stage, failure.error)
-                        if failure.stage in ("task", "approach"):
-                            tried, quick = tried - 1, quick + 1
-                        if failure.stage == "approach":
-                            break  # the same hand comes to the same grasp in its other ways
-                        continue
-                    chosen.append(frame)
-                    if plan is not None:
-                        return plan
-                    tried -= 1
-                    break
-        if chosen:
-            raise MagicError(
-                Code.NO_GRASP, "stage grasp: attempt", attempt, f"0 to {len(chosen) - 1}: there are {len(chosen)} different grasps"
-            )
-        raise failures.error()
+    def _start(self, given: Array | None) -> Array:
+        """Where the arm is (J,): at home where nothing else is ``given``."""
+        chain = self.robot.chain
+        start = self.robot.home.copy() if given is None else np.asarray(given, dtype=float)
+        if start.shape != (self.robot.count,) or not np.all(np.isfinite(start)):
+            raise MagicError(Code.BAD_REQUEST, "start configuration", start.tolist(), f"{self.robot.count} finite joint positions")
+        over = np.flatnonzero((start < chain.lower - 1e-3) | (start > chain.upper + 1e-3))
+        if len(over):
+            j = int(over[0])
+            allowed = f"{chain.lower[j]} to {chain.upper[j]} rad"
+            raise MagicError(Code.JOINT_LIMIT, f"start, {chain.names[j]}", round(float(start[j]), 4), allowed)
+        return start
 
-    def _bearable(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
-        """The plan with its margins, the tool carried no faster than it may go and than grip and joints bear; raises StageError where that
-        is more than :data:`GENTLEST` times as slowly as the joints could."""
-        plan = slowed(plan, max(1.0, *haste(plan.tool_motion)))
-        try:
-            return self._with_margins(tool, grasping, tool_from_contact, plan)
-        except StageError:
-            quick, still = (self._margins(tool, grasping, tool_from_contact, p) for p in (plan, slowed(plan, AT_REST)))
-            # Each share grows at most by its inertial part, which falls with the square of the factor: the shares are sums of norms.
-            left = {margin.name: margin.left for margin in still}
-            needed = [(margin.left, left[margin.name]) for margin in quick if margin.left < 0]
-            if min(rest for _, rest in needed) <= 0:
-                raise
-            factor = max(math.sqrt((rest - moving) / rest) for moving, rest in needed) + 0.01
-            if factor > GENTLEST:
-                raise
-        return self._with_margins(tool, grasping, tool_from_contact, slowed(plan, factor))
 
-    def _margins(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> tuple[Margin, ...]:
-        arm = plan.arm_motion
-        assert arm is not None
-        held = (arm.grasp_time, np.inf if arm.release_time is None else arm.release_time)
-        return margins(
-            self.robot, grasping, tool, arm.tool_from_tcp, tool_from_contact, arm.times, arm.positions, held, plan.tool_motion.phases
-        )
+class _Search:
+    """The search for the plan of one request among grasps and the ways of the arm to follow the task with each.
 
-    def _with_margins(self, tool: SceneObject, grasping: GraspSettings, tool_from_contact: Array, plan: MotionPlan) -> MotionPlan:
-        """The plan with its margins; raises StageError where one is negative."""
-        found = self._margins(tool, grasping, tool_from_contact, plan)
-        least = min(found, key=lambda margin: margin.left)
-        if least.left < 0:
-            code = Code.NO_GRASP if least.name == "grip" else Code.DYNAMIC_LIMIT
-            raise StageError("timing", MagicError(code, f"margin of {least}", f"{100 * least.left:.0f} % left", "0 % or more"))
-        return replace(plan, margins=found)
+    held: the grasp of a tool that is in the hand already, the arm at the request's start.  attempt: how many grasps that serve are left
+    to the attempts before.
+    """
 
-    def _complete(self, request: Request, branch: Branch, only_check: bool, in_hand: bool) -> MotionPlan | None:
-        """The whole plan for one branch, or (``only_check``) None once pick-up and task are known to be possible; raises StageError.
+    def __init__(self, planner: ArmPlanner, request: Request, held: Grasp | None, pace: Pace, attempt: int) -> None:
+        self.planner, self.request, self.pace, self.attempt = planner, request, pace, attempt
+        self.in_hand = held is not None
+        self.failures = Failures()
+        self.chosen: list[Array] = []  # grasps of the attempts before, in order
+        self.spare: list[Branch] = []  # those that close where one of these does, only from another side
+        self.tried = 0  # plans that failed after the hand had come to its grasp
+        self.quick = 0  # of the lot in hand: those that failed before
 
-        in_hand: the tool is there already, and the arm at the request's start.
-        """
-        self.task.check(request, branch)
-        if in_hand:
+    def plan(self, lots: Iterator[list[Grasp]]) -> MotionPlan:
+        """The plan with the first grasp that serves, after those of the attempts before; raises what came furthest where there is none."""
+        for number, lot in enumerate(lots):
+            plan = self._among(self._branches(lot, number == 0), elsewhere=True)
+            if plan is not None:
+                return plan
+        plan = self._among(self.spare, elsewhere=False)
+        if plan is not None:
+            return plan
+        if self.chosen:
+            count = len(self.chosen)
+            allowed = f"0 to {count - 1}: there are {count} different grasps"
+            raise MagicError(Code.NO_GRASP, "stage grasp: attempt", self.attempt, allowed)
+        raise self.failures.error()
+
+    def _branches(self, lot: list[Grasp], best: bool) -> list[Branch]:
+        """The ways to follow the task with the grasps of a lot; ``best``: these are the first ones."""
+        planner, request = self.planner, self.request
+        request.budget.check("task")
+        if not best:  # what cannot be picked up is not followed; the best few are left to be looked at when their turn comes
+            lot = planner.hand.reached(request, lot, self.failures)
+        request.feedback("task", f"following the task with {len(lot)} grasps")
+        return planner.task.branches(request, lot, self.failures) if lot else []
+
+    def _among(self, branches: list[Branch], elsewhere: bool) -> MotionPlan | None:
+        """The plan with the first of these branches that serves, where no attempt before had its grasp; ``elsewhere``: those that close
+        where one of these does are put by."""
+        self.quick = 0
+        for grasp, ways in self.planner.task.clear(self.request, branches, self.failures):
+            if self.quick >= self.planner.settings.quick_tries:
+                break
+            frame = grasp.tool_from_tcp
+            if elsewhere and any(_same_place(frame, other, self.planner.robot.closing) for other in self.chosen):
+                self.spare += [branch for branch in branches if branch.grasp is grasp]
+                continue
+            if any(_alike(frame, other) for other in self.chosen):
+                continue
+            plan = self._in_one_of(itertools.islice(ways, WAYS))
+            if plan is not None:
+                return plan
+        return None
+
+    def _in_one_of(self, ways: Iterator[Branch]) -> MotionPlan | None:
+        """The plan in the first of the ways with one grasp that serves; ``None`` where none does, or the grasp is one of the attempts before,
+        which is noted."""
+        for branch in ways:
+            if self.tried >= self.planner.settings.tries:
+                raise self.failures.error()
+            try:
+                plan = self._along(branch)
+            except StageError as failure:
+                self.failures.add(failure.stage, failure.error)
+                if failure.stage in ("task", "approach"):
+                    self.quick += 1
+                else:
+                    self.tried += 1
+                if failure.stage == "approach":
+                    break  # the same hand comes to the same grasp in its other ways
+                continue
+            self.chosen.append(branch.grasp.tool_from_tcp)
+            return plan
+        return None
+
+    def _along(self, branch: Branch) -> MotionPlan | None:
+        """The whole plan along one branch, or ``None``, once pick-up and task are known to be possible, where its grasp is one of the attempts
+        before; raises StageError."""
+        planner, request = self.planner, self.request
+        planner.task.check(request, branch)
+        if self.in_hand:
             here = request.start[None]
-            pick = here, request.start, self.hand.raised(request, branch)
+            pick = here, request.start, planner.hand.raised(request, branch)
         else:
-            pick = self.hand.pick(request, branch)
-        task = self.task.follow(request, branch)
-        retreat = self.hand.retreat(request, branch, task) if request.strategy.releases else None
-        if only_check:
+            pick = planner.hand.pick(request, branch)
+        task = planner.task.follow(request, branch)
+        retreat = planner.hand.retreat(request, branch, task) if request.strategy.releases else None
+        if len(self.chosen) < self.attempt:
             return None
         request.feedback("transfer", "free motion with the tool in hand")
-        carry = self.free.carry(request, branch, pick[2][-1], task[0])
-        if in_hand:
+        carry = planner.free.carry(request, branch, pick[2][-1], task[0])
+        if self.in_hand:
             come = pick[0]
         else:
             request.feedback("approach", "free motion to the tool")
-            come = self.free.come(request, pick[0][0])
+            come = planner.free.come(request, pick[0][0])
         request.feedback("timing", "time parameterisation")
-        return self.schedule.timed(request, branch, come, pick, carry, task, retreat)
-
-
-def haste(motion: ToolMotion) -> tuple[float, float]:
-    """Speed and turning speed of a tool at their greatest, in shares of what is allowed."""
-    steps = np.diff(motion.times)
-    way = np.linalg.norm(np.diff(motion.world_from_tool[:, :3, 3], axis=0), axis=1)
-    turns = turning(motion.world_from_tool[:-1], motion.world_from_tool[1:])
-    return float((way / steps).max() / TOOL_SPEED), float((turns / steps).max() / TOOL_TURN)
+        return self.pace.bearable(planner.schedule.timed(request, branch, come, pick, carry, task, retreat))
 
 
 def tipping(lying: Array, used: Array) -> float:

@@ -30,6 +30,7 @@ from magic_core.threads import one_thread
 from magic_planner.budget import Budget
 from magic_planner.collision import mass_centre
 from magic_planner.object_motion import plan_tool_motion
+from magic_planner.request import Problem
 
 #: For each task: the tool families with the region that does the job, the target's family, and where the tool lies (x, y).
 TASKS = {
@@ -187,14 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
                 if motion is not None:
                     try:
                         plan = planner.plan(
-                            strategy,
-                            case.tool,
-                            case.target,
-                            case.candidate,
-                            "keep",
-                            motion,
-                            (0, 0, 1, 0),
-                            case.obstacles,
+                            Problem(strategy, case.tool, case.target, case.candidate, "keep", motion, (0, 0, 1, 0), case.obstacles),
                             budget=Budget(options.timeout),
                         )
                         assert plan.arm_motion is not None

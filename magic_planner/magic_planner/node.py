@@ -23,6 +23,7 @@ from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
 from magic_planner.giving_way import GAP, GAP_IN_HAND
 from magic_planner.object_motion import plan_tool_motion, warm_up
+from magic_planner.request import Problem
 
 
 class PlannerNode(Node):
@@ -158,8 +159,7 @@ class PlannerNode(Node):
             return MotionPlan("fg", motion)
         if self._arm is None:
             raise MagicError(Code.UNKNOWN_VARIANT, "variant", goal.variant, "fg, as this planner was started without an arm")
-        start = self._start(goal.start)
-        return self._arm.plan(
+        problem = Problem(
             strategy,
             tool,
             target,
@@ -168,12 +168,11 @@ class PlannerNode(Node):
             motion,
             table,
             obstacles,
-            start,
-            int(goal.attempt),
-            int(goal.seed),
-            budget,
-            feedback,
+            start=self._start(goal.start),
+            attempt=int(goal.attempt),
+            seed=int(goal.seed),
         )
+        return self._arm.plan(problem, budget, feedback)
 
     def _start(self, state: JointState) -> NDArray[np.float64] | None:
         """Joint positions of the arm out of a JointState (in any order, fingers and others left out); None where it is empty."""

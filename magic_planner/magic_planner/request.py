@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core.contact import ContactCandidate
 from magic_core.errors import MagicError
 from magic_core.motion import ToolMotion
 from magic_core.scene import SceneObject
@@ -60,9 +61,31 @@ class Branch:
     cost: float
 
 
+@dataclass(frozen=True)
+class Problem:
+    """What the arm is asked for, and all that its plan is a function of: to take a tool that lies in the world along ``motion``.
+
+    candidate, reflection: the contacts for which the motion was made, as :func:`magic_planner.object_motion.plan_tool_motion` had them.
+    table (4,): plane with its unit normal up.  start (J,): where the arm is (``None``: home).  attempt: 0 for the best grasp, n for the n-th
+    next that differs from those before.
+    """
+
+    strategy: Strategy
+    tool: SceneObject
+    target: SceneObject
+    candidate: ContactCandidate
+    reflection: str
+    motion: ToolMotion
+    table: Array | Sequence[float] = (0.0, 0.0, 1.0, 0.0)
+    obstacles: Sequence[SceneObject] = ()
+    start: Array | None = None
+    attempt: int = 0
+    seed: int = 0
+
+
 @dataclass
 class Request:
-    """What one call of :meth:`ArmPlanner.plan` works on."""
+    """A problem as one call of :meth:`ArmPlanner.plan` works on it: checked, with what follows from it."""
 
     strategy: Strategy
     tool: SceneObject

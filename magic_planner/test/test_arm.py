@@ -14,13 +14,13 @@ from magic_core.errors import Code, MagicError
 from magic_core.joint_limits import PUBLISHED
 from magic_core.strategy import Waypoint
 from magic_planner import timing
-from magic_planner.arm import haste
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, grown, roomy_shell, shell
 from magic_planner.free_motion import LONGEST
 from magic_planner.margins import margins
 from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
-from magic_planner.request import ArmSettings, StageError
+from magic_planner.pace import Pace, haste
+from magic_planner.request import ArmSettings, Problem, StageError
 from magic_planner.schedule import slowed
 from magic_planner.task_path import TaskPath
 from magic_planner.workspace import DEEPER
@@ -37,7 +37,7 @@ def problem(at=(0.6, 0.0), **changes):
 @pytest.fixture(scope="module")
 def solved(arm):
     given = problem()
-    return given, arm.plan(*given)
+    return given, arm.plan(Problem(*given))
 
 
 def span(plan, name):
@@ -122,14 +122,14 @@ def test_no_pose_of_the_plan_is_in_collision(arm, solved):
 
 def test_the_same_seed_gives_the_same_plan(arm, solved):
     given, plan = solved
-    again = arm.plan(*given)
+    again = arm.plan(Problem(*given))
     np.testing.assert_array_equal(plan.arm_motion.positions, again.arm_motion.positions)
     np.testing.assert_array_equal(plan.arm_motion.times, again.arm_motion.times)
 
 
 def test_another_attempt_is_another_grasp(arm, solved):
     given, plan = solved
-    other = arm.plan(*given, attempt=1)
+    other = arm.plan(Problem(*given, attempt=1))
     a, b = plan.arm_motion.tool_from_tcp, other.arm_motion.tool_from_tcp
     assert np.linalg.norm(a[:3, 3] - b[:3, 3]) > 0.014 or transforms.rotation_angle(a, b) > np.deg2rad(19)
 
@@ -147,7 +147,7 @@ def test_where_no_grasp_of_the_quick_look_serves_more_are_looked_for(arm, solved
         return []
 
     monkeypatch.setattr(arm.task, "branches", branches)
-    assert arm.plan(*given).arm_motion is not None
+    assert arm.plan(Problem(*given)).arm_motion is not None
     assert len(asked) == len(arm.settings.lots) + 1
 
 
@@ -164,7 +164,7 @@ def test_what_fails_before_the_tool_is_lifted_uses_up_no_try(arm, solved, monkey
         check(request, branch)
 
     monkeypatch.setattr(arm.task, "check", met)
-    other = arm.plan(*given)
+    other = arm.plan(Problem(*given))
     assert len(failed) == 2 * arm.settings.tries
     assert not np.array_equal(other.arm_motion.tool_from_tcp, plan.arm_motion.tool_from_tcp)
 
@@ -173,7 +173,7 @@ def test_a_releasing_strategy_lets_go_and_backs_off(arm):
     strategy = scenes.pulling()
     waypoints = (*strategy.waypoints[:3], Waypoint("let go", np.zeros(3), "release"))
     given = problem(waypoints=waypoints, releases=True)
-    plan = arm.plan(*given)
+    plan = arm.plan(Problem(*given))
     motion = plan.arm_motion
     assert [p.name for p in motion.phases][-2:] == ["release", "retreat"]
     assert motion.release_time == pytest.approx(span(plan, "release").start)
@@ -187,12 +187,12 @@ def test_a_releasing_strategy_lets_go_and_backs_off(arm):
 
 def test_out_of_reach_names_the_waypoint(arm):
     with pytest.raises(MagicError, match="waypoint 'above'") as raised:
-        arm.plan(*problem(at=(1.6, 0.0)))
+        arm.plan(Problem(*problem(at=(1.6, 0.0))))
     assert raised.value.code == Code.NO_IK
     strategy = scenes.pulling()
     far = (*strategy.waypoints[:3], Waypoint("far", np.array([0.9, 0, 0]), "goal", 0.1))
     with pytest.raises(MagicError, match="waypoint 'far'") as raised:
-        arm.plan(*problem(waypoints=far))
+        arm.plan(Problem(*problem(waypoints=far)))
     assert raised.value.code in (Code.NO_IK, Code.JOINT_LIMIT)
 
 
@@ -200,14 +200,14 @@ def test_a_tool_out_of_reach_is_said(arm):
     strategy, tool, target, candidate, keep, motion = problem()
     away = dataclasses.replace(tool, world_from_object=transforms.make(translation=[-1.5, 0, 0.01]))
     with pytest.raises(MagicError, match="where it lies") as raised:
-        arm.plan(strategy, away, target, candidate, keep, motion)
+        arm.plan(Problem(strategy, away, target, candidate, keep, motion))
     assert raised.value.code == Code.NO_IK
 
 
 def test_a_start_in_collision_names_the_pair(arm):
     block = scenes.item("block", [scenes.box([0.1, 0.1, 0.1])], transforms.make(translation=[0.3, 0, 0.5]))
     with pytest.raises(MagicError, match="panda_.* and block|block and panda_") as raised:
-        arm.plan(*problem(), obstacles=[block])
+        arm.plan(Problem(*problem(), obstacles=[block]))
     assert raised.value.code == Code.START_IN_COLLISION
 
 
@@ -215,23 +215,23 @@ def test_a_start_beyond_the_limits_names_the_joint(arm):
     start = arm.robot.home.copy()
     start[3] = 0.5
     with pytest.raises(MagicError, match="panda_joint4") as raised:
-        arm.plan(*problem(), start=start)
+        arm.plan(Problem(*problem(), start=start))
     assert raised.value.code == Code.JOINT_LIMIT
     with pytest.raises(MagicError) as raised:
-        arm.plan(*problem(), start=np.zeros(3))
+        arm.plan(Problem(*problem(), start=np.zeros(3)))
     assert raised.value.code == Code.BAD_REQUEST
 
 
 def test_an_obstacle_is_gone_around(arm):
     wall = scenes.item("wall", [scenes.box([0.15, 0.02, 0.25])], transforms.make(translation=[0.45, 0.14, 0.125]))
-    plan = arm.plan(*problem(), obstacles=[wall])
+    plan = arm.plan(Problem(*problem(), obstacles=[wall]))
     assert plan.arm_motion.times[-1] > 5
 
 
 def test_a_cage_about_the_target_is_a_collision_and_not_a_hang(arm):
     lid = scenes.item("lid", [scenes.box([0.5, 0.5, 0.02])], transforms.make(translation=[0.55, 0, 0.11]))
     with pytest.raises(MagicError) as raised:
-        arm.plan(*problem(), obstacles=[lid], budget=Budget(6.0))
+        arm.plan(Problem(*problem(), obstacles=[lid]), budget=Budget(6.0))
     assert raised.value.code in (Code.NO_GRASP, Code.PATH_IN_COLLISION, Code.NO_PATH, Code.NO_IK, Code.JOINT_LIMIT, Code.PLANNING_TIMEOUT)
 
 
@@ -243,16 +243,16 @@ def test_cancel_and_deadline_stop_inside_the_stages(arm):
         return len(asked) > 3
 
     with pytest.raises(MagicError) as raised:
-        arm.plan(*problem(), budget=Budget(10.0, cancelled))
+        arm.plan(Problem(*problem()), budget=Budget(10.0, cancelled))
     assert raised.value.code == Code.CANCELED
     with pytest.raises(MagicError, match="stage") as raised:
-        arm.plan(*problem(), budget=Budget(0.02))
+        arm.plan(Problem(*problem()), budget=Budget(0.02))
     assert raised.value.code == Code.PLANNING_TIMEOUT
 
 
 def test_feedback_names_the_stages(arm):
     stages = []
-    arm.plan(*problem(), feedback=lambda stage, message: stages.append(stage))
+    arm.plan(Problem(*problem()), feedback=lambda stage, message: stages.append(stage))
     assert stages[0] == "grasp" and set(stages) >= {"grasp", "task", "lift", "transfer", "approach", "timing"}
 
 
@@ -261,7 +261,7 @@ def test_a_retreat_out_of_reach_is_left_out(arm):
     waypoints = (*strategy.waypoints, Waypoint("up", np.array([-0.25, 0, -1.2]), "retreat", 0.3))
     given = problem(waypoints=waypoints)
     assert given[-1].phases[-1].name == "retreat"
-    plan = arm.plan(*given)
+    plan = arm.plan(Problem(*given))
     assert [p.name for p in plan.arm_motion.phases][-1] == "goal"
 
 
@@ -274,7 +274,7 @@ def test_a_free_motion_is_clear_as_it_is_timed_and_not_only_as_it_was_found(arm)
     assert np.abs(np.diff(passed, axis=0)).max() < 0.025
     strategy, tool, target, candidate, reflection, motion = problem()
     post = scenes.item("post", [scenes.box([0.06, 0.06, 0.5])], transforms.make(translation=[0.45, 0.08, 0.25]))
-    plan = arm.plan(strategy, tool, target, candidate, reflection, motion, obstacles=(post,))
+    plan = arm.plan(Problem(strategy, tool, target, candidate, reflection, motion, obstacles=(post,)))
     held, fixed = Body("tool", tool.pieces), Body.from_object(post)
     carried = (plan.arm_motion.times > span(plan, "grasp").end) & (plan.arm_motion.times < span(plan, "transfer").end)
     gaps = []
@@ -288,7 +288,7 @@ def test_the_empty_hand_keeps_room_about_what_it_passes(arm, monkeypatch):
     asked = []
     come = arm.free.come
     monkeypatch.setattr(arm.free, "come", lambda request, goal: asked.append((request, goal, come(request, goal))) or asked[-1][2])
-    arm.plan(*problem())
+    arm.plan(Problem(*problem()))
     request, goal, path = asked[-1]
     robot = arm.robot
     middle = robot.chain.forward(path[None, 0] + 0.5 * (path[None, -1] - path[None, 0]))[0, :3, 3]
@@ -351,7 +351,7 @@ def test_a_tool_that_is_carried_with_room_does_not_pass_through_the_table(arm, m
     carry = arm.free.carry
     monkeypatch.setattr(arm.free, "carry", lambda *given: asked.append(given) or carry(*given))
     strategy, tool, *rest = problem()
-    arm.plan(strategy, tool, *rest)
+    arm.plan(Problem(strategy, tool, *rest))
     request, branch, q, _ = asked[-1]
     robot, space, room = arm.robot, arm.space, arm.settings.room
     pose = robot.chain.forward(q[None])[0] @ transforms.inverse(branch.grasp.tool_from_tcp)
@@ -386,11 +386,11 @@ def test_a_plan_carries_its_margins_and_a_heavy_tool_is_refused_with_its_number(
     contact = tool_contact_frame(candidate, reflection)
     shares = []
     for density in (600.0, 1200.0):
-        heavier = arm._with_margins(tool, dataclasses.replace(arm.grasping, density=density, force=0.0), contact, plan)
+        heavier = Pace(arm.robot, dataclasses.replace(arm.grasping, density=density, force=0.0), tool, contact).with_margins(plan)
         shares.append(1 - next(m.left for m in heavier.margins if m.name == "grip"))
     assert shares[1] == pytest.approx(2 * shares[0], rel=1e-6)
     with pytest.raises(StageError) as caught:
-        arm._with_margins(tool, dataclasses.replace(arm.grasping, density=1.2 * 600.0 / shares[0], force=0.0), contact, plan)
+        Pace(arm.robot, dataclasses.replace(arm.grasping, density=1.2 * 600.0 / shares[0], force=0.0), tool, contact).with_margins(plan)
     assert caught.value.error.code in (Code.NO_GRASP, Code.DYNAMIC_LIMIT) and "margin of grip: 120 %" in caught.value.error.message
 
 
@@ -424,20 +424,20 @@ def test_a_tool_that_the_grip_would_lose_at_the_arms_speed_is_carried_slower(arm
     plan = slowed(plan, 0.4)
 
     def grip(density, motion):
-        found = arm._margins(tool, dataclasses.replace(arm.grasping, density=density, force=0.0), contact, motion)
+        found = Pace(arm.robot, dataclasses.replace(arm.grasping, density=density, force=0.0), tool, contact).margins(motion)
         return 1 - next(m.left for m in found if m.name == "grip")
 
     # As dense as leaves a fifth of the grip for what the tool's inertia asks, which is more at this speed.
     density = 600.0 * 0.8 / grip(600.0, slowed(plan, 100.0))
     assert grip(density, plan) > 1.05
     grasping = dataclasses.replace(arm.grasping, density=density, force=0.0)
-    gentle = arm._bearable(tool, grasping, contact, plan)
+    gentle = Pace(arm.robot, grasping, tool, contact).bearable(plan)
     least = min(gentle.margins, key=lambda margin: margin.left)
     assert least.name == "grip" and 0 <= least.left < 0.1
     assert gentle.arm_motion.times[-1] > plan.arm_motion.times[-1]
     np.testing.assert_array_equal(gentle.arm_motion.positions, plan.arm_motion.positions)
     with pytest.raises(StageError) as caught:  # what it cannot hold at rest it holds at no speed
-        arm._bearable(tool, dataclasses.replace(grasping, density=1.5 * density), contact, plan)
+        Pace(arm.robot, dataclasses.replace(grasping, density=1.5 * density), tool, contact).bearable(plan)
     assert "margin of grip" in caught.value.error.message
 
 
@@ -446,7 +446,7 @@ def test_a_tool_is_carried_no_faster_than_a_tool_may_go(arm, solved):
     quick = slowed(plan, max(haste(plan.tool_motion)) / 1.5)
     assert max(haste(quick.tool_motion)) == pytest.approx(1.5)
     light = dataclasses.replace(arm.grasping, density=1.0, force=0.0)
-    allowed = arm._bearable(tool, light, tool_contact_frame(candidate, reflection), quick)
+    allowed = Pace(arm.robot, light, tool, tool_contact_frame(candidate, reflection)).bearable(quick)
     assert max(haste(allowed.tool_motion)) <= 1 + 1e-9
 
 
@@ -467,7 +467,7 @@ def test_grasps_that_cannot_hold_the_tool_at_rest_are_not_planned_with(arm):
     heavy = dataclasses.replace(strategy, physics=dataclasses.replace(strategy.physics, tool_density=60000.0))
     heard = []
     with pytest.raises(MagicError) as caught:
-        arm.plan(heavy, *rest, feedback=lambda stage, message: heard.append(stage))
+        arm.plan(Problem(heavy, *rest), feedback=lambda stage, message: heard.append(stage))
     assert caught.value.code == Code.NO_GRASP and "at rest" in caught.value.message and "margin of grip" in caught.value.message
     assert set(heard) == {"grasp"}
 
@@ -509,7 +509,7 @@ def test_a_tool_in_the_hand_is_carried_on_as_it_is_held(arm, solved, where):
     plan = solved[1]
     after = plan.arm_motion.grasp_time if where == "grasped" else span(plan, "transfer").end
     given, start, held = in_hand(solved, arm, after, (0.0, 0.0, 0.004))
-    again = arm.plan(*given, start=start)
+    again = arm.plan(Problem(*given, start=start))
     motion = again.arm_motion
     assert motion.grasp_time == 0
     np.testing.assert_allclose(motion.positions[0], start)
@@ -521,17 +521,17 @@ def test_a_tool_in_the_hand_is_carried_on_as_it_is_held(arm, solved, where):
     lifted = again.tool_motion.world_from_tool[:, 2, 3].max() - given[1].world_from_object[2, 3]
     assert where != "grasped" or lifted > 0.02
     with pytest.raises(MagicError, match="0 to 0") as raised:
-        arm.plan(*given, start=start, attempt=1)
+        arm.plan(Problem(*given, start=start, attempt=1))
     assert raised.value.code == Code.NO_GRASP
 
 
 def test_a_tool_that_hangs_elsewhere_is_not_in_the_hand(arm, solved):
     given, start, _ = in_hand(solved, arm, solved[1].arm_motion.times[-1], (0.0, 0.0, 0.15))
     with pytest.raises(MagicError, match="nothing of it") as raised:
-        arm.plan(*given, start=start)
+        arm.plan(Problem(*given, start=start))
     assert raised.value.code == Code.BAD_REQUEST
     with pytest.raises(MagicError, match="where the arm is"):
-        arm.plan(*given)
+        arm.plan(Problem(*given))
 
 
 def test_a_refusal_says_by_how_much_the_tool_has_to_be_tipped(arm, monkeypatch):
@@ -542,11 +542,11 @@ def test_a_refusal_says_by_how_much_the_tool_has_to_be_tipped(arm, monkeypatch):
     def refuse(*_):
         raise MagicError(Code.NO_GRASP, "stage grasp: faces", 0, "two that fit")
 
-    monkeypatch.setattr(arm, "_plan", refuse)
+    monkeypatch.setattr(arm, "_solved", refuse)
     upright = dataclasses.replace(tool, world_from_object=transforms.make(attitude, tool.world_from_object[:3, 3]))
     lying = dataclasses.replace(tool, world_from_object=transforms.from_rpy(np.pi / 2, 0, 0) @ upright.world_from_object)
     for item, tipped in ((upright, False), (lying, True)):
         with pytest.raises(MagicError) as caught:
-            arm.plan(given[0], item, *given[2:])
+            arm.plan(Problem(given[0], item, *given[2:]))
         assert caught.value.code is Code.NO_GRASP and "two that fit" in caught.value.message
         assert ("tipped by 90 degrees" in caught.value.message) == tipped

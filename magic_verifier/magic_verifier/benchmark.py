@@ -24,6 +24,7 @@ from magic_planner.benchmark import TASKS, Case, make_case
 from magic_planner.budget import Budget
 from magic_planner.giving_way import GAP, GAP_IN_HAND
 from magic_planner.object_motion import plan_tool_motion
+from magic_planner.request import Problem
 from magic_planner.robot import Robot
 from magic_verifier import verification
 from magic_verifier.workers import Workers
@@ -69,7 +70,7 @@ def planned(strategy: Strategy, case: Case, variant: str, planner: ArmPlanner | 
     motion = plan_tool_motion(*scene, TABLE, case.obstacles, GAP if variant == "fg" else GAP_IN_HAND)
     if planner is None or variant == "fg":
         return MotionPlan("fg", motion)
-    return planner.plan(*scene, motion, TABLE, case.obstacles, budget=Budget(10.0))
+    return planner.plan(Problem(*scene, motion, TABLE, case.obstacles), budget=Budget(10.0))
 
 
 def summary(timings: list[Timing], rollouts: int) -> str:

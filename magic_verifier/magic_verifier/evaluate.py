@@ -319,6 +319,7 @@ def _try(
     from magic_planner.budget import Budget
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
+    from magic_planner.request import Problem
     from magic_verifier.verification import verify
 
     started = time.perf_counter()
@@ -330,7 +331,7 @@ def _try(
         if options.variant == "arm":
             given = (strategy, tool, target, candidate, reflection, motion, table, obstacles)
             budget = Budget(PLANNING_TIME, clock=time.process_time)
-            plan = _arm_planner().plan(*given, attempt=trial.attempt, seed=options.seed, budget=budget)
+            plan = _arm_planner().plan(Problem(*given, attempt=trial.attempt, seed=options.seed), budget=budget)
         else:
             plan = MotionPlan("fg", motion)
     except MagicError as error:

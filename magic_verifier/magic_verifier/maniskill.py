@@ -365,6 +365,7 @@ class Solver:
         from magic_planner.giving_way import GAP_IN_HAND
         from magic_planner.grasps import GraspSettings
         from magic_planner.object_motion import plan_tool_motion
+        from magic_planner.request import Problem
         from magic_verifier.articulation import SOFTLY, ArmOptions
 
         candidate, reflection = trial.candidate, trial.reflection
@@ -373,14 +374,23 @@ class Solver:
             motion = plan_tool_motion(strategy, given.tool, given.target, candidate, reflection, given.table, (), GAP_IN_HAND)
             friction = (given.finger_friction + given.friction) / 2
             grasping = GraspSettings(grip_force=GRIP_SHARE * given.grip_force, friction=friction, density=given.tool_density, away=AWAY)
+            problem = Problem(
+                strategy,
+                given.tool,
+                given.target,
+                candidate,
+                reflection,
+                hastened(motion),
+                given.table,
+                start=given.joints,
+                attempt=trial.attempt,
+                seed=seed,
+            )
             plan = None
             for planner in self.planners:
                 planner.grasping = grasping
                 try:
-                    plan = planner.plan(
-                        strategy, given.tool, given.target, candidate, reflection, hastened(motion), given.table, (),
-                        start=given.joints, attempt=trial.attempt, seed=seed, budget=Budget(PLANNING_TIME, clock=time.process_time),
-                    )  # fmt: skip
+                    plan = planner.plan(problem, Budget(PLANNING_TIME, clock=time.process_time))
                     break
                 except MagicError as error:
                     if error.code != Code.PATH_IN_COLLISION or planner is self.planners[-1]:

@@ -25,6 +25,7 @@ from magic_core.testing import six_axis
 from magic_planner.arm import ArmPlanner
 from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
+from magic_planner.request import Problem
 from magic_planner.robot import Robot
 from magic_verifier import verification
 from magic_verifier.articulation import ArmOptions, Articulation, collision_groups
@@ -41,7 +42,7 @@ def planned(config, name):
     strategy, tool, target, obstacles, candidate = demonstration(name)
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
     planner = ArmPlanner(Robot(config))
-    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(60.0))
+    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(60.0))
     return (strategy, tool, target, obstacles, scenes.TABLE, candidate), plan
 
 
@@ -94,7 +95,7 @@ def test_a_tool_that_is_in_the_hand_off_its_place_is_carried_on(config, pull):
     held = replace(tool, world_from_object=robot.forward(start)[0] @ transforms.inverse(off), hanging=True)
     motion = plan_tool_motion(strategy, held, target, candidate, "keep", table, obstacles)
     plan = ArmPlanner(Robot(config)).plan(
-        strategy, held, target, candidate, "keep", motion, table, obstacles, start=start, budget=Budget(60.0)
+        Problem(strategy, held, target, candidate, "keep", motion, table, obstacles, start=start), budget=Budget(60.0)
     )
     verdict = verify(strategy, held, target, obstacles, table, candidate, plan, repetitions=3, arm_options=GAINS, robot=robot)
     assert len(verdict.runs) > 1 and all(run.code == Code.OK for run in verdict.runs), verdict.message

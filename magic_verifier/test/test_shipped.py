@@ -15,6 +15,7 @@ from magic_core.motion import MotionPlan
 from magic_planner.arm import ArmPlanner
 from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
+from magic_planner.request import Problem
 from magic_planner.robot import Robot
 from magic_verifier import uncertainty, verification
 from magic_verifier.articulation import ArmOptions
@@ -43,7 +44,7 @@ def test_the_arm_does_the_demonstrated_task(name, planner):
     verdicts = []
     for attempt in range(3):
         plan = planner.plan(
-            strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt, budget=Budget(30.0)
+            Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt), budget=Budget(30.0)
         )
         verdicts.append(verify(strategy, tool, target, obstacles, scenes.TABLE, candidate, plan, repetitions=1))
         if verdicts[-1].success:
@@ -58,7 +59,7 @@ def test_the_arm_does_the_demonstrated_task(name, planner):
 def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(30.0))
+    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
     scene = (strategy, tool, target, obstacles, scenes.TABLE, candidate)
     first, again = verify(*scene, plan, repetitions=1), verify(*scene, plan, repetitions=1)
     assert np.array_equal(first.recording.joints, again.recording.joints)
@@ -85,7 +86,7 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
 def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(30.0))
+    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
     # 4 g pull 0.2 kg, whose friction is a hundredth of what the pads hold: the load is that of the motion, as with heavier tools.
     light = replace(strategy, physics=replace(strategy.physics, tool_density=40.0, target_density=3000.0))
     verdict = verify(light, tool, target, obstacles, scenes.TABLE, candidate, plan, repetitions=1)
@@ -95,7 +96,7 @@ def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
 def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    plan = planner.plan(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, budget=Budget(30.0))
+    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
 
     def drawn_rollout(item):
         task = verification.make_task(strategy, item, target, obstacles, scenes.TABLE, plan)
