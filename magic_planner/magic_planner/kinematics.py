@@ -16,6 +16,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,75 +248,124 @@ def load_chain(urdf: str | Path, tip: str, base: str | None = None) -> Chain:
 
 def _chain(root: ElementTree.Element, tip: str, base: str | None) -> Chain:
     links = {link.get("name"): link for link in root.findall("link")}
-    by_child = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # type: ignore[union-attr]
+    by_child = {_end(joint, "child"): joint for joint in root.findall("joint")}
     if tip not in links:
         raise MagicError(Code.BAD_REQUEST, "tip link", tip, list(links))
+    joints, base_link = _joints_to(tip, base, by_child)
+    moving, last_from_tip, carried = _along(joints)
+    if not moving:
+        raise MagicError(Code.BAD_REQUEST, "tip link", tip, "a link that at least one joint moves")
+    masses, mass_joint, mass_centre = _masses(links, _with_branches(carried, by_child))
+    return Chain(
+        names=tuple(joint.name for joint in moving),
+        a=np.stack([joint.a for joint in moving]),
+        b=np.stack([joint.b for joint in moving]),
+        c=np.stack([joint.c for joint in moving]),
+        axes=np.stack([joint.axis for joint in moving]),
+        prismatic=np.array([joint.prismatic for joint in moving], dtype=bool),
+        lower=np.array([joint.lower for joint in moving], dtype=float),
+        upper=np.array([joint.upper for joint in moving], dtype=float),
+        velocity=np.array([joint.velocity for joint in moving], dtype=float),
+        effort=np.array([joint.effort for joint in moving], dtype=float),
+        last_from_tip=last_from_tip,
+        base_link=base_link,
+        tip_link=tip,
+        masses=masses,
+        mass_joint=mass_joint,
+        mass_centre=mass_centre,
+    )
+
+
+class _Joint(NamedTuple):
+    """One moving joint of a :class:`Chain`, which says what its fields are."""
+
+    name: str
+    a: Array
+    b: Array
+    c: Array
+    axis: Array
+    prismatic: bool
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+
+
+#: By link: the index of the moving joint that carries it (-1: none does), and its pose (4, 4) in that joint's moving frame.
+_Carried = dict[str, tuple[int, Array]]
+
+
+def _end(joint: ElementTree.Element, which: str) -> str:
+    """The link at the ``parent`` or ``child`` end of a joint."""
+    return joint.find(which).get("link")  # type: ignore[union-attr,return-value]
+
+
+def _joints_to(tip: str, base: str | None, by_child: dict[str, ElementTree.Element]) -> tuple[list[ElementTree.Element], str]:
+    """The joints that lead to a link from ``base``, or from the root, and the link at which they begin."""
     joints: list[ElementTree.Element] = []
     link = tip
     while link in by_child and link != base:
         joints.insert(0, by_child[link])
-        link = by_child[link].find("parent").get("link")  # type: ignore[union-attr]
-    names, rows, fixed = [], [], np.eye(4)
-    carrier: dict[str, tuple[int, Array]] = {}  # link -> joint that moves it, joint frame from link
+        link = _end(by_child[link], "parent")
+    return joints, link
+
+
+def _along(joints: list[ElementTree.Element]) -> tuple[list[_Joint], Array, _Carried]:
+    """The moving ones of joints in a row, the pose (4, 4) of the last link in the last of these, and what carries each link."""
+    moving: list[_Joint] = []
+    carried: _Carried = {}
+    fixed = np.eye(4)  # in the frame of the last moving joint
     for joint in joints:
         fixed = fixed @ _origin(joint.find("origin"))
-        kind = joint.get("type")
-        if kind in ("revolute", "continuous", "prismatic"):
-            axis = joint.find("axis")
-            direction = transforms.unit(_numbers(axis.get("xyz") if axis is not None else None, "1 0 0"))
-            cross = np.zeros((4, 4))
-            cross[:3, :3] = np.cross(np.eye(3), direction)
-            if kind == "prismatic":
-                b, c = np.zeros((4, 4)), np.zeros((4, 4))
-                b[:3, 3] = direction
-                b = fixed @ b
-            else:
-                b, c = fixed @ cross, fixed @ cross @ cross
-            limit = joint.find("limit")
-            low, high = -2 * np.pi, 2 * np.pi
-            if kind != "continuous":
-                low, high = _bound(limit, "lower", low), _bound(limit, "upper", high)
-            most = _bound(limit, "velocity", 1.0), _bound(limit, "effort", np.inf)
-            rows.append((fixed, b, c, direction, kind == "prismatic", low, high, *most))
-            names.append(joint.get("name"))
+        if joint.get("type") in ("revolute", "continuous", "prismatic"):
+            moving.append(_moving(joint, fixed))
             fixed = np.eye(4)
-        carrier[joint.find("child").get("link")] = (len(names) - 1, fixed.copy())  # type: ignore[union-attr]
-    if not names:
-        raise MagicError(Code.BAD_REQUEST, "tip link", tip, "a link that at least one joint moves")
-    # What hangs on the chain without being part of it (the fingers) counts with its joints at zero.
+        carried[_end(joint, "child")] = (len(moving) - 1, fixed.copy())
+    return moving, fixed, carried
+
+
+def _moving(joint: ElementTree.Element, a: Array) -> _Joint:
+    """A moving joint whose frame at zero is ``a`` (4, 4) in that of the moving joint before it."""
+    kind, axis, limit = joint.get("type"), joint.find("axis"), joint.find("limit")
+    direction = transforms.unit(_numbers(axis.get("xyz") if axis is not None else None, "1 0 0"))
+    b, c = np.zeros((4, 4)), np.zeros((4, 4))
+    if kind == "prismatic":
+        b[:3, 3] = direction
+        b = a @ b
+    else:
+        cross = np.zeros((4, 4))
+        cross[:3, :3] = np.cross(np.eye(3), direction)
+        b, c = a @ cross, a @ cross @ cross
+    low, high = -2 * np.pi, 2 * np.pi
+    if kind != "continuous":
+        low, high = _bound(limit, "lower", low), _bound(limit, "upper", high)
+    most = _bound(limit, "velocity", 1.0), _bound(limit, "effort", np.inf)
+    return _Joint(joint.get("name"), a, b, c, direction, kind == "prismatic", low, high, *most)  # type: ignore[arg-type]
+
+
+def _with_branches(carried: _Carried, by_child: dict[str, ElementTree.Element]) -> _Carried:
+    """What the chain carries with all that hangs on it without being part of it (the fingers), whose joints count as at zero."""
+    carried = dict(carried)
     grown = True
     while grown:
         grown = False
         for child, joint in by_child.items():
-            parent = joint.find("parent").get("link")  # type: ignore[union-attr]
-            if child not in carrier and parent in carrier:
-                index, frame = carrier[parent]
-                carrier[child] = (index, frame @ _origin(joint.find("origin")))
+            parent = _end(joint, "parent")
+            if child not in carried and parent in carried:
+                index, frame = carried[parent]
+                carried[child] = (index, frame @ _origin(joint.find("origin")))
                 grown = True
-    masses, mass_joint, mass_centre = [], [], []
-    for name, (index, frame) in carrier.items():
+    return carried
+
+
+def _masses(links: dict[str | None, ElementTree.Element], carried: _Carried) -> tuple[Array, NDArray[np.int64], Array]:
+    """masses (M,), mass_joint (M,) and mass_centre (M, 3) of the links that moving joints carry, as :class:`Chain` has them."""
+    masses, joints, centres = [], [], []
+    for name, (index, frame) in carried.items():
         inertial = links[name].find("inertial") if name in links else None
         mass = inertial.find("mass") if inertial is not None else None
         if index >= 0 and mass is not None and float(mass.get("value", "0")) > 0:
             masses.append(float(mass.get("value", "0")))
-            mass_joint.append(index)
-            mass_centre.append((frame @ _origin(inertial.find("origin")))[:3, 3])  # type: ignore[union-attr]
-    columns = list(zip(*rows, strict=True))
-    return Chain(
-        names=tuple(names),
-        a=np.stack(columns[0]),
-        b=np.stack(columns[1]),
-        c=np.stack(columns[2]),
-        axes=np.stack(columns[3]),
-        prismatic=np.array(columns[4], dtype=bool),
-        lower=np.array(columns[5], dtype=float),
-        upper=np.array(columns[6], dtype=float),
-        velocity=np.array(columns[7], dtype=float),
-        effort=np.array(columns[8], dtype=float),
-        last_from_tip=fixed,
-        base_link=link,
-        tip_link=tip,
-        masses=np.array(masses, dtype=float),
-        mass_joint=np.array(mass_joint, dtype=int),
-        mass_centre=np.array(mass_centre, dtype=float).reshape(-1, 3),
-    )
+            joints.append(index)
+            centres.append((frame @ _origin(inertial.find("origin")))[:3, 3])  # type: ignore[union-attr]
+    return np.array(masses, dtype=float), np.array(joints, dtype=int), np.array(centres, dtype=float).reshape(-1, 3)

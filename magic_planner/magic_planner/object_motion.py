@@ -106,18 +106,13 @@ def plan_tool_motion(
     stands on edge), BAD_MESH (a tool without a shape), and PATH_IN_COLLISION naming the pair where the
     tool would start inside the target or an obstacle.
     """
-    if candidate.target is None:
-        raise MagicError(
-            Code.BAD_REQUEST, f"candidate of tool {tool.id}", "without a target contact", "a candidate with the target's contact filled in"
-        )
-    if candidate.tool_id and candidate.tool_id != tool.id:
-        raise MagicError(Code.BAD_REQUEST, "tool of the candidate", candidate.tool_id, f"{tool.id!r}, the tool of the request")
+    met = _target_contact(candidate, tool)
     if reflection not in REFLECTIONS:
         raise MagicError(Code.BAD_REQUEST, "reflection", reflection, REFLECTIONS)
     plane = table_plane(table)
     _rigid(tool.world_from_object, f"pose of {tool.id}")  # the arm starts from it
     world_from_target = _rigid(target.world_from_object, f"pose of {target.id}")
-    target_from_contact = _rigid(candidate.target.object_from_contact, f"contact frame of {target.id}")
+    target_from_contact = _rigid(met.object_from_contact, f"contact frame of {target.id}")
     tool_from_contact = placed_contact_frame(strategy, candidate, reflection)
     world_from_contact = world_from_target @ target_from_contact
     shown = demonstrated_motion(strategy) if strategy.mode == "retarget" else None
@@ -142,9 +137,33 @@ def plan_tool_motion(
     frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, room)
     world_from_tool = world_from_meeting @ transforms.inverse(frames)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool), clearance)
+    _require_clear_start(tool, world_from_tool[0], (target, *obstacles))
+    marks = waypoint_times(strategy, pairs)
+
+    def name(index: int) -> str:
+        ahead = next((n for n, t in marks if t >= times[index] - 1e-6), marks[-1][0])
+        return f"waypoint {ahead!r} (at {times[index]:.2f} s of the tool's motion)"
+
+    world_from_tool = give_way(world_from_tool, tool, obstacles, world_from_contact[:3, 2], plane, clearance, name, gap)
+    return ToolMotion(times, world_from_tool, phases, marks)
+
+
+def _target_contact(candidate: ContactCandidate, tool: SceneObject) -> Contact:
+    """Where a candidate's tool is to meet the target; raises BAD_REQUEST where the candidate does not say it, or is another tool's."""
+    if candidate.target is None:
+        raise MagicError(
+            Code.BAD_REQUEST, f"candidate of tool {tool.id}", "without a target contact", "a candidate with the target's contact filled in"
+        )
+    if candidate.tool_id and candidate.tool_id != tool.id:
+        raise MagicError(Code.BAD_REQUEST, "tool of the candidate", candidate.tool_id, f"{tool.id!r}, the tool of the request")
+    return candidate.target
+
+
+def _require_clear_start(tool: SceneObject, world_from_tool: NDArray[np.float64], others: Sequence[SceneObject]) -> None:
+    """Raises PATH_IN_COLLISION where a tool at the first pose (4, 4) of its motion is in something else."""
     start = Body(tool.id, solid_pieces(tool))
-    start.move(world_from_tool[0])
-    for item in (target, *obstacles):
+    start.move(world_from_tool)
+    for item in others:
         if start.touches(Body.from_object(item)):
             raise MagicError(
                 Code.PATH_IN_COLLISION,
@@ -152,15 +171,6 @@ def plan_tool_motion(
                 "in collision",
                 "a first waypoint at which the tool is clear of the target and the obstacles",
             )
-    direction = world_from_contact[:3, 2]
-    marks = waypoint_times(strategy, pairs)
-
-    def name(index: int) -> str:
-        ahead = next((n for n, t in marks if t >= times[index] - 1e-6), marks[-1][0])
-        return f"waypoint {ahead!r} (at {times[index]:.2f} s of the tool's motion)"
-
-    world_from_tool = give_way(world_from_tool, tool, obstacles, direction, plane, clearance, name, gap)
-    return ToolMotion(times, world_from_tool, phases, marks)
 
 
 def _ends_beneath(world_from_meeting: NDArray[np.float64], plane: NDArray[np.float64]) -> bool:

@@ -18,6 +18,8 @@ from magic_planner.request import ArmSettings, Branch, Request, StageError
 from magic_planner.robot import Robot
 
 Array = NDArray[np.float64]
+#: Samples of a motion at which what its joints hold is looked at.
+LOADED = 60
 
 
 def slowed(plan: MotionPlan, factor: float) -> MotionPlan:
@@ -107,8 +109,10 @@ class Schedule:
                 track.append(timing.parameterise(retreat, near, step))
             names.append(("retreat", track.now))
         times, q, qd, qdd = track.arrays()
-        self._check_limits(request, branch, times, q, qd, qdd, grasp_time, release_time)
         held = (times >= grasp_time) & (times <= (np.inf if release_time is None else release_time))
+        self._check_range(times, q)
+        self._check_rates(times, q, qd, qdd)
+        self._check_torques(request, branch, times, q, held)
         poses = np.empty((len(times), 4, 4))
         poses[held] = robot.chain.forward(q[held]) @ transforms.inverse(branch.grasp.tool_from_tcp)
         poses[times < grasp_time] = request.tool.world_from_object
@@ -133,63 +137,47 @@ class Schedule:
             found.add(min(last, int(np.abs(request.times - when).argmin())))
         return sorted(found)
 
-    def _check_limits(
-        self, request: Request, branch: Branch, times: Array, q: Array, qd: Array, qdd: Array, grasp_time: float, release_time: float | None
-    ) -> None:
-        robot = self.robot
-        over = np.argwhere((q < robot.chain.lower - 1e-6) | (q > robot.chain.upper + 1e-6))
+    def _check_range(self, times: Array, q: Array) -> None:
+        """Raises StageError where joints q (T, J) leave their ranges."""
+        chain = self.robot.chain
+        over = np.argwhere((q < chain.lower - 1e-6) | (q > chain.upper + 1e-6))
         if len(over):
             i, j = over[0]
-            raise StageError(
-                "timing",
-                MagicError(
-                    Code.JOINT_LIMIT,
-                    f"{robot.chain.names[j]} at {times[i]:.2f} s",
-                    round(float(q[i, j]), 4),
-                    f"{robot.chain.lower[j]} to {robot.chain.upper[j]} rad",
-                ),
-            )
-        fast, strong, sharp = interpolation.extremes(times, q, qd, qdd)
-        published = robot.description
-        for values, limits, unit in (
-            (fast, robot.chain.velocity, "rad/s"),
-            (strong, published.acceleration, "rad/s^2"),
-            (sharp, published.jerk, "rad/s^3"),
-        ):
+            allowed = f"{chain.lower[j]} to {chain.upper[j]} rad"
+            raise StageError("timing", MagicError(Code.JOINT_LIMIT, self._joint(j, times[i]), round(float(q[i, j]), 4), allowed))
+
+    def _check_rates(self, times: Array, q: Array, qd: Array, qdd: Array) -> None:
+        """Raises StageError where, between the samples too, velocity, acceleration or jerk is more than is published of the robot."""
+        published = self.robot.description
+        most = self.robot.chain.velocity, published.acceleration, published.jerk
+        found = interpolation.extremes(times, q, qd, qdd)
+        for values, limits, unit in zip(found, most, ("rad/s", "rad/s^2", "rad/s^3"), strict=True):
             over = np.argwhere(values > limits)
             if len(over):
                 i, j = over[0]
-                raise StageError(
-                    "timing",
-                    MagicError(
-                        Code.DYNAMIC_LIMIT,
-                        f"{robot.chain.names[j]} at {times[i]:.2f} s",
-                        f"{values[i, j]:.3f} {unit}",
-                        f"up to {limits[j]:.3f} {unit}",
-                    ),
-                )
-        some = np.unique(np.linspace(0, len(times) - 1, min(len(times), 60)).astype(int))
-        held = (times[some] >= grasp_time) & (times[some] <= (np.inf if release_time is None else release_time))
+                value, allowed = f"{values[i, j]:.3f} {unit}", f"up to {limits[j]:.3f} {unit}"
+                raise StageError("timing", MagicError(Code.DYNAMIC_LIMIT, self._joint(j, times[i]), value, allowed))
+
+    def _check_torques(self, request: Request, branch: Branch, times: Array, q: Array, held: NDArray[np.bool_]) -> None:
+        """Raises StageError where joints q (T, J) do not hold the arm, and where it is ``held`` (T,) the tool."""
+        chain = self.robot.chain
+        some = np.unique(np.linspace(0, len(times) - 1, min(len(times), LOADED)).astype(int))
         volume, centre = mass_centre(solid_pieces(request.tool))
         mass = volume * request.strategy.physics.tool_density
-        for rows, load in ((some[held], mass), (some[~held], 0.0)):
+        tcp_centre = transforms.apply(transforms.inverse(branch.grasp.tool_from_tcp), centre)
+        for rows, load in ((some[held[some]], mass), (some[~held[some]], 0.0)):
             if not len(rows):
                 continue
-            torques = np.abs(
-                robot.chain.gravity_torques(q[rows], load, transforms.apply(transforms.inverse(branch.grasp.tool_from_tcp), centre))
-            )
-            over = np.argwhere(torques > robot.chain.effort)
+            torques = np.abs(chain.gravity_torques(q[rows], load, tcp_centre))
+            over = np.argwhere(torques > chain.effort)
             if len(over):
                 i, j = over[0]
-                raise StageError(
-                    "timing",
-                    MagicError(
-                        Code.DYNAMIC_LIMIT,
-                        f"{robot.chain.names[j]} at {times[rows[i]]:.2f} s with {load:.2f} kg in hand",
-                        f"{torques[i, j]:.1f} N m",
-                        f"up to {robot.chain.effort[j]} N m",
-                    ),
-                )
+                what = f"{self._joint(j, times[rows[i]])} with {load:.2f} kg in hand"
+                value, allowed = f"{torques[i, j]:.1f} N m", f"up to {chain.effort[j]} N m"
+                raise StageError("timing", MagicError(Code.DYNAMIC_LIMIT, what, value, allowed))
+
+    def _joint(self, index: int, time: float) -> str:
+        return f"{self.robot.chain.names[index]} at {time:.2f} s"
 
 
 @contextmanager
