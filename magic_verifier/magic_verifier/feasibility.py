@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.content import digest
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView, SceneObject
@@ -220,18 +221,13 @@ def impossible(strategy: Strategy, case: Case) -> str:
     return "; ".join(reasons)
 
 
-#: Answers for tools and targets that were asked for before: what is so does not depend on the method or the turn.
-_known: dict[tuple[Any, ...], str] = {}
+#: Answers for tools and targets that were asked for before, by what they depend on: that is not the method or the turn.
+_known: dict[bytes, str] = {}
 
 
 def _impossible(strategy: Strategy, name: str, target_name: str) -> str:
-    key = (
-        repr(strategy.goal),
-        strategy.view,
-        strategy.target_contact.radius,
-        name,
-        target_name,
-    )
+    where = strategy.target_contact.radius, strategy.target_outline
+    key = digest((strategy.goal, strategy.view, where, strategy.environment, strategy.target_mesh, name, target_name))
     if key not in _known:
         _known[key] = _looked_at(strategy, name, target_name)
     return _known[key]

@@ -76,6 +76,17 @@ def test_a_mesh_is_looked_at_along_its_own_directions_before_geometry_forbids_it
     assert said.startswith("nothing in it holds a rod") if forbidden else said == ""
 
 
+def test_what_is_impossible_is_said_anew_of_a_strategy_that_meets_the_target_otherwise_or_another_target():
+    strategy = strategies.find("hooking", STRATEGIES)
+    case = Case("bar", ("letter:1,glyph=I",), "demonstration")
+    assert "around a disc of 25 mm" in feasibility.impossible(strategy, case)
+    assert feasibility.impossible(replace(strategy, target_outline="inner"), case) == ""
+    larger = {"family": "sphere", "seed": 0, "parameters": {"radius": 0.04}}
+    assert "around a disc of 40 mm" in feasibility.impossible(
+        replace(strategy, environment=strategy.environment | {"target": larger}), case
+    )
+
+
 def test_turns_are_cases_of_their_own_and_lie_differently():
     options = Options("hooking", "fg_no_selection", strategies=STRATEGIES, turns=3)
     names = [case.name for case in all_cases(options)]
