@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.motion import MotionPlan
+from magic_core.motion import ArmMotion, MotionPlan
 from magic_core.robot import Description
 from magic_verifier.articulation import ARM, FINGERS, ArmOptions, Articulation, panda
 from magic_verifier.floating import (
@@ -94,16 +94,15 @@ class ArmRun:
         motion = plan.arm_motion
         if motion is None:
             raise MagicError(Code.BAD_MOTION, "plan", "without an arm motion", "an arm motion")
-        positions = np.asarray(motion.positions, dtype=float)
-        times = np.asarray(motion.times, dtype=float)
-        self._in_hand = in_hand = held is None and motion.grasp_time <= 0
-        if held is None and not in_hand:
+        self._in_hand = held is None and motion.grasp_time <= 0
+        if held is None and not self._in_hand:
             setup = replace(setup, tool=lifted_onto_table(setup.tool, setup.table))
         self.setup = setup
         self.options = options or ArmOptions()
         self._coupled = self.options.past is None  # hand and tool, by a joint
         self.limits = limits
         self.phases = motion.phases or plan.tool_motion.phases
+        times = np.asarray(motion.times, dtype=float)
         self.duration = float(times[-1] - times[0])
         self.grasp_time = float(motion.grasp_time)
         self.release_time = None if motion.release_time is None else float(motion.release_time)
@@ -112,24 +111,14 @@ class ArmRun:
         self._motion = motion
         self.world = fill_world(setup, DYNAMIC)
         if setup.target_kind == DYNAMIC:
-            tool, target = self.world.component(TOOL), self.world.component(TARGET)
-            share = min(max(target.mass / tool.mass / HEAVIER, 1.0), MOST_ITERATIONS)
-            tool.solver_position_iterations = round(share * setup.settings.position_iterations)
+            self._iterate_for_weight()
         self._arm = Articulation(self.world, robot, self.options)
         self._obstacles = frozenset((TARGET, *(o.id for o in setup.obstacles)))
-        self._lag = round(lag * setup.settings.frequency)
         frequency = setup.settings.frequency
-        clock = times[0] + np.arange(int(np.ceil(self.duration * frequency)) + 1) / frequency
-        self._q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
-        self._qd = np.gradient(self._q, 1.0 / frequency, axis=0) if len(self._q) > 1 else np.zeros_like(self._q)
+        self._lag = round(lag * frequency)
+        self._q, self._qd = self._sampled(motion)
         self._positions = self._q.tolist()
-        led = self._q + self._arm.lead * self._qd
-        if self.options.command_period > 0:
-            # A command that stays is that of the middle of its time.
-            period = self.options.command_period * frequency
-            middle = ((np.floor(np.arange(len(led)) / period + 1e-9) + 0.5) * period).astype(int)
-            led = led[np.minimum(middle, len(led) - 1)]
-        self._led = led.tolist()
+        self._led = self._commands().tolist()
         self._index = self._first = 0
         self._hold = 0.0
         self._widths: list[float] = []  # between the closing fingers, step by step
@@ -147,15 +136,45 @@ class ArmRun:
         self._torque = [0.0] * len(robot.names)
         self._effort = self._arm.effort.tolist()
         self._metrics = {"torque_ratio": 0.0, "grip_load": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
-        if in_hand:
-            self._arm.place(self._q[0], min(motion.grasp_width + WIDER, robot.config.opening))
+        self._begin(held, begin)
+
+    def _iterate_for_weight(self) -> None:
+        """More solver iterations where the target is much heavier than the tool (:data:`HEAVIER`)."""
+        tool, target = self.world.component(TOOL), self.world.component(TARGET)
+        share = min(max(target.mass / tool.mass / HEAVIER, 1.0), MOST_ITERATIONS)
+        tool.solver_position_iterations = round(share * self.setup.settings.position_iterations)
+
+    def _sampled(self, motion: ArmMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Joint positions and velocities (N, J) of the trajectory, step by step."""
+        times, positions = np.asarray(motion.times, dtype=float), np.asarray(motion.positions, dtype=float)
+        frequency = self.setup.settings.frequency
+        clock = times[0] + np.arange(int(np.ceil(self.duration * frequency)) + 1) / frequency
+        q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
+        return q, np.gradient(q, 1.0 / frequency, axis=0) if len(q) > 1 else np.zeros_like(q)
+
+    def _commands(self) -> NDArray[np.float64]:
+        """What the drives are told (N, J), step by step: ahead of the trajectory by what they lead by, and kept for the command's period."""
+        led = self._q + self._arm.lead * self._qd
+        if self.options.command_period > 0:
+            # A command that stays is that of the middle of its time.
+            period = self.options.command_period * self.setup.settings.frequency
+            middle = ((np.floor(np.arange(len(led)) / period + 1e-9) + 0.5) * period).astype(int)
+            led = led[np.minimum(middle, len(led) - 1)]
+        return led
+
+    def _begin(self, held: Held | None, begin: float) -> None:
+        """Put arm, fingers and a tool in the hand where the run begins: with the tool as it was ``held``, or as the plan has it in the hand,
+        or with an empty hand at the moment ``begin``."""
+        if self._in_hand:
+            self._arm.place(self._q[0], min(self._motion.grasp_width + WIDER, self.robot.config.opening))
             self.world.component(TOOL).disable_gravity = True
-        elif held is None:
-            self._index = self._first = min(round(begin * frequency), len(self._q) - 1)
+            return
+        time = begin if held is None else held.time
+        self._index = self._first = min(round(time * self.setup.settings.frequency), len(self._q) - 1)
+        if held is None:
             self._arm.place(self._q[self._index])
             self._arm.open_fingers()
         else:
-            self._index = self._first = min(round(held.time * frequency), len(self._q) - 1)
             self._arm.place(self._q[self._index], held.width + WIDER)
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(held.tool_from_tcp))
             self._closed = True
