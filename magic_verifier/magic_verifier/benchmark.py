@@ -27,6 +27,8 @@ from magic_planner.object_motion import plan_tool_motion
 from magic_planner.request import Problem
 from magic_planner.robot import Robot
 from magic_verifier import verification
+from magic_verifier.rollout import Task, rollout
+from magic_verifier.verification import Proposal
 from magic_verifier.workers import Workers
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -51,10 +53,10 @@ class Timing:
         )
 
 
-def measured(task: verification.Task, name: str, count: int, pool: Workers) -> Timing | None:
+def measured(task: Task, name: str, count: int, pool: Workers) -> Timing | None:
     """The rollouts of one task, timed; ``None`` where the scene as given fails, after which there are none."""
     started = time.perf_counter()
-    first = verification.rollout(task, 0)
+    first = rollout(task, 0)
     alone = time.perf_counter() - started
     if first.judgement.code != Code.OK:
         return None
@@ -109,7 +111,7 @@ def main(arguments: list[str] | None = None) -> None:
                     try:
                         plan = planned(strategy, case, variant, planner)
                         scene = (strategy, case.tool, case.target, case.obstacles, TABLE)
-                        found = measured(verification.make_task(*scene, plan, options.seed), case.name, options.rollouts, pool)
+                        found = measured(verification.make_task(Proposal(*scene, plan, options.seed)), case.name, options.rollouts, pool)
                     except MagicError as error:
                         print(f"{label} {error}")
                         continue

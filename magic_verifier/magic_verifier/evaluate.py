@@ -34,8 +34,10 @@ from magic_verifier import captured, placing, reliability
 from magic_verifier.cases import BASELINES, METHODS, SOURCES, TARGET_SETS, VARIANTS, Options, all_cases, evaluated, strategy_for
 from magic_verifier.feasibility import impossible
 from magic_verifier.floating import settled
+from magic_verifier.rates import wilson
+from magic_verifier.rollout import Limits
 from magic_verifier.subjects import Case, Meeting, met_at, scene_for, short_name, tool_object
-from magic_verifier.verification import Limits, Verdict, wilson
+from magic_verifier.verification import Verdict
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 #: How long planning for the arm may take (s of this process's processor: what else the machine does changes no result) and how many
@@ -320,7 +322,7 @@ def _try(
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
     from magic_planner.request import Problem
-    from magic_verifier.verification import verify
+    from magic_verifier.verification import Proposal, verify
 
     started = time.perf_counter()
     candidate, reflection = trial.candidate, trial.reflection
@@ -339,8 +341,8 @@ def _try(
     finally:
         answer["seconds"]["plan"] += time.perf_counter() - started
     limits = Limits(required_rate=options.required_rate)
-    asked = (strategy, tool, target, obstacles, table, candidate, plan)
-    verdict = verify(*asked, seed=options.seed, limits=limits, tried=answer["simulations"])
+    proposal = Proposal(strategy, tool, target, obstacles, table, plan, options.seed, limits=limits)
+    verdict = verify(proposal, tried=answer["simulations"])
     answer["seconds"]["verify"] += verdict.seconds
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}

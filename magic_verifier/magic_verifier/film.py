@@ -17,7 +17,7 @@ from magic_core.robot_pictures import RobotPictures
 from magic_core.scene import SceneObject
 from magic_verifier.articulation import panda
 from magic_verifier.floating import TARGET, TOOL
-from magic_verifier.verification import Recording
+from magic_verifier.rollout import Recording
 
 TOOL_COLOR = (222, 150, 62)
 TARGET_COLOR = (72, 126, 196)

@@ -36,9 +36,11 @@ from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy, find
 from magic_core.views import find_view
 from magic_verifier import uncertainty
+from magic_verifier.rates import fewest, wilson
+from magic_verifier.rollout import Limits
 from magic_verifier.simulation import Settings
 from magic_verifier.uncertainty import Uncertainty
-from magic_verifier.verification import Limits, fewest, verify, wilson
+from magic_verifier.verification import Proposal, verify
 
 Array = NDArray[np.float64]
 NAME = "PullCubeTool-v1"
@@ -413,11 +415,21 @@ class Solver:
             command_period=given.step,
             effort=given.effort,
         )
-        verdict = verify(
-            strategy, given.tool, given.target, (), given.table, candidate, plan,
-            seed=seed, settings=given.settings, spreads=self.spreads, limits=LIMITS, arm_options=hand, robot=self.arm, tried=simulated,
-            repetitions=fewest(LIMITS.required_rate, simulated),
-        )  # fmt: skip
+        proposal = Proposal(
+            strategy,
+            given.tool,
+            given.target,
+            (),
+            given.table,
+            plan,
+            seed,
+            settings=given.settings,
+            spreads=self.spreads,
+            limits=LIMITS,
+            arm_options=hand,
+            robot=self.arm,
+        )
+        verdict = verify(proposal, repetitions=fewest(LIMITS.required_rate, simulated), tried=simulated)
         what = {
             "code": verdict.code.name,
             "message": verdict.message,

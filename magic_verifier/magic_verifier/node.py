@@ -13,7 +13,6 @@ from sensor_msgs.msg import Image
 
 from magic_core import conversions as convert
 from magic_core import strategy as strategies
-from magic_core.contact import ContactCandidate
 from magic_core.content import digest
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, check_solid
@@ -28,7 +27,7 @@ from magic_verifier import motion_check, parameters
 from magic_verifier.articulation import Articulation
 from magic_verifier.parameters import MAX_REPETITIONS
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
-from magic_verifier.verification import Verdict, verify
+from magic_verifier.verification import Proposal, Verdict, verify
 from magic_verifier.workers import Workers
 
 NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
@@ -40,21 +39,20 @@ UNJUDGED = (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEG
 
 @dataclass(frozen=True)
 class _Asked:
-    """What a goal asks: a plan of a strategy with tool and target among obstacles on a table (4,), and the contact that it is for, if that was told."""
+    """What a goal asks: a plan of a strategy with tool and target among obstacles on a table (4,)."""
 
     strategy: Strategy
     tool: SceneObject
     target: SceneObject
     obstacles: tuple[SceneObject, ...]
     table: NDArray[np.float64]
-    candidate: ContactCandidate | None
     plan: MotionPlan
 
     def mark(self, goal: VerifyMotion.Goal) -> bytes:
         """The same for goals whose verdicts are the same."""
         # What obstacles look like is in the film alone.
         simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in self.obstacles)
-        plan = self.candidate, self.plan, goal.repetitions, goal.seed, goal.tried
+        plan = self.plan, goal.repetitions, goal.seed, goal.tried
         return digest((goal.strategy, self.tool, self.target, simulated, self.table, *plan))
 
 
@@ -128,23 +126,24 @@ class VerifierNode(Node):
         if goal.want_film and self._last is not None and mark == self._last[0]:
             return self._with_film(self._last[1], asked)
         verdict = verify(
-            asked.strategy,
-            asked.tool,
-            asked.target,
-            asked.obstacles,
-            asked.table,
-            asked.candidate,
-            asked.plan,
-            seed=int(goal.seed),
+            Proposal(
+                asked.strategy,
+                asked.tool,
+                asked.target,
+                asked.obstacles,
+                asked.table,
+                asked.plan,
+                seed=int(goal.seed),
+                settings=given.settings[asked.plan.variant],
+                spreads=given.spreads,
+                limits=given.limits,
+                arm_options=given.arm,
+                robot=self._robot,
+            ),
             repetitions=int(goal.repetitions) or given.rollouts,
             deadline=started + (goal.timeout or given.timeout),
             cancel=lambda: handle.is_cancel_requested,
             progress=_Feedback(handle, started),
-            settings=given.settings[asked.plan.variant],
-            spreads=given.spreads,
-            limits=given.limits,
-            arm_options=given.arm,
-            robot=self._robot,
             pool=self._pool.executor,
             workers=self._pool.count,
             tried=int(goal.tried),
@@ -175,8 +174,7 @@ class VerifierNode(Node):
         table = convert.plane_from_msg(goal.table)
         plan = convert.plan_from_msg(goal.plan)
         motion_check.check_trajectory(goal.plan.tool_trajectory, tool.id, plan.tool_motion)
-        candidate = convert.candidate_from_msg(goal.candidate) if goal.candidate.tool_id else None
-        return _Asked(strategy, tool, target, obstacles, table, candidate, plan)
+        return _Asked(strategy, tool, target, obstacles, table, plan)
 
     def _with_film(self, verdict: Verdict, asked: _Asked) -> tuple[Verdict, Image]:
         if verdict.recording is None or verdict.code == Code.CANCELED:

@@ -10,8 +10,9 @@ from rclpy.node import Node
 from magic_core.node import parameter
 from magic_verifier import uncertainty
 from magic_verifier.articulation import ArmOptions
+from magic_verifier.rollout import Limits
 from magic_verifier.simulation import Settings
-from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits
+from magic_verifier.verification import DEFAULTS, ROLLOUTS
 
 #: More repetitions than this in one goal are refused.
 MAX_REPETITIONS = 1000

@@ -49,7 +49,7 @@ def points(judged: Sequence[Judged]) -> list[tuple[float, float, int]]:
 
 def table(judged: Sequence[Judged]) -> str:
     """The rows as lines of text, the intervals 95 %, the highest bounds first."""
-    from magic_verifier.verification import wilson
+    from magic_verifier.rates import wilson
 
     lines = [f"{'lower bound of the success rate':<34}{'motions':>8}{'truly succeed':>15}"]
     for row in reversed(rows(judged)):

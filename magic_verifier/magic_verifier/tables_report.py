@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from magic_verifier.evaluate import truths
-from magic_verifier.verification import wilson
+from magic_verifier.rates import wilson
 
 #: Pictures of successes and of failures on the page, for each table, and their width in pixels.
 PICTURES, PICTURE_WIDTH = 12, 420

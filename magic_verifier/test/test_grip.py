@@ -12,8 +12,8 @@ from magic_verifier.arm_simulation import ArmRun
 from magic_verifier.articulation import ArmOptions
 from magic_verifier.floating import make_setup
 from magic_verifier.grip import LEAST, Grip, Patch, patch_of
+from magic_verifier.rollout import Limits
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, usable_pieces
-from magic_verifier.verification import Limits
 
 FORCE, FRICTION = 40.0, 0.8
 PATCH = Patch(np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]]), 0.006, (0.008, 0.006))

@@ -11,20 +11,23 @@ import yaml
 
 from magic_core import shapes, transforms
 from magic_core.errors import Code, MagicError
-from magic_verifier import uncertainty, verification
+from magic_verifier import rates, uncertainty, verification
 from magic_verifier.floating import TABLE, Body, FloatingRun, lifted_onto_table, make_setup
 from magic_verifier.floating import speed as fastest
 from magic_verifier.goals import Judgement
+from magic_verifier.rates import decided, fewest, passes, wilson
+from magic_verifier.rollout import Limits, Task, rollout, standing
 from magic_verifier.simulation import DYNAMIC, Probe, World, usable_pieces
 from magic_verifier.uncertainty import ShapeError, Spread
-from magic_verifier.verification import DEFAULTS, ROLLOUTS, Limits, decided, fewest, passes, verify, wilson
+from magic_verifier.verification import DEFAULTS, ROLLOUTS, Proposal, verify
 
 RNG = np.random.default_rng
 
 
 def verdict_of(scene, **options):
     strategy, tool, target, *obstacles, plan = scene
-    return verify(strategy, tool, target, tuple(obstacles), scenes.TABLE, None, plan, **options)
+    proposed = {name: options.pop(name) for name in ("seed", "settings", "spreads", "limits") if name in options}
+    return verify(Proposal(strategy, tool, target, tuple(obstacles), scenes.TABLE, plan, **proposed), **options)
 
 
 def test_a_good_motion_is_verified_with_its_interval():
@@ -66,7 +69,7 @@ def test_steps_are_longer_where_the_tool_is_slow():
         poses = [(transforms.make(translation=[-0.1 - 0.28 * k, 0, 0]), "goal", 0.28 / speed) for k in range(2)]
         plan = scenes.plan(poses)
         assert fastest(plan.tool_motion, Body("a", (np.eye(4, 3),), np.eye(4))) == pytest.approx(speed, rel=1e-6)
-        task = verification.make_task(strategy, tool, target, (), scenes.TABLE, plan)
+        task = verification.make_task(Proposal(strategy, tool, target, (), scenes.TABLE, plan))
         assert task.longer == longer
         assert task.under(task.drawn(1)).settings.frequency == pytest.approx(240 / longer)
     # About the middle of the box a corner at 0.1 m goes by 0.1 m for each radian, in steps by their chords.
@@ -138,7 +141,7 @@ def test_what_was_lost_with_a_process_is_computed_by_this_one():
     assert verdict_of(scene, repetitions=4, pool=Killed(), workers=1).runs == verdict_of(scene, repetitions=4).runs
 
 
-def probability(rate, most, required, z=verification.Z95):
+def probability(rate, most, required, z=rates.Z95):
     """How probable it is that a motion of that rate is verified, and how many rollouts that takes on average."""
     undecided, verified, looked = {1: rate}, 0.0, 1 - rate
     for count in range(2, most + 1):
@@ -168,11 +171,11 @@ def test_one_of_many_that_often_fail_is_not_verified_by_chance():
     alike, held = 1.0, 1.0
     for tried in range(8):
         alike *= 1 - probability(0.7, ROLLOUTS, required)[0]
-        held *= 1 - probability(0.7, ROLLOUTS, required, verification._z(tried))[0]
+        held *= 1 - probability(0.7, ROLLOUTS, required, rates.deviations(tried))[0]
     assert 1 - alike > 0.35 and 1 - held < 0.15
     # And of those that hardly ever fail any but the last is still verified.
-    assert probability(0.99, ROLLOUTS, required, verification._z(7))[0] > 0.9
-    assert verification._z(0) == verification.Z95 and verification.level(4) == pytest.approx(0.99)
+    assert probability(0.99, ROLLOUTS, required, rates.deviations(7))[0] > 0.9
+    assert rates.deviations(0) == rates.Z95 and rates.level(4) == pytest.approx(0.99)
 
 
 def test_intervals():
@@ -185,7 +188,7 @@ def test_intervals():
 
 @pytest.mark.parametrize(("required", "tried"), [(0.7, 0), (0.8, 0), (0.8, 3)])
 def test_with_the_fewest_rollouts_one_that_fails_is_a_no(required, tried):
-    most, z = fewest(required, tried), verification._z(tried)
+    most, z = fewest(required, tried), rates.deviations(tried)
     assert passes(most, most, required, z) and not passes(most - 1, most - 1, required, z)
     for done in range(1, most + 1):
         assert decided(done - 1, done, most, required, z) and not passes(done - 1, done, required, z)
@@ -249,7 +252,7 @@ def test_where_a_camera_saw_a_surface_it_is_known_best():
 
     def shifts(points):
         item = replace(off, points=points, colors=np.zeros((len(points), 3), np.uint8))
-        task = verification.make_task(strategy, item, target, tuple(obstacles), scenes.TABLE, plan)
+        task = verification.make_task(Proposal(strategy, item, target, tuple(obstacles), scenes.TABLE, plan))
         errors = [replace(task.drawn(k).tool_error, size=np.zeros(3), thickness=0.0) for k in range(1, 150)]
         moved = [error.applied(task.setup.tool, task.shares).corners - task.setup.tool.corners for error in errors]
         return np.sqrt(np.mean(np.square(moved), axis=(0, 2))), task.setup.tool.corners
@@ -326,7 +329,7 @@ def test_the_parameter_that_separates_is_named():
     setup = make_setup(tool, target, (), scenes.TABLE, strategy.physics, DEFAULTS["fg"])
     spreads = uncertainty.read()
     eyes = spreads.eyes(tool), spreads.eyes(target)
-    task = verification.Task(strategy, setup, plan, Limits(), 0, spreads, eyes)
+    task = Task(strategy, setup, plan, Limits(), 0, spreads, eyes)
     friction = [None, *(task.drawn(k).values(setup)["friction"] for k in range(1, 24))]
     order = sorted(friction[1:])
 
@@ -396,9 +399,9 @@ def test_no_obstacle_is_looked_at_where_what_the_tool_is_off_by_is_too_little(of
 
 def test_the_others_are_told_what_the_scene_as_given_shows():
     strategy, tool, target, pipe, plan = scenes.scooping()
-    task = verification.make_task(strategy, tool, target, (pipe,), scenes.TABLE, plan)
+    task = verification.make_task(Proposal(strategy, tool, target, (pipe,), scenes.TABLE, plan))
     told = []
-    first = verification.rollout(task, 0, begin=told.append)
+    first = rollout(task, 0, begin=told.append)
     assert [known.overlap for known in told] == [first.judgement.metrics["overlap"]] and task.overlap == np.inf
 
 
@@ -413,7 +416,7 @@ def test_a_drawn_tool_stands_as_it_was_seen_to_stand():
     for index in range(1, 7):
         drawn = uncertainty.draw(spreads, eyes, eyes, 5, index)
         shaped = drawn.tool_error.applied(seen)
-        stood = verification.standing(shaped, seen, drawn.tool_from_held, scenes.TABLE)
+        stood = standing(shaped, seen, drawn.tool_from_held, scenes.TABLE)
         np.testing.assert_allclose(stood.corners[:, :2], shaped.corners[:, :2], atol=1e-12)
         upper = seen.corners[:, 2] > 0.001
         np.testing.assert_allclose(stood.corners[upper], shaped.corners[upper], atol=1e-12)

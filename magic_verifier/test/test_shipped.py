@@ -17,11 +17,11 @@ from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
 from magic_planner.request import Problem
 from magic_planner.robot import Robot
-from magic_verifier import uncertainty, verification
+from magic_verifier import rollout, uncertainty, verification
 from magic_verifier.articulation import ArmOptions
 from magic_verifier.demonstration import replay
 from magic_verifier.film import film_strip
-from magic_verifier.verification import verify
+from magic_verifier.verification import Proposal, verify
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def planner():
 def test_the_floating_demonstration_passes_its_goal_test(name):
     strategy, tool, target, obstacles, candidate = demonstration(name)
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    verdict = verify(strategy, tool, target, obstacles, scenes.TABLE, candidate, MotionPlan("fg", motion))
+    verdict = verify(Proposal(strategy, tool, target, obstacles, scenes.TABLE, MotionPlan("fg", motion)))
     assert verdict.success, verdict.message
 
 
@@ -46,7 +46,7 @@ def test_the_arm_does_the_demonstrated_task(name, planner):
         plan = planner.plan(
             Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt), budget=Budget(30.0)
         )
-        verdicts.append(verify(strategy, tool, target, obstacles, scenes.TABLE, candidate, plan, repetitions=1))
+        verdicts.append(verify(Proposal(strategy, tool, target, obstacles, scenes.TABLE, plan), repetitions=1))
         if verdicts[-1].success:
             break
     assert verdicts[-1].success, [v.message for v in verdicts]
@@ -60,17 +60,17 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
     plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
-    scene = (strategy, tool, target, obstacles, scenes.TABLE, candidate)
-    first, again = verify(*scene, plan, repetitions=1), verify(*scene, plan, repetitions=1)
+    scene = (strategy, tool, target, obstacles, scenes.TABLE)
+    first, again = verify(Proposal(*scene, plan), repetitions=1), verify(Proposal(*scene, plan), repetitions=1)
     assert np.array_equal(first.recording.joints, again.recording.joints)
     assert np.array_equal(first.recording.poses["target"], again.recording.poses["target"])
 
-    weak = verify(*scene, plan, repetitions=1, arm_options=ArmOptions(grip_force=0.3))
+    weak = verify(Proposal(*scene, plan, arm_options=ArmOptions(grip_force=0.3)), repetitions=1)
     assert weak.code == Code.GRASP_SLIPPED, weak.message
-    soft = verify(*scene, plan, repetitions=1, arm_options=ArmOptions(stiffness=(20.0,) * 7, damping=(200.0,) * 7))
+    soft = verify(Proposal(*scene, plan, arm_options=ArmOptions(stiffness=(20.0,) * 7, damping=(200.0,) * 7)), repetitions=1)
     assert soft.code == Code.LIMIT_EXCEEDED, soft.message
     away = replace(tool, world_from_object=transforms.make(translation=[0, 0.12, 0]) @ tool.world_from_object)
-    missed = verify(strategy, away, *scene[2:], plan)
+    missed = verify(Proposal(strategy, away, *scene[2:], plan))
     assert missed.code in (Code.GRASP_SLIPPED, Code.LIMIT_EXCEEDED, Code.PRE_CONTACT_COLLISION), missed.message
 
     film = film_strip(first.recording, tool, target, obstacles, scenes.TABLE, frames=2, columns=2, size=(160, 120))
@@ -89,7 +89,7 @@ def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
     plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
     # 4 g pull 0.2 kg, whose friction is a hundredth of what the pads hold: the load is that of the motion, as with heavier tools.
     light = replace(strategy, physics=replace(strategy.physics, tool_density=40.0, target_density=3000.0))
-    verdict = verify(light, tool, target, obstacles, scenes.TABLE, candidate, plan, repetitions=1)
+    verdict = verify(Proposal(light, tool, target, obstacles, scenes.TABLE, plan), repetitions=1)
     assert verdict.success and verdict.metrics["grip_load"] < 0.5, (verdict.message, verdict.metrics)
 
 
@@ -99,18 +99,18 @@ def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
     plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
 
     def drawn_rollout(item):
-        task = verification.make_task(strategy, item, target, obstacles, scenes.TABLE, plan)
-        task = verification.from_held(task, verification.rollout(task, 0, record=False).held)
-        return verification.rollout(task, 1, record=False)
+        task = verification.make_task(Proposal(strategy, item, target, obstacles, scenes.TABLE, plan))
+        task = rollout.from_held(task, rollout.rollout(task, 0, record=False).held)
+        return rollout.rollout(task, 1, record=False)
 
     seen = replace(tool, source="camera", confidence=1.0, seen_share=1.0)
     known, again = drawn_rollout(tool), drawn_rollout(seen)
     assert known.judgement.code == again.judgement.code == Code.OK, again.judgement.message
-    grasp = verification.BEFORE_GRASP + verification.AFTER_GRASP
+    grasp = rollout.BEFORE_GRASP + rollout.AFTER_GRASP
     assert grasp < again.simulated - known.simulated < grasp + 1.5, "the fingers close as well"
 
     # Fingers turn what lies askew until it is nearly along them, and it goes on as they have it; a height is not theirs to mend.
-    drawing, begin, begun = uncertainty.draw, verification._arm_run, []
+    drawing, begin, begun = uncertainty.draw, rollout._arm_run, []
 
     def begins(task, *given):
         begun.append((task.held, begin(task, *given)))
@@ -118,7 +118,7 @@ def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
 
     up = tool.world_from_object[:3, :3].T @ [0.0, 0.0, 1.0]
     askew = transforms.from_rotvec(0.2 * up, 0.002 * up)
-    monkeypatch.setattr(verification, "_arm_run", begins)
+    monkeypatch.setattr(rollout, "_arm_run", begins)
     monkeypatch.setattr(uncertainty, "draw", lambda *given: replace(drawing(*given), tool_from_held=askew))
     drawn_rollout(seen)
     held, run = begun[-1]

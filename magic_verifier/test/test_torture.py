@@ -16,15 +16,15 @@ from magic_core.strategy import Physics
 from magic_verifier import posing
 from magic_verifier.floating import settled
 from magic_verifier.simulation import MAX_PIECES, usable_pieces
-from magic_verifier.verification import verify
+from magic_verifier.verification import Proposal, verify
 
 
 def hook(tool=None, target=None, obstacles=()):
     """The verdict on the pull of an L hook with some of its scene exchanged, and the seconds of CPU time it took."""
     strategy, own_tool, own_target, motion = scenes.hooking("L")
     started = time.process_time()
-    given = strategy, tool or own_tool, target or own_target, obstacles, scenes.TABLE, None, motion
-    verdict = verify(*given, repetitions=1, deadline=time.monotonic() + 20.0)
+    given = strategy, tool or own_tool, target or own_target, obstacles, scenes.TABLE, motion
+    verdict = verify(Proposal(*given), repetitions=1, deadline=time.monotonic() + 20.0)
     return verdict, time.process_time() - started
 
 

@@ -12,13 +12,15 @@ from magic_core import transforms
 from magic_core.errors import Code
 from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, ToolMotion
+from magic_verifier.rollout import Limits
 from magic_verifier.simulation import Settings
-from magic_verifier.verification import Limits, verify
+from magic_verifier.verification import Proposal, verify
 
 
 def judge(strategy, tool, target, motion, obstacles=(), **options):
     """The scene as given alone, unless told otherwise: what a goal test says does not hang on what is drawn."""
-    return verify(strategy, tool, target, obstacles, scenes.TABLE, None, motion, **{"repetitions": 1, **options})
+    proposed = {name: options.pop(name) for name in ("seed", "settings", "limits") if name in options}
+    return verify(Proposal(strategy, tool, target, obstacles, scenes.TABLE, motion, **proposed), **{"repetitions": 1, **options})
 
 
 @pytest.mark.parametrize("radius", [0.015, 0.025, 0.035])

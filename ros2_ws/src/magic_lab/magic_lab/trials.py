@@ -30,7 +30,7 @@ from magic_core.errors import Code, MagicError
 from magic_lab.judge import Track, judge, loop_in_sight, middle, nearest
 from magic_lab.scenarios import SCENARIOS, Scenario, Scene, case_of, draw, scenario_of
 from magic_server.pipeline import split_metrics
-from magic_verifier.verification import wilson
+from magic_verifier.rates import wilson
 
 Image = NDArray[np.uint8]
 
