@@ -363,58 +363,12 @@ class Solver:
     def _try(
         self, strategy: Strategy, given: Episode, trial: Any, seed: int, simulated: int
     ) -> tuple[MotionPlan | None, Code, dict[str, Any]]:
-        from magic_planner.budget import Budget
-        from magic_planner.giving_way import GAP_IN_HAND
-        from magic_planner.grasps import GraspSettings
-        from magic_planner.object_motion import plan_tool_motion
-        from magic_planner.request import Problem
-        from magic_verifier.articulation import SOFTLY, ArmOptions
-
-        candidate, reflection = trial.candidate, trial.reflection
         started = time.process_time()
         try:
-            motion = plan_tool_motion(strategy, given.tool, given.target, candidate, reflection, given.table, (), GAP_IN_HAND)
-            friction = (given.finger_friction + given.friction) / 2
-            grasping = GraspSettings(grip_force=GRIP_SHARE * given.grip_force, friction=friction, density=given.tool_density, away=AWAY)
-            problem = Problem(
-                strategy,
-                given.tool,
-                given.target,
-                candidate,
-                reflection,
-                hastened(motion),
-                given.table,
-                start=given.joints,
-                attempt=trial.attempt,
-                seed=seed,
-            )
-            plan = None
-            for planner in self.planners:
-                planner.grasping = grasping
-                try:
-                    plan = planner.plan(problem, Budget(PLANNING_TIME, clock=time.process_time))
-                    break
-                except MagicError as error:
-                    if error.code != Code.PATH_IN_COLLISION or planner is self.planners[-1]:
-                        raise
-            plan, end = unhurried(plan, strategy, given)
+            plan, end = unhurried(self._planned(strategy, given, trial, seed), strategy, given)
         except MagicError as error:
             return None, error.code, {"code": error.code.name, "message": error.message, "plan_seconds": time.process_time() - started}
         planned = time.process_time() - started
-        stiffness, damping, grip_stiffness, grip_damping = given.gains
-        hand = ArmOptions(
-            stiffness=(stiffness,),
-            damping=(damping,),
-            armature=0.0,
-            grip_force=given.grip_force,
-            finger_stiffness=grip_stiffness,
-            closing_speed=SOFTLY / grip_damping,  # closing, so much force against the drive's damping
-            finger_friction=given.finger_friction,
-            finger_armature=0.0,
-            past=PAST,
-            command_period=given.step,
-            effort=given.effort,
-        )
         proposal = Proposal(
             strategy,
             given.tool,
@@ -426,7 +380,7 @@ class Solver:
             settings=given.settings,
             spreads=self.spreads,
             limits=LIMITS,
-            arm_options=hand,
+            arm_options=hand(given),
             robot=self.arm,
         )
         verdict = verify(proposal, repetitions=fewest(LIMITS.required_rate, simulated), tried=simulated)
@@ -439,6 +393,50 @@ class Solver:
         }
         what |= {"plan_seconds": planned, "verify_seconds": verdict.seconds}
         return (plan if verdict.success else None), verdict.code, what
+
+    def _planned(self, strategy: Strategy, given: Episode, trial: Any, seed: int) -> MotionPlan:
+        """The arm's plan as quick as its limits let it be, with the first lift that nothing is in the way of."""
+        from magic_planner.budget import Budget
+        from magic_planner.giving_way import GAP_IN_HAND
+        from magic_planner.grasps import GraspSettings
+        from magic_planner.object_motion import plan_tool_motion
+        from magic_planner.request import Problem
+
+        scene = given.tool, given.target, trial.candidate, trial.reflection
+        motion = plan_tool_motion(strategy, *scene, given.table, (), GAP_IN_HAND)
+        problem = Problem(strategy, *scene, hastened(motion), given.table, start=given.joints, attempt=trial.attempt, seed=seed)
+        friction = (given.finger_friction + given.friction) / 2
+        grasping = GraspSettings(grip_force=GRIP_SHARE * given.grip_force, friction=friction, density=given.tool_density, away=AWAY)
+        *lower, highest = self.planners
+        for planner in lower:
+            planner.grasping = grasping
+            try:
+                return planner.plan(problem, Budget(PLANNING_TIME, clock=time.process_time))
+            except MagicError as error:
+                if error.code != Code.PATH_IN_COLLISION:
+                    raise
+        highest.grasping = grasping
+        return highest.plan(problem, Budget(PLANNING_TIME, clock=time.process_time))
+
+
+def hand(given: Episode) -> Any:
+    """The controller of the environment's arm and hand, as the verifier drives them (:class:`magic_verifier.articulation.ArmOptions`)."""
+    from magic_verifier.articulation import SOFTLY, ArmOptions
+
+    stiffness, damping, grip_stiffness, grip_damping = given.gains
+    return ArmOptions(
+        stiffness=(stiffness,),
+        damping=(damping,),
+        armature=0.0,
+        grip_force=given.grip_force,
+        finger_stiffness=grip_stiffness,
+        closing_speed=SOFTLY / grip_damping,  # closing, so much force against the drive's damping
+        finger_friction=given.finger_friction,
+        finger_armature=0.0,
+        past=PAST,
+        command_period=given.step,
+        effort=given.effort,
+    )
 
 
 def spreads() -> Uncertainty:
