@@ -253,13 +253,17 @@ def _side_edges(
     distance = max(float(np.linalg.norm(away)), 1e-6)
     away = away / distance
     across = np.array([away[1], -away[0]])
+    radii = body.radius(levels)
+    # Of what opens upwards a wider level above is seen before the side of a lower one.
+    nearer = (levels - levels[:, None]) * distance / max(float(sight.eye[2] - levels[-1]), 1e-6)
+    before = np.where(nearer >= 0, np.sqrt(np.maximum(radii**2 - nearer**2, 0)), 0).max(axis=1) - radii
     found = []
     for sign in (-1, 1):
-        rho = body.radius(levels)[:, None] + steps
+        rho = radii[:, None] + steps
         sine = np.clip(rho / distance, 0, 0.9)
         tangent = body.axis + rho[..., None] * (-sine[..., None] * away + sign * np.sqrt(1 - sine**2)[..., None] * across)
         inside, blind, _, _ = sight.sample(np.concatenate([tangent, np.broadcast_to(levels[:, None, None], (*rho.shape, 1))], axis=2))
-        edge = crossing(inside, steps)
+        edge = crossing(inside, steps) - before
         edge[blind.any(axis=1) | ~inner] = np.nan
         found.append(edge)
     middle = np.nanmedian(np.concatenate(found)) if np.isfinite(np.concatenate(found)).any() else 0.0

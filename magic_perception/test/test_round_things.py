@@ -211,6 +211,12 @@ def test_a_scoop_is_hollow_also_where_its_near_wall_hides_it(family, seed, yaw, 
     assert np.sqrt(np.mean(off)) < least, np.sqrt(np.mean(off))
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_a_bowl_that_opens_wide_the_rim_is_not_taken_for_the_side_below(seed):
+    item, _ = seen(scenes.placed(bowl(0.08, 0.045, 0.038), 0.55, 0.02).painted((70, 90, 160)), ("left", "right"), seed)
+    assert item.mesh.extents == pytest.approx([0.16, 0.16, 0.038], abs=0.002)
+
+
 @pytest.mark.parametrize(("deep", "half"), [(0.02, 0.04), (0.012, 0.03), (0.008, 0.025)])
 def test_the_pieces_of_a_bowl_do_not_fill_its_hollow(deep, half):
     bowl = scoops.Bowl(transforms.make(translation=[0, 0, deep + 0.004]), np.array([half, half]), deep * (1 - scoops.RINGS**2), 0.002)
