@@ -7,12 +7,13 @@ velocity, disturbed as a hand disturbs it) and corrected by what the frame shows
 * where the model should be seen and the camera looks through to what is behind, the model's point is moved to the nearest pixel
   that is not background: a flat tool that slides in its own plane is held by its outline;
 * the outline is moved to where the colours change from the tool's own to those of what is about it, which depth, smeared past every edge,
-  does not show.  The tool's colours are those of the pixels in which it lies first; those of what is about it are learned while it moves.
+  does not show (:mod:`magic_perception.tool_colors`).
 
-What is nearer to the camera than the model hides it and says nothing: that is the hand, and whatever else comes between.  Points of
-the hand that touch the tool are told by their colour, where the tool has another, and by a loss that gives up what is far (Geman and
-McClure).  Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  An extended
-Kalman filter on SE(3) with velocities goes forward, a Rauch-Tung-Striebel smoother back.
+What is nearer to the camera than the model hides it and says nothing: that is the hand, and whatever else comes between.  What touches
+the tool, the hand or the target, is no nearer than it: there its colour tells it, where the tool has another, and it hides the tool as
+well unless it is seen to be behind.  What else is of the tool's colour is given up by a loss for what is far (Geman and McClure).
+Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  An extended Kalman
+filter on SE(3) with velocities goes forward, a Rauch-Tung-Striebel smoother back.
 
 The track is lost, and refused, where too much of the model is looked through, or where what is seen leaves it as uncertain as
 :data:`UNSURE`.
@@ -28,13 +29,13 @@ import cv2
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_perception.tool_colors import Said, ToolColors, lab
 
 Array = NDArray[np.float64]
 #: Spectral densities of a hand's accelerations: m^2/s^3 and rad^2/s^3.  It takes up 0.5 m/s and 3 rad/s within a quarter of a second.
@@ -48,6 +49,8 @@ START = (0.004, 0.03, 0.01, 0.05)
 NOISE, OUTLINE, WORTH = 0.004, 0.005, 60.0
 #: Points farther from the surface than this are not the tool's (m): when the search begins, and when it ends.
 REACH, CLOSE = 0.030, 0.010
+#: ... and where it begins from where the tool is expected: what lies farther off is mostly another thing, even of the tool's own colour.
+EXPECTED = 0.015
 ROUNDS = 16
 #: The farthest that the search goes in a round: m, rad.
 STRIDE = (0.02, np.deg2rad(12.0))
@@ -63,16 +66,10 @@ BEHIND, HIDES = 0.012, 0.005
 TABLE = 0.004
 #: How far from the outline a point that is looked through may be (pixels).
 ASTRAY = 25
-#: Colours are told apart by L*, a* and b* in bins of so many units (of 256), blurred by as many bins as the light on a surface changes them;
-#: a colour that the tool has not shown is its own with this share of an even chance.
-BIN, BLUR, STRANGE = (16, 4, 4), (2.0, 1.5, 1.5), 0.02
-SHAPE = tuple(256 // size for size in BIN)
-EVEN = 1 / math.prod(SHAPE)
-#: Evidence of a pixel at most (natural logarithm of the ratio of likelihoods); pixels are not independent, and count as this share of it.
-EVIDENCE, SHARED = 3.0, 0.3
-#: What is about the tool in a picture, from half of BESIDE to AROUND pixels from its outline, is background; its colours are learned at the
-#: first of these rates, those of what has come nearer to a camera, anywhere in its picture, at the second.
-BESIDE, AROUND, LEARNING = 7, 20, (0.1, 0.3)
+#: What is about the tool in a picture, from half of BESIDE to AROUND pixels from its outline, is background.
+BESIDE, AROUND = 7, 20
+#: A pixel counts as this share of one that is independent of its neighbours.
+SHARED = 0.3
 #: So far (pixels) the outline is sought by its colours to either side, first and last; at so many places; standard deviation (pixels) of
 #: one that is found sharply, and so many places count as independent.
 SOUGHT, PLACES, SHARP, LINES = (6, 3), 120, 0.8, 40.0
@@ -147,12 +144,13 @@ def _predicted(state: _State, middle: Array, step: float) -> tuple[_State, Array
 class Follower:
     """One tool's mesh, ready to be found in frames.
 
-    mesh: closed, in its own frame; world_from_tool (4, 4) where it lies; table (4,): plane with its unit normal up.
+    mesh: closed, in its own frame; world_from_tool (4, 4) where it lies; table (4,): plane with its unit normal up; others: what else is
+    there at first, in the world.
     """
 
-    def __init__(self, mesh: Mesh, world_from_tool: Array, table: Array, seed: int = 0) -> None:
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    def __init__(self, mesh: Mesh, world_from_tool: Array, table: Array, others: Sequence[Mesh] = (), seed: int = 0) -> None:
+        self._scene = _raycaster(mesh)
+        self._others = tuple(others)
         sampled = mesh.to_trimesh()
         rng = np.random.default_rng(seed)
         corners = np.asarray(sampled.triangles)
@@ -165,7 +163,7 @@ class Follower:
         self._radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
         self._table = np.asarray(table, dtype=float)
         self._lying = np.asarray(world_from_tool, dtype=float)
-        self._own = self._ground = self._moving = np.full(SHAPE, EVEN)
+        self.colors = ToolColors()
         self._before: dict[str, RgbdFrame] = {}
         self._rng = rng
 
@@ -179,11 +177,12 @@ class Follower:
             if view is None:
                 continue
             self._before[frame.camera] = frame
-            colors, (inside, outside) = _lab(frame), self._sides(frame, view)
+            colors, (inside, outside) = lab(frame), self._sides(frame, view)
             own.append(colors[inside & np.isfinite(frame.depth)])
             ground.append(colors[outside])
         if sum(map(len, own)) >= FEWEST:
-            self._own, self._ground = _histogram(np.concatenate(own)), _histogram(np.concatenate(ground))
+            others = [np.concatenate([lab(frame)[_shown(frame, mesh)] for frame in frames]) for mesh in self._others]
+            self.colors.learn(np.concatenate(own), np.concatenate(ground), [colors for colors in others if len(colors) >= FEWEST])
 
     def see_around(self, frames: Sequence[RgbdFrame], pose: Array) -> None:
         """Take the colours of what is not the tool now: of other ground about it, and of what has come into the pictures, the hand."""
@@ -191,13 +190,13 @@ class Follower:
             view = self._drawn(frame, pose)
             if view is None:
                 continue
-            colors, (_, outside) = _lab(frame), self._sides(frame, view)
+            colors, (_, outside) = lab(frame), self._sides(frame, view)
             about = colors[view.rows, view.columns][outside[view.rows, view.columns]]
             if len(about) >= FEWEST:
-                self._ground = (1 - LEARNING[0]) * self._ground + LEARNING[0] * _histogram(about)
+                self.colors.see_ground(about)
             come = colors[self._come(frame) & outside]
             if len(come) >= FEWEST:
-                self._moving = (1 - LEARNING[1]) * self._moving + LEARNING[1] * _histogram(come)
+                self.colors.see_moving(come)
 
     def _sides(self, frame: RgbdFrame, view: _View) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Pixels (H, W) of the drawn tool, and those surely beside it."""
@@ -216,13 +215,6 @@ class Follower:
             return np.zeros(frame.depth.shape, bool)
         with np.errstate(invalid="ignore"):
             return frame.depth < before.depth - 2 * BEHIND
-
-    def evidence(self, frame: RgbdFrame) -> NDArray[np.float32]:
-        """For each pixel the logarithm of how much likelier its colour is the tool's than that of anything else, (H, W)."""
-        own = self._own + STRANGE * EVEN
-        other = 0.4 * self._ground + 0.4 * self._moving + 0.2 * EVEN
-        bins = tuple(np.moveaxis(_lab(frame) // BIN, -1, 0))
-        return np.clip(np.log(own / other), -EVIDENCE, EVIDENCE).astype(np.float32)[bins]
 
     def _drawn(self, frame: RgbdFrame, pose: Array) -> _View | None:
         """The tool as a camera would see it alone at a pose, with AROUND pixels about it; None where it is outside the picture."""
@@ -318,7 +310,7 @@ class Follower:
         on, through, hidden = (int(count) for count in counts)
         return on, through, hidden
 
-    def _outlined(self, frame: RgbdFrame, pose: Array, evidence: NDArray[np.float32], sought: int) -> tuple[Array, Array]:
+    def _outlined(self, frame: RgbdFrame, pose: Array, colors: Said, sought: int) -> tuple[Array, Array]:
         """What the colours of a frame say at a pose, as :meth:`_information`: the outline is moved to where they change.
 
         Along the normal of each place of the drawn outline the tool's profile (inside, outside, and inside again behind a slit) is shifted
@@ -331,9 +323,9 @@ class Follower:
             return matrix, vector
         seen = frame.depth[view.rows, view.columns]
         nearest = cv2.erode(np.where(view.mask, view.depth, 1e3).astype(np.float32), np.ones((2 * sought + 1,) * 2))
-        said = evidence[view.rows, view.columns]
-        # What lies on the tool hides it as well, and is told from it by its colour.
-        hidden = (seen < nearest - BEHIND) | ((seen < nearest - HIDES) & (said < 0))
+        said, touches = colors.tool[view.rows, view.columns], colors.touches[view.rows, view.columns]
+        # What lies on the tool, or touches it, hides it as well, and is told from it by its colour.
+        hidden = (seen < nearest - BEHIND) | ((seen < nearest - HIDES) & (said < 0)) | (touches & ~(seen > nearest + BEHIND))
         said = np.where(hidden, 0, said).astype(np.float32)
         soft = cv2.GaussianBlur(view.mask.astype(np.float32), (0, 0), 1.5)
         slope = np.stack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)], axis=-1)
@@ -350,11 +342,11 @@ class Follower:
         u = (columns[:, None] + along * normal[:, :1]).astype(np.float32)
         v = (rows[:, None] + along * normal[:, 1:]).astype(np.float32)
         profile = 2 * cv2.remap(view.mask.astype(np.float32), u, v, cv2.INTER_LINEAR, borderValue=0) - 1
-        colors = cv2.remap(said, u, v, cv2.INTER_LINEAR, borderValue=0)
+        evidence = cv2.remap(said, u, v, cv2.INTER_LINEAR, borderValue=0)
         shifts = np.arange(-sought, sought + 1)
         middle = slice(sought, 3 * sought + 1)
         # The profile shifted by d, where it is known for all d.
-        score = np.stack([(profile[:, sought - d : 3 * sought + 1 - d] * colors[:, middle]).sum(axis=1) for d in shifts], axis=1)
+        score = np.stack([(profile[:, sought - d : 3 * sought + 1 - d] * evidence[:, middle]).sum(axis=1) for d in shifts], axis=1)
         weight = np.exp(SHARED * (score - score.max(axis=1, keepdims=True)))
         weight /= weight.sum(axis=1, keepdims=True)
         shift = weight @ shifts
@@ -418,15 +410,15 @@ class Follower:
         measured, colors = [], []
         for frame in frames:
             points, pixels = self._measured(frame, state.pose)
-            colors.append(self.evidence(frame))
-            own = colors[-1][pixels[:, 1], pixels[:, 0]] > 0
+            colors.append(self.colors.said(frame))
+            own = colors[-1].tool[pixels[:, 1], pixels[:, 0]] > 0
             if len(points) > USED:
                 chosen = self._rng.choice(len(points), USED, replace=False)
                 points, own = points[chosen], own[chosen]
             measured.append((points, own))
         best, least = None, 1.0
         # A hand that stops or turns is not where it was going: then from where the tool was, and from farther off.
-        for start, reach in ((state.pose, REACH), (before, REACH), (state.pose, FAR), (before, FAR)):
+        for start, reach in ((state.pose, EXPECTED), (before, REACH), (state.pose, FAR), (before, FAR)):
             fitted = self._fitted(frames, measured, colors, state, start, reach)
             on, through, _ = self.looked_at(frames, fitted.pose)
             share = through / max(on + through, 1)
@@ -443,7 +435,7 @@ class Follower:
         self,
         frames: Sequence[RgbdFrame],
         measured: list[tuple[Array, NDArray[np.bool_]]],
-        colors: list[NDArray[np.float32]],
+        colors: list[Said],
         state: _State,
         start: Array,
         far: float,
@@ -477,15 +469,21 @@ def _add(matrix: Array, vector: Array, jacobian: Array, residual: Array, noise: 
     return matrix + (jacobian * weight[:, None]).T @ jacobian, vector + (jacobian * weight[:, None]).T @ residual
 
 
-def _lab(frame: RgbdFrame) -> NDArray[np.uint8]:
-    return cv2.cvtColor(frame.color, cv2.COLOR_RGB2LAB)
+def _raycaster(mesh: Mesh) -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    return scene
 
 
-def _histogram(colors: NDArray[np.uint8]) -> Array:
-    """How often colours (N, 3) come, as shares of 1, in bins and blurred."""
-    counts = np.zeros(SHAPE)
-    np.add.at(counts, tuple((colors // BIN).T), 1.0)
-    return gaussian_filter(counts / max(len(colors), 1), BLUR)
+def _shown(frame: RgbdFrame, mesh: Mesh) -> NDArray[np.bool_]:
+    """Pixels (H, W), but for those at its edge, in which a thing is seen where it is in the world."""
+    v, u = np.indices(frame.depth.shape)
+    k = frame.intrinsics
+    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(u.shape)], axis=-1) @ frame.world_from_camera[:3, :3].T
+    rays = np.concatenate([np.broadcast_to(frame.world_from_camera[:3, 3], rays.shape), rays], axis=-1)
+    depth = _raycaster(mesh).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+    seen = np.isfinite(depth) & (np.abs(depth - frame.depth) < BEHIND)
+    return cv2.erode(seen.astype(np.uint8), np.ones((3, 3))) > 0
 
 
 def _crop(pixels: NDArray[np.int64], shape: tuple[int, ...], margin: int) -> tuple[int, int, int, int]:
@@ -505,12 +503,13 @@ def _plane_depth(frame: RgbdFrame, plane: Array, crop: tuple[int, int, int, int]
     return np.where(depth > 0, depth, np.inf)
 
 
-def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame]) -> Followed:
-    """The tool's track through frames in the order of their stamps, of the first of which it is known that it lies at ``world_from_tool``.
+def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame], others: Sequence[Mesh] = ()) -> Followed:
+    """The tool's track through frames in the order of their stamps, of the first of which it is known that it lies at ``world_from_tool``;
+    others: what else is there then, in the world.
 
     Raises BAD_MOTION where it is lost, with the moment and what was seen; NO_FRAMES without two frames.
     """
-    follower = Follower(mesh, world_from_tool, table)
+    follower = Follower(mesh, world_from_tool, table, others)
     middle = follower.middle
     deviations = np.repeat(START, 3)
     state = _State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(deviations**2))

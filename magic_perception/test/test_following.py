@@ -87,7 +87,7 @@ def test_colours_tell_the_tool_from_the_ground_and_from_what_comes(hook):
     follower.learn_colors(frames[:1])
     for frame, pose in zip(frames[:6], poses[:6], strict=True):
         follower.see_around([frame], pose)
-    last, evidence = frames[5], follower.evidence(frames[5])
+    last, evidence = frames[5], follower.colors.said(frames[5]).tool
     alone, empty = (
         capture([], SMALL, STATION["left"], 0, camera="left", stamp=0.0, raycaster=scene_raycaster(meshes)).depth
         for meshes in ([hook.mesh.transformed(poses[5])], [])

@@ -220,11 +220,12 @@ def left_first(scene: Scene, frames: list[RgbdFrame]) -> str:
     raise MagicError(Code.BAD_MOTION, "the tool", "nothing leaves its place", "a tool that a hand takes while the cameras look, or --tool")
 
 
-def followed(bag: Recorded, world: str, tool: SceneObject, table: Array) -> tuple[Array, Array]:
+def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tuple[Array, Array]:
     """Times (T,) in seconds and world_from_tool (T, 4, 4), by nothing but pictures; raises BAD_MOTION where the tool is lost."""
     from magic_perception.following import follow
 
-    found = follow(tool.mesh, tool.world_from_object, table, every_frame(bag, world))
+    others = [item.mesh.transformed(item.world_from_object) for item in scene.objects if item.id != tool.id]
+    found = follow(tool.mesh, tool.world_from_object, scene.table, every_frame(bag, world), others)
     print(
         f"followed {tool.id} through {len(found.times)} moments, found in {found.seen}; known to {1000 * found.shift.max():.1f} mm and "
         f"{np.degrees(found.turn.max()):.1f} degrees or better"
@@ -510,7 +511,7 @@ def demonstrated(given: argparse.Namespace) -> Demonstration:
     if fixed and given.goal in ("hook", "scoop"):
         raise MagicError(Code.BAD_REQUEST, f"target of --goal {given.goal}", f"{target.id} is a known fixture", "a target that can move")
     if bare:
-        times, poses = followed(bag, given.world, tool, scene.table)
+        times, poses = followed(bag, given.world, tool, scene)
     # What is tracked is fixed to the tool, wherever on it.
     first, later = transforms.interpolate(times, poses, [seen])[0], times > seen
     times = np.concatenate([[seen], times[later]])
