@@ -25,12 +25,14 @@ TABLE, THING, HOLE = 1.0, 1.5, 2.5
 LIKE = 25.0
 #: A hole is hollow in depth, by so many metres, or it has the table's colour to so many squared standard deviations.
 HOLLOW, SAME = 0.004, 4.0
-#: Depth falls back beyond an outline by so many metres more than a surface at 45 degrees would, looked for so many pixels beside it.
+#: Depth falls back beyond an outline by so many metres (more than a surface at 45 degrees would), looked for so many pixels beside it.
 STEP, BESIDE = 0.005, 3
 #: Least pixels of a hole, and of either kind for its histogram to tell anything.
 LEAST, SAMPLE = 12, 150
 #: Past such a share of the outlines nearest to a patch's inner pixels depth goes on where it is a face that stands on the table.
 STANDS = 0.6
+#: A patch with a larger share of the open around it than this may be the thing's end, where its pixels are off a plane by no more than so many metres in the middle.
+OPEN, EVEN = 0.5, 0.008
 #: Widths of the histograms' bins in lightness and in the two colour axes, of 256.
 BINS = (12, 5, 5)
 
@@ -43,7 +45,7 @@ def _index(lab: NDArray[np.uint8]) -> NDArray[np.int32]:
 
 _SHAPE = tuple(256 // b + 1 for b in BINS)
 #: A density so small that it says nothing.
-EVEN = np.float32(1e-5)
+FLAT = np.float32(1e-5)
 
 
 def _density(index: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -151,7 +153,7 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
 
     def field(own: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log of how much likelier each pixel's colour is around the thing than on it, of which ``own`` is a sample."""
-        return cv2.blur(np.log((ground + EVEN) / (_density(index[own]) + EVEN))[index], (3, 3))
+        return cv2.blur(np.log((ground + FLAT) / (_density(index[own]) + FLAT))[index], (3, 3))
 
     inner = mine & (within > min(most, 0.6 * float(within.max())))
     other = inner & (near.unlike >= LIKE)
@@ -201,7 +203,7 @@ def _width(told: list[_Told], most: int) -> int:
 def _judged(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArray[np.bool_]:
     """The region as colour has it."""
     mine = near.mine
-    kept = mine & ~_smeared(near, told, reach, deep)
+    kept = mine & ~_smeared(near, told, reach, most, deep)
     # Grow step by step, so that nothing is reached across the table.
     like = near.possible & ~mine & (told.field < -THING)
     grown = kept
@@ -210,8 +212,9 @@ def _judged(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArr
     return grown | _enclosed(like & ~grown & np.isfinite(near.depth), grown)
 
 
-def _smeared(near: _Near, told: _Told, reach: int, deep: int) -> NDArray[np.bool_]:
-    """Of a region's pixels those that colour gives to the table: a rim of it no wider than smear is, and holes that it encloses."""
+def _smeared(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArray[np.bool_]:
+    """Of a region's pixels those that colour gives to the table: a rim of it no wider than smear is, and holes, which depth shows hollow or nothing can tell
+    from the table."""
     within = told.within
     empty = near.mine & (told.field > TABLE) & (near.unlike < LIKE)
     outside = cv2.dilate((~near.mine).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -224,7 +227,9 @@ def _smeared(near: _Near, told: _Told, reach: int, deep: int) -> NDArray[np.bool
         part = parts[cut] == i
         if (
             float(within[cut][part].max()) < deep
-            and _hole(near, part, empty[cut], told.field[cut][part], cut)
+            and float(told.field[cut][part].mean()) >= HOLE
+            and (_hollow(near, part, empty[cut], cut) or float(np.median(near.unlike[cut][part])) < SAME)
+            and not _sticks_out(near, parts == i, empty, 2 * most)
             and not _stands(told, part, cut, reach)
         ):
             removed[cut] |= part
@@ -233,20 +238,17 @@ def _smeared(near: _Near, told: _Told, reach: int, deep: int) -> NDArray[np.bool
     return removed | connected(empty & (within <= reach) & near.jump & ~own, outside)
 
 
-def _hole(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], told: NDArray[np.float32], cut: tuple[slice, slice]) -> bool:
-    """Whether a patch of the table's colour in a region is a hole: depth shows it hollow or nothing there, or it cannot be told from the table."""
-    if float(told.mean()) < HOLE:
-        return False
+def _hollow(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], cut: tuple[slice, slice]) -> bool:
+    """Whether depth shows a patch of the table's colour in a region hollow, or is missing there."""
     ring = (cv2.dilate(part.view(np.uint8), np.ones((7, 7), np.uint8)) > 0) & near.mine[cut] & ~empty
     inside, rim = part & np.isfinite(near.depth[cut]), ring & np.isfinite(near.depth[cut])
-    if np.count_nonzero(inside) < 0.7 * len(told):
+    if np.count_nonzero(inside) < 0.7 * np.count_nonzero(part):
         return True
-    if np.count_nonzero(rim) > 8:
-        # Behind its rim, and more so than a slope explains.
-        back = float(np.median(near.depth[cut][inside]) - np.median(near.depth[cut][rim]))
-        if back > HOLLOW and _behind_plane(near.depth[cut], inside, rim) > HOLLOW:
-            return True
-    return float(np.median(near.unlike[cut][part])) < SAME
+    if np.count_nonzero(rim) <= 8:
+        return False
+    # Behind its rim, and more so than a slope explains.
+    back = float(np.median(near.depth[cut][inside]) - np.median(near.depth[cut][rim]))
+    return back > HOLLOW and float(np.median(_from_plane(near.depth[cut], rim, inside))) > HOLLOW
 
 
 def _stands(told: _Told, part: NDArray[np.bool_], cut: tuple[slice, slice], reach: int) -> bool:
@@ -256,15 +258,32 @@ def _stands(told: _Told, part: NDArray[np.bool_], cut: tuple[slice, slice], reac
     return np.count_nonzero(deep) >= LEAST and float(told.goes_on[cut][deep].mean()) > STANDS
 
 
-def _behind_plane(depth: NDArray[np.float32], inside: NDArray[np.bool_], rim: NDArray[np.bool_]) -> float:
-    """How far the middle pixel of a patch lies behind the plane through its rim, m: of a plane the inverse depth is linear in the picture."""
+def _sticks_out(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], away: int) -> bool:
+    """Whether a patch of the table's colour (H, W) has more of the open than of the region around it, is even, lies before what is there, and reaches more than
+    ``away`` pixels from all that is of the thing's own colours, farther than depth is carried: the end of a wooden handle on a wooden table."""
+    x, y, w, h = cv2.boundingRect(part.view(np.uint8))
+    cut = (slice(max(y - away - 1, 0), y + h + away + 1), slice(max(x - away - 1, 0), x + w + away + 1))
+    here, mine, depth = part[cut], near.mine[cut], near.depth[cut]
+    ring = (cv2.dilate(here.view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~here
+    seen = here & np.isfinite(depth)
+    far = seen & ~_around(mine & ~empty[cut], away)
+    beside = _around(here, BESIDE) & ~mine & np.isfinite(depth)
+    if np.count_nonzero(far) < LEAST or np.count_nonzero(beside) < LEAST or float((ring & ~mine).sum()) <= OPEN * float(ring.sum()):
+        return False
+    # Towards the camera the table begins where the thing ends.  Depth that is carried from one thing to another is a ramp.
+    before = float(np.percentile(depth[beside], 75) - np.median(depth[far])) > STEP
+    return before and float(np.median(np.abs(_from_plane(depth, seen, seen)))) < EVEN
+
+
+def _from_plane(depth: NDArray[np.float32], of: NDArray[np.bool_], at: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """How far pixels ``at`` lie behind the plane through those ``of``, m: of a plane the inverse depth is linear in the picture."""
 
     def rows(where: NDArray[np.bool_]) -> NDArray[np.float64]:
         v, u = np.nonzero(where)
         return np.column_stack([u, v, np.ones(len(u))])
 
-    plane = np.linalg.lstsq(rows(rim), 1 / depth[rim].astype(float), rcond=None)[0]
-    return float(np.median(depth[inside] - 1 / np.maximum(rows(inside) @ plane, 1e-3)))
+    plane = np.linalg.lstsq(rows(of), 1 / depth[of].astype(float), rcond=None)[0]
+    return np.asarray(depth[at] - 1 / np.maximum(rows(at) @ plane, 1e-3))
 
 
 def _around(mask: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:

@@ -136,3 +136,15 @@ def test_a_foot_of_the_tables_colour_is_no_hole_where_depth_goes_on_past_it(stan
     found = smear.cleared(mask, picture(mask & ~foot), depth, table, unlike, np.ones(mask.shape, bool), jump, 615.0)
     assert found[60:116, 66:134].mean() > 0.98
     assert (found[122:134, 80:120].mean() > 0.95) == stands
+
+
+@pytest.mark.parametrize("length, kept", [(70, True), (8, False)])
+def test_what_sticks_out_farther_than_smear_is_carried_is_no_smear(length: int, kept: bool) -> None:
+    # The end of a wooden handle on a wooden table: raised as its head is, of the table's colour, and narrower than twice what smear reaches.
+    head, bar = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
+    head[60:140, 30:90] = True
+    bar[93:107, 90 : 90 + length] = True
+    depth = np.where(head | bar, 0.6, 0.63).astype(np.float32)
+    found = cleared(head | bar, picture(head), depth, head, unlike=1.0)
+    assert found[head].mean() > 0.97
+    assert (found[bar].mean() > 0.9) == kept and (found[bar].mean() < 0.4) != kept
