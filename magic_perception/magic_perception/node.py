@@ -33,7 +33,7 @@ from magic_core.scene import Scene, SceneObject
 from magic_core.tf_listener import TransformListener
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
-from magic_perception import settings
+from magic_perception import node_parameters
 from magic_perception.averaging import average
 from magic_perception.keyframes import STEADY, STILL, Keyframes
 from magic_perception.meanwhile import Made
@@ -87,9 +87,9 @@ class Perception(Node):
 
     def __init__(self) -> None:
         super().__init__("perception")
-        self.settings = settings.read(self)
+        self.settings = node_parameters.read(self)
         self.segmenter = make_segmenter(self.settings.segmenter, self.settings.weights, self.settings.device)
-        self.robot = settings.read_robot(self, self.settings.tolerance)
+        self.robot = node_parameters.read_robot(self, self.settings.tolerance)
         self.keyframes = Keyframes(self.settings.keyframes, self.settings.keyframe_age)
         self.warm_up()
 

@@ -25,7 +25,7 @@ TABLE, THING, HOLE = 1.0, 1.5, 2.5
 LIKE = 25.0
 #: A hole is hollow in depth, by so many metres, or it has the table's colour to so many squared standard deviations.
 HOLLOW, SAME = 0.004, 4.0
-#: Depth falls back beyond an outline by so many metres (more than a surface at 45 degrees would), looked for so many pixels beside it.
+#: Depth falls back beyond an outline by so many metres more than a surface at 45 degrees would, looked for so many pixels beside it.
 STEP, BESIDE = 0.005, 3
 #: Least pixels of a hole, and of either kind for its histogram to tell anything.
 LEAST, SAMPLE = 12, 150

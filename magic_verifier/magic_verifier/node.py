@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
@@ -16,16 +15,13 @@ from magic_core import strategy as strategies
 from magic_core.content import digest
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, check_solid
-from magic_core.motion import MotionPlan
 from magic_core.node import OneGoalServer, describe, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
-from magic_core.scene import SceneObject
-from magic_core.strategy import Strategy
 from magic_core.threads import one_thread
 from magic_interfaces.action import VerifyMotion
-from magic_verifier import motion_check, parameters
+from magic_verifier import motion_check, node_parameters
 from magic_verifier.articulation import Articulation
-from magic_verifier.parameters import MAX_REPETITIONS
+from magic_verifier.node_parameters import MAX_REPETITIONS
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
 from magic_verifier.verification import Proposal, Verdict, verify
 from magic_verifier.workers import Workers
@@ -37,23 +33,12 @@ FEEDBACK_PERIOD = 0.1
 UNJUDGED = (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY)
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """What a goal asks: a plan of a strategy with tool and target among obstacles on a table (4,)."""
-
-    strategy: Strategy
-    tool: SceneObject
-    target: SceneObject
-    obstacles: tuple[SceneObject, ...]
-    table: NDArray[np.float64]
-    plan: MotionPlan
-
-    def mark(self, goal: VerifyMotion.Goal) -> bytes:
-        """The same for goals whose verdicts are the same."""
-        # What obstacles look like is in the film alone.
-        simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in self.obstacles)
-        plan = self.plan, goal.repetitions, goal.seed, goal.tried
-        return digest((goal.strategy, self.tool, self.target, simulated, self.table, *plan))
+def mark_of(goal: VerifyMotion.Goal, proposal: Proposal) -> bytes:
+    """The same for goals whose verdicts are the same."""
+    # What obstacles look like is in the film alone.
+    simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in proposal.obstacles)
+    plan = proposal.plan, goal.repetitions, goal.seed, goal.tried
+    return digest((goal.strategy, proposal.tool, proposal.target, simulated, proposal.table, *plan))
 
 
 class VerifierNode(Node):
@@ -68,7 +53,7 @@ class VerifierNode(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("verifier", **kwargs)
-        self._given = parameters.read(self)
+        self._given = node_parameters.read(self)
         self._robot = Description(RobotConfig(**robot_parameters(self)))
         self._last: tuple[bytes, Verdict] | None = None
         self._server = OneGoalServer(
@@ -121,25 +106,12 @@ class VerifierNode(Node):
     def _verify(self, handle: Any, started: float) -> tuple[Verdict, Image]:
         """The verdict on a goal that came at ``started`` (s, monotonic), and its film, empty where none was asked for."""
         goal, given = handle.request, self._given
-        asked = self._read(goal)
-        mark = asked.mark(goal)
+        proposal = self._read(goal)
+        mark = mark_of(goal, proposal)
         if goal.want_film and self._last is not None and mark == self._last[0]:
-            return self._with_film(self._last[1], asked)
+            return self._with_film(self._last[1], proposal)
         verdict = verify(
-            Proposal(
-                asked.strategy,
-                asked.tool,
-                asked.target,
-                asked.obstacles,
-                asked.table,
-                asked.plan,
-                seed=int(goal.seed),
-                settings=given.settings[asked.plan.variant],
-                spreads=given.spreads,
-                limits=given.limits,
-                arm_options=given.arm,
-                robot=self._robot,
-            ),
+            proposal,
             repetitions=int(goal.repetitions) or given.rollouts,
             deadline=started + (goal.timeout or given.timeout),
             cancel=lambda: handle.is_cancel_requested,
@@ -149,14 +121,14 @@ class VerifierNode(Node):
             tried=int(goal.tried),
         )
         self.get_logger().info(
-            f"{goal.strategy} {asked.plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
+            f"{goal.strategy} {proposal.plan.variant} {goal.tool.id}: {verdict.code.name}: {verdict.message} ({verdict.seconds:.2f} s)"
         )
         if verdict.code not in (Code.CANCELED, Code.SIMULATION_TIMEOUT):  # these depend on more than the goal
             self._last = mark, verdict
-        return self._with_film(verdict, asked) if goal.want_film else (verdict, Image())
+        return self._with_film(verdict, proposal) if goal.want_film else (verdict, Image())
 
-    def _read(self, goal: VerifyMotion.Goal) -> _Asked:
-        """What a goal asks, checked.  Raises BAD_REQUEST, and what the conversions raise."""
+    def _read(self, goal: VerifyMotion.Goal) -> Proposal:
+        """What a goal proposes, checked, under the node's physics and limits.  Raises BAD_REQUEST, and what the conversions raise."""
         if goal.repetitions > MAX_REPETITIONS:
             raise MagicError(Code.BAD_REQUEST, "repetitions", goal.repetitions, f"0 to {MAX_REPETITIONS}")
         if not (np.isfinite(goal.timeout) and goal.timeout >= 0):
@@ -174,22 +146,36 @@ class VerifierNode(Node):
         table = convert.plane_from_msg(goal.table)
         plan = convert.plan_from_msg(goal.plan)
         motion_check.check_trajectory(goal.plan.tool_trajectory, tool.id, plan.tool_motion)
-        return _Asked(strategy, tool, target, obstacles, table, plan)
+        given = self._given
+        return Proposal(
+            strategy,
+            tool,
+            target,
+            obstacles,
+            table,
+            plan,
+            seed=int(goal.seed),
+            settings=given.settings[plan.variant],
+            spreads=given.spreads,
+            limits=given.limits,
+            arm_options=given.arm,
+            robot=self._robot,
+        )
 
-    def _with_film(self, verdict: Verdict, asked: _Asked) -> tuple[Verdict, Image]:
+    def _with_film(self, verdict: Verdict, proposal: Proposal) -> tuple[Verdict, Image]:
         if verdict.recording is None or verdict.code == Code.CANCELED:
             return verdict, Image()
         try:
-            return verdict, self._film(verdict, asked)
+            return verdict, self._film(verdict, proposal)
         except Exception as error:  # a picture that cannot be drawn changes no verdict
             _, message = describe(self, error)
             return replace(verdict, message=f"{verdict.message}; no film: {message}"), Image()
 
-    def _film(self, verdict: Verdict, asked: _Asked) -> Image:
+    def _film(self, verdict: Verdict, proposal: Proposal) -> Image:
         from magic_verifier.film import film_strip
 
         caption = f"{verdict.code.name}: {verdict.message}"
-        scene = asked.tool, asked.target, asked.obstacles, asked.table
+        scene = proposal.tool, proposal.target, proposal.obstacles, proposal.table
         strip = film_strip(verdict.recording, *scene, frames=self._given.film_frames, caption=caption, robot=self._robot)
         return convert.image_to_msg(strip, "rgb8")
 
