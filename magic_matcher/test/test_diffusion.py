@@ -47,10 +47,10 @@ def reference():
     return global_stage.make_reference(view, contact.pixel, contact.normal)
 
 
-def made(name, weights, size=256):
+def made(name, weights, size=256, device="auto"):
     paths = str(weights / "sd") if name == "dift" else f"{weights / 'sd'},{weights / 'dino'}"
     own = {"draws": 2} if name == "dift" else {"tokens": size // 16}
-    return features.load(name, paths, size=size, rotations=2, **own)
+    return features.load(name, paths, device, size=size, rotations=2, **own)
 
 
 @pytest.mark.parametrize(("name", "width"), [("dift", 16), ("sd_dino", 16 + 16 + 8 + 32)])
@@ -66,6 +66,17 @@ def test_maps_have_the_stated_shape_and_are_the_same_again(weights, name, width)
     assert backend.key() == made(name, weights).key()
     if name == "sd_dino":
         np.testing.assert_allclose(np.linalg.norm(maps, axis=-1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["dift", "sd_dino"])
+def test_maps_of_a_gpu_are_those_of_the_processor(weights, name):
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU here")
+    pictures = np.random.default_rng(0).integers(0, 255, (1, 256, 256, 3), dtype=np.uint8)
+    there, here = (made(name, weights, device=device).extract(pictures) for device in ("auto", "cpu"))
+    assert there.dtype == np.float32 and np.abs(there - here).max() < 0.02 * np.abs(here).max()
 
 
 @pytest.mark.parametrize("name", ["dift", "sd_dino"])

@@ -125,9 +125,9 @@ def test_every_aggregation_and_no_pca_run(backend, reference, prepared):
 @pytest.mark.parametrize("precision", ["bfloat16", "float16"])
 def test_half_precision_finds_the_same_place(weights, reference, precision):
     torch = pytest.importorskip("torch")
-    half = features.load("dinov2", weights, tokens=14, rotations=4, precision=precision)
+    half = features.load("dinov2", weights, "cpu", tokens=14, rotations=4, precision=precision)
     assert half._dtype == getattr(torch, precision) and next(half._model.parameters()).dtype == half._dtype
-    full = features.load("dinov2", weights, tokens=14, rotations=4)
+    full = features.load("dinov2", weights, "cpu", tokens=14, rotations=4)
     assert full._dtype == torch.float32 and full.key() != half.key()
     found, exact = (b.propose(b.prepare(reference), reference.view, None, None, 1).proposals[0] for b in (half, full))
     assert found.pixel == pytest.approx(exact.pixel) and found.similarity == pytest.approx(exact.similarity, abs=0.02)
@@ -135,6 +135,17 @@ def test_half_precision_finds_the_same_place(weights, reference, precision):
     with pytest.raises(MagicError) as caught:
         features.load("dinov2", weights, precision="int8")
     assert caught.value.code == Code.BAD_REQUEST
+
+
+def test_a_gpu_is_taken_where_there_is_one_and_finds_what_the_processor_finds(weights, reference):
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU here")
+    there, here = (features.load("dinov2", weights, device, tokens=14, rotations=4) for device in ("auto", "cpu"))
+    assert next(there._model.parameters()).is_cuda and there._dtype == torch.float16 and there.key() != here.key()
+    found, exact = (b.propose(b.prepare(reference), reference.view, None, None, 1).proposals[0] for b in (there, here))
+    assert found.pixel == pytest.approx(exact.pixel) and found.similarity == pytest.approx(exact.similarity, abs=0.02)
+    assert (found.rotation, found.flipped) == (exact.rotation, exact.flipped)
 
 
 @pytest.mark.parametrize("kind", ["Dinov2WithRegisters", "DINOv3ViT"])

@@ -832,6 +832,21 @@ def test_sam_loads_and_never_loses_an_object(tmp_path, hooking, name, make):
 
 
 @pytest.mark.parametrize("name, make", [("sam", tiny_sam), ("sam2", tiny_sam2)])
+def test_masks_of_a_gpu_are_those_of_the_processor(tmp_path, name, make):
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU here")
+    make(tmp_path)
+    color = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    prompts = [np.zeros((480, 640), bool) for _ in range(2)]
+    prompts[0][100:200, 300:400] = prompts[1][50:90, 20:300] = True
+    there, here = (make_segmenter(name, str(tmp_path), device) for device in ("auto", "cpu"))
+    assert next(there._model.parameters()).is_cuda
+    for (found, score), (exact, wanted) in zip(there.masks(color, prompts), here.masks(color, prompts), strict=True):
+        assert np.abs(found - exact).max() < 0.01 and score == pytest.approx(wanted, abs=0.01)
+
+
+@pytest.mark.parametrize("name, make", [("sam", tiny_sam), ("sam2", tiny_sam2)])
 def test_coarse_masks_of_a_network_get_the_refinement_of_depth(tmp_path, monkeypatch, name, make):
     """A network that is right but coarse: the handle's hole filled, the edge some pixels out.  Depth and colour have both put right."""
     pytest.importorskip("transformers")

@@ -110,6 +110,15 @@ def test_logits_are_by_picture_and_text_and_do_not_depend_on_the_company(network
     np.testing.assert_allclose(network.logits(texts, shown[1:2]), together[1:2], rtol=1e-3, atol=1e-3)
 
 
+def test_a_gpu_reads_what_the_processor_reads(weights, network):
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU here")
+    shown, texts = [flat(color) for color in TAUGHT.values()], ["a photo of the wrench", "something"]
+    there = OpenWords(str(weights))
+    assert next(there._model.parameters()).is_cuda
+    np.testing.assert_allclose(there.logits(texts, shown), network.logits(texts, shown), rtol=0.01, atol=0.01)
+
+
 def test_nothing_of_a_long_thing_is_cut_away():
     long = np.zeros((10, 40, 3), np.uint8)
     long[:, :5] = 255
