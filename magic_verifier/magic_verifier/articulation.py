@@ -229,14 +229,15 @@ class Articulation:
         for target, position in zip(self._finger_targets, wanted.tolist(), strict=True):
             target(position)
 
-    def close_fingers(self) -> None:
-        """Drive both fingers to their mean less the way that gives the closing force.
+    def close_fingers(self, force: float = 0.0) -> None:
+        """Drive both fingers to their mean less the way that gives the closing force, or ``force`` N where that is more.
 
         What moves them together is resisted by that force alone, what moves one against the other by the stiffness.  Fingers that are
         driven one by one go past where they would meet.
         """
         opened = self._opened_by()
-        mean = 0.5 * float(opened[0] + opened[1]) - self._options.closing_force / self._options.finger_stiffness
+        force = min(max(force, self._options.closing_force), self._options.grip_force)
+        mean = 0.5 * float(opened[0] + opened[1]) - force / self._options.finger_stiffness
         mean = mean if self._options.past is None else -self._options.past
         for target, closed, outward in zip(self._finger_targets, self._closed.tolist(), self._outward.tolist(), strict=True):
             target(closed + outward * mean)

@@ -439,7 +439,12 @@ def _moving_from(task: Task, setup: Setup) -> float:
 def _grasp_is_drawn(task: Task) -> bool:
     """Whether drawn rollouts take hold of the tool anew: of one whose shape cameras gave, which is not in the hand when the plan begins."""
     motion = task.plan.arm_motion
-    return motion is not None and motion.grasp_time > 0 and task.eyes[0][0] == task.uncertainty.camera
+    return motion is not None and motion.grasp_time > 0 and _seen(task)
+
+
+def _seen(task: Task) -> bool:
+    """Whether cameras gave the tool's shape and pose."""
+    return task.eyes[0][0] == task.uncertainty.camera
 
 
 def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Stop) -> tuple[float, Any]:
@@ -456,7 +461,7 @@ def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Stop) -> tuple[flo
     setup = replace(task, longer=1.0).under(drawn)
     setup = replace(setup, tool=standing(setup.tool, task.setup.tool, drawn.tool_from_held, setup.table))
     begin, end = max(motion.grasp_time - BEFORE_GRASP, 0.0), min(motion.grasp_time + AFTER_GRASP, task.start)
-    run = ArmRun(setup, task.plan, _drawn_options(task, drawn), limits, task.robot, None, drawn.lag, begin)
+    run = ArmRun(setup, task.plan, _drawn_options(task, drawn), limits, task.robot, None, drawn.lag, begin, rests=True)
     while run.time < end:
         run.advance()
         if run.world.steps % CHECK_EVERY == 0:
@@ -506,7 +511,7 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None, taken_anew: Any = Non
     from magic_verifier.articulation import ArmOptions
 
     if drawn is None:
-        return ArmRun(setup, task.plan, task.arm_options or ArmOptions(), task.limits, task.robot)
+        return ArmRun(setup, task.plan, task.arm_options or ArmOptions(), task.limits, task.robot, rests=_seen(task))
     options = _drawn_options(task, drawn)
     if options.past is not None:  # what contacts alone have taken hold of has no state that could be begun from
         return ArmRun(setup, task.plan, options, task.limits, task.robot, None, drawn.lag)

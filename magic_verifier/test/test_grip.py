@@ -1,5 +1,7 @@
 """Two soft pads hold what friction holds: forces along them and torques, up to a limit that analysis gives, and no more."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
@@ -14,6 +16,8 @@ from magic_verifier.floating import make_setup
 from magic_verifier.grip import LEAST, Grip, Patch, patch_of
 from magic_verifier.rollout import Limits
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, usable_pieces
+from magic_verifier.subjects import tool_object
+from magic_verifier.verification import DEFAULTS
 
 FORCE, FRICTION = 40.0, 0.8
 PATCH = Patch(np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]]), 0.006, (0.008, 0.006))
@@ -46,9 +50,9 @@ def test_weight_along_the_pads_slips_exactly_where_it_exceeds_friction(share, fr
     load, slip, _ = after(*hand_and_tool(mass, (0, 0, 0), Settings(frequency=frequency)), 0.5)
     if share < 1:
         assert load == pytest.approx(share, abs=0.06)
-        assert slip < 0.001
-    else:  # g (1 - 1 / share) t^2 / 2
-        assert slip == pytest.approx(9.81 * (1 - 1 / share) * 0.5**2 / 2, rel=0.1)
+        assert slip < 0.002
+    else:  # g (1 - 1 / share) t^2 / 2, and what it gains before fingers have given way by what they do under so much
+        assert slip == pytest.approx(9.81 * (1 - 1 / share) * 0.5**2 / 2, rel=0.15)
 
 
 @pytest.mark.parametrize("share", [0.8, 1.3])
@@ -59,6 +63,18 @@ def test_a_lever_about_the_closing_axis_turns_exactly_where_it_exceeds_the_patch
     load, _, angle = after(*hand_and_tool(mass, (lever, 0, 0)), 0.5)
     assert (angle < 0.1) if share < 1 else (angle > 0.5)
     assert share > 1 or load == pytest.approx(share, abs=0.1)
+
+
+@pytest.mark.parametrize(("length", "lever", "mass"), [(0.3, 0.12, 0.05), (0.2, 0.08, 0.03), (0.4, 0.18, 0.1)])
+def test_a_long_light_tool_loads_the_pads_by_what_it_weighs(length, lever, mass):
+    world = World(DEFAULTS["arm"])
+    bar = scenes.block((lever - length / 2, lever + length / 2), (-0.005, 0.005), (-0.005, 0.005))
+    world.add("hand", usable_pieces("hand", (scenes.block((-0.02, 0.02), (-0.02, 0.02), (0.2, 0.24)),)), np.eye(4), KINEMATIC, 1000.0, 0.5)
+    world.add("tool", usable_pieces("tool", (bar,)), np.eye(4), DYNAMIC, mass / (length * 0.01**2), 0.5)
+    grip = Grip(world.component("hand"), PATCH.tcp_from_patch, world.component("tool"), PATCH, FORCE, FRICTION, world.timestep)
+    holds = 2 * FRICTION * FORCE
+    asked = np.hypot(9.81 * mass / holds, 9.81 * mass * lever / (holds * PATCH.radius))
+    assert after(world, grip, 0.5)[0] == pytest.approx(asked, abs=0.06)
 
 
 def test_a_light_tool_is_held_as_a_heavy_one_and_falls_when_let_go():
@@ -94,6 +110,17 @@ def test_no_patch_where_one_pad_touches_nothing_or_only_pushes():
     assert patch_of([*one, steep], np.eye(4), 1, FRICTION) is None
     aside = [touch(0, -0.01, 0.04, -1)]
     assert patch_of([*one, *aside], np.eye(4), 1, FRICTION) is None
+
+
+def test_the_edges_of_a_pad_in_a_hollow_hold_it_together():
+    """Each of them would push it aside; both press it against the other pad."""
+    flat = [touch(x, -0.01, z, -1) for x in (-0.008, 0.008) for z in (-0.004, 0.006)]
+    slant = np.array([0.8, -0.6, 0.0])  # 53 degrees from the closing axis, where friction bears 39
+    left = [Touch(np.array([-0.009, 0.008, z]), slant, 0.0, np.zeros(3)) for z in (-0.004, 0.006)]
+    right = [Touch(np.array([0.009, 0.007, z]), slant * [-1, 1, 1], 0.0, np.zeros(3)) for z in (-0.004, 0.006)]
+    assert patch_of([*flat, *left], np.eye(4), 1, FRICTION) is None
+    patch = patch_of([*flat, *left, *right], np.eye(4), 1, FRICTION)
+    assert patch is not None and patch.half[0] == pytest.approx(0.008)
 
 
 def test_a_pad_that_gives_way_touches_as_far_as_it_does_what_lies_askew():
@@ -167,6 +194,66 @@ def run_of(options, speed=0.0, grasp_time=0.1):
     qd = np.tile(speed * np.eye(len(home))[0], (len(times), 1))
     arm = ArmMotion(times, robot.names, q, qd, 0 * qd, np.eye(4), 0.012, grasp_time)
     return ArmRun(setup, MotionPlan("arm", ToolMotion(times, np.tile(tcp, (len(times), 1, 1))), arm), options, Limits(), robot)
+
+
+def closing_on(block, physics, rests=False):
+    """The Panda at home, its hand straight down to a stand 20 mm below the tip, closing at 0.2 s on a block (its ranges about the tip, y along the
+    fingers' way, z up); also where the block is put."""
+    robot = Description()
+    home = np.asarray(robot.config.home, dtype=float)
+    tcp = robot.forward(home)[0]
+    pose = transforms.make(tcp[:3, :3] @ np.diag([1.0, -1.0, -1.0]), tcp[:3, 3])
+    tool = scenes.item("tool", [scenes.block(*block)], pose)
+    stand = scenes.item("stand", [scenes.block((-0.1, 0.1), (-0.1, 0.1), (-0.05, -0.02))], pose)
+    target = scenes.item("target", [scenes.block((-0.03, 0.03), (-0.03, 0.03), (0, 0.06))], transforms.make(translation=[0.5, 0.4, 0]))
+    settings = Settings(position_iterations=8, velocity_iterations=1, contact_offset=0.002)
+    times = np.linspace(0.0, 0.8, 81)
+    q, still = np.tile(home, (len(times), 1)), np.zeros((len(times), len(home)))
+    arm = ArmMotion(times, robot.names, q, still, still, transforms.inverse(pose) @ tcp, 0.012, 0.2)
+    plan = MotionPlan("arm", ToolMotion(times, np.tile(pose, (len(times), 1, 1))), arm)
+    return ArmRun(make_setup(tool, target, (stand,), scenes.TABLE, physics, settings), plan, None, Limits(), robot, rests=rests), pose
+
+
+def test_fingers_press_harder_on_what_sticks_to_the_table():
+    """A block of 3 kg, 8 mm aside, on a stand with a friction of 0.8: it takes 24 N to shift it, and fingers close with 8."""
+    size = (0.08, 0.04, 0.05)
+    run, pose = closing_on(((-0.04, 0.04), (-0.012, 0.028), (-0.02, 0.03)), Physics(0.8, 3.0 / np.prod(size), 600.0))
+    while run.time < 0.3:
+        run.advance()
+    assert run.held() is not None and run.held().width == pytest.approx(0.04, abs=0.001)
+    assert np.linalg.norm((run.world.pose("tool") - pose)[:3, 3]) == pytest.approx(0.008, abs=0.002)
+
+
+@pytest.mark.parametrize("mass", [0.009, 0.018])
+def test_fingers_do_not_sink_into_what_weighs_little(mass):
+    """A spoon on the table, its round handle 21 mm thick between the tips of the pads."""
+    robot = Description()
+    q = np.tile([-1.46, 0.797, 0.788, -2.192, -1.074, 2.526, -1.447], (81, 1))
+    pose = transforms.make([[-0.7149, -0.6969, 0.0575], [0.6947, -0.7172, -0.0558], [0.0801, 0.0, 0.9968]], [0.3555, -0.2053, 0.0057])
+    spoon = replace(tool_object("spoon:290063", 0, "side"), world_from_object=pose)
+    target = scenes.item("target", [scenes.block((-0.03, 0.03), (-0.03, 0.03), (0, 0.06))], transforms.make(translation=[0.5, 0.4, 0]))
+    setup = make_setup(spoon, target, (), scenes.TABLE, Physics(0.3, 600.0 * mass / 0.036, 600.0), DEFAULTS["arm"])
+    times = np.linspace(0.0, 0.8, 81)
+    held = transforms.inverse(pose) @ robot.forward(q[:1])[0]
+    motion = ToolMotion(times, np.tile(pose, (81, 1, 1)))
+    run = ArmRun(setup, MotionPlan("arm", motion, ArmMotion(times, robot.names, q, 0 * q, 0 * q, held, 0.021, 0.2)), None, Limits(), robot)
+    assert run.world.component("tool").mass == pytest.approx(mass, rel=0.05)
+    while run.time < 0.3:
+        run.advance()
+    assert run.held() is not None and run.held().width == pytest.approx(0.021, abs=0.001)
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_what_was_seen_to_lie_lies_until_it_is_touched(rests):
+    """A bar beside its stand, as a ladle lies on a handle's end that no camera saw."""
+    run, pose = closing_on(((-0.3, 0.05), (-0.006, 0.006), (-0.02, 0.006)), Physics(0.5, 600.0, 600.0), rests)
+    while run.time < 0.195:
+        run.advance()
+    turned = transforms.rotation_angle(run.world.pose("tool"), pose)
+    assert turned < 1e-6 if rests else turned > 0.02
+    while run.time < 0.3:
+        run.advance()
+    assert not rests or (run.held() is not None and transforms.rotation_angle(run.world.pose("tool"), pose) < 0.02)
 
 
 def test_fingers_that_are_driven_one_by_one_hold_by_contacts_alone_while_the_arm_goes_on():
