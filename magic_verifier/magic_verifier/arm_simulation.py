@@ -158,6 +158,11 @@ class ArmRun:
         """Solve what the tool takes part in by so many iterations."""
         self.world.component(TOOL).solver_position_iterations = count
 
+    def _wake(self) -> None:
+        """The tool that rested where it was seen is touched, and moves as it would from now on."""
+        self._rests = False
+        self.world.let_go(TOOL)
+
     def _sampled(self, motion: ArmMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Joint positions and velocities (N, J) of the trajectory, step by step."""
         times, positions = np.asarray(motion.times, dtype=float), np.asarray(motion.positions, dtype=float)
@@ -245,8 +250,7 @@ class ArmRun:
         self._arm.drive(self._positions[row] if still else self._led[row])
         self.world.step()
         if self._rests and self.world.touched_by(TOOL):
-            self._rests = False
-            self.world.let_go(TOOL)
+            self._wake()
         if not waiting:
             self._index += 1
         if self._let_go_at is not None and self._index == len(self._q) + self._lag + self._after:
@@ -308,6 +312,8 @@ class ArmRun:
     def _take(self, patch: Patch) -> None:
         """The tool is held, as it is between the pads, or as it was before they closed on what was in them already."""
         self._patch = patch
+        if self._rests:
+            self._wake()
         planned = np.asarray(self._motion.tool_from_tcp, dtype=float)
         if self._in_hand:
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(planned))
