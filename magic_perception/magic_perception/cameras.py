@@ -2,8 +2,13 @@
 
 Each camera's table is a plane: two of them tell the difference in height and two angles, to fractions of a millimetre.  What is
 left is a motion in that plane, two shifts and a turn.  It comes from the things on the table: a point that one camera sees on a
-thing, moved to where the other camera would have it, must fall on the other's mask unless something hides it there, and on its
-surface where both see the same side.  The motion is the one with which the cameras contradict each other least.
+thing, moved to where the other camera would have it, must fall on the other's mask unless something hides it there, on its
+surface where both see the same side, and never before that surface, where the other camera looks through it.  The motion is the one with
+which the cameras contradict each other least.
+
+Whether it is believed the things say patch by patch.  What one patch of a surface tells, its points tell all together: a mask that is too wide, a depth that is carried
+past an edge, is one error and not a hundred.  So the contradictions are summed by patch, and a motion is believed where they fall in so many patches, and so
+evenly, that it is not for the sake of a few.  A round thing alone, or sides of which each camera sees its own, has few patches that tell; then the poses stand as they are.
 """
 
 from __future__ import annotations
@@ -22,19 +27,30 @@ from magic_perception.segmentation import Looked
 MOST_OFFSET, MOST_ANGLE = 0.010, float(np.radians(1.5))
 #: Metres and radians below which a disagreement is not worth a word; standard errors that chance may reach.
 LEAST_OFFSET, LEAST_ANGLE, CHANCE = 0.004, float(np.radians(0.75)), 2.2
-#: A thing has moved where its two views contradict each other by less than this share once one of them is moved.
-FITS = 0.92
-#: Points of each camera that are looked for in the other: of all things, and where one thing is looked at.
-POINTS, SINGLE = 600, 300
-#: Errors of neighbouring points go together, so that a point counts for less than one; and what a standard error is at least, m and rad.
-SPREAD, FLOOR = 3.0, (0.001, float(np.radians(0.1)))
-#: Of the points every so many-th looks for where to begin; the longest step (3,) of the search, m and rad.
-FEW, LARGEST = 3, np.array([0.012, 0.012, 0.05])
+#: A motion is believed where contradictions fall by so many times the root of the sum of squares of what they fall by in each patch of a surface; one of more than
+#: may be corrected, which chance hardly makes, from so many on.  The size of a patch, m.
+FALL, BEYOND, PATCH = 2.8, 2.3, 0.02
+#: Points of each camera that are looked for in the other: of all things, and where one thing is looked at; so many have to be seen by both.
+POINTS, SINGLE, SEEN = 600, 300, 40
+#: Of the points every so many-th looks for where to begin, and for the motion.
+FEW, SOME = 4, 2
+#: Metres and radians by which a motion is changed in search of a better one, from step to step.
+STEPS = ((0.004, float(np.radians(2))), (0.002, float(np.radians(1))), (0.001, float(np.radians(0.5))))
+#: Standard errors are taken from so many draws of the patches, with shifts on a lattice of so many steps of so many metres to each side, and
+#: turns of so many radians; they are at least these, m and rad.
+DRAWS, REACH, STEP, TURN, FLOOR = 100, 3, 0.003, float(np.radians(0.5)), (0.001, float(np.radians(0.1)))
 #: Metres: a contradiction beyond this is none of a pose but of what was seen.
 MOST = 0.03
+#: Metres for one standard deviation of a point beside a mask and off a surface.  Masks tell how large an offset there is; a round thing
+#: leaves them room of a centimetre, so that surfaces decide.
+EDGE, SURFACE = 0.006, 0.003
+#: What a point costs at most, in squares of these, which it does where the other camera looks through it; and, to begin with, where that neither sees it nor speaks against it.
+DEAREST, UNSEEN = 9.0, 1.0
+#: Metres off a surface up to which a point is taken for one of it: of a motion, and where to begin.
+GATE, WIDE = 0.010, 0.020
 #: Pixels beside a mask's edge that say nothing, and width in pixels over which heights are smoothed.
 GRACE, SMOOTH = 2.0, 7
-#: Metres and radians per standard deviation of what cameras may well be off by; keeps directions that nothing tells of at 0.
+#: Metres and radians for one standard deviation of what cameras may well be off by; keeps directions that nothing tells of at 0.
 PRIOR = np.array([0.03, 0.03, 0.03])
 
 
@@ -42,8 +58,9 @@ PRIOR = np.array([0.03, 0.03, 0.03])
 class Disagreement:
     """How camera ``second`` sees the world displaced from where ``first`` does.
 
-    offset: by how much, m, in the middle of the things that both see, and angle, rad; errors: their standard errors.
-    motion (3,): what of it is left once each camera's table is the common plane: shifts in m along x and y of the table frame, and a turn in
+    offset: by how much, m, in the middle of the things that both see, and angle, rad: the likeliest ones; errors: their standard errors.
+    sure: how much of both, m and rad, is more than chance: what the tables tell, and of the things what is believed of them.
+    motion (3,): what of that is left once each camera's table is the common plane: shifts in m along x and y of the table frame, and a turn in
     rad about ``centre`` (3,), that carry what ``second`` sees to where ``first`` does.
     """
 
@@ -52,6 +69,7 @@ class Disagreement:
     offset: float
     angle: float
     errors: tuple[float, float]
+    sure: tuple[float, float]
     motion: NDArray[np.float64]
     centre: NDArray[np.float64]
 
@@ -64,17 +82,12 @@ class Disagreement:
     @property
     def certain(self) -> bool:
         """Whether the cameras disagree by more than chance and by what is worth a word."""
-        return (self.offset > LEAST_OFFSET and self.offset > CHANCE * self.errors[0]) or (
-            self.angle > LEAST_ANGLE and self.angle > CHANCE * self.errors[1]
-        )
+        return self.sure[0] > LEAST_OFFSET or self.sure[1] > LEAST_ANGLE
 
     @property
     def beyond(self) -> bool:
         """Whether they certainly disagree by more than may be corrected."""
-        return self.certain and (
-            (self.offset > MOST_OFFSET and self.offset > CHANCE * self.errors[0])
-            or (self.angle > MOST_ANGLE and self.angle > CHANCE * self.errors[1])
-        )
+        return self.sure[0] > MOST_OFFSET or self.sure[1] > MOST_ANGLE
 
 
 @dataclass(frozen=True)
@@ -143,11 +156,11 @@ def _steady(
     return measured + change[:, None] * (measured - eye)
 
 
-def _contradictions(
-    other: _Witness, moved: NDArray[np.float64], turned: NDArray[np.float64], gate: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """How points ``moved`` (N, 3) with normals ``turned`` (N, 3) that one camera saw contradict another camera: metres (N,) beside its masks (0 where nothing is told), and
-    off its surface (NaN where the two do not see the same side within ``gate``), with the normals (N, 3) there."""
+def _compared(
+    other: _Witness, moved: NDArray[np.float64], turned: NDArray[np.float64], gate: float, unseen: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """What points ``moved`` (N, 3) with normals ``turned`` (N, 3) that one camera saw cost (N,) by what another camera sees there, and which of them (N,) it sees too, within ``gate``;
+    unseen: what it costs that it neither sees a point nor speaks against it."""
     k, pose = other.look.frame.intrinsics, other.camera_from_world
     local = moved @ pose[:3, :3].T + pose[:3, 3]
     z = np.maximum(local[:, 2], 1e-6)
@@ -168,18 +181,9 @@ def _contradictions(
     gap = np.sum((moved - there) * normal, axis=1)
     with np.errstate(invalid="ignore"):
         alike = on & (np.sum(normal * turned, axis=1) > 0.8) & (np.abs(gap) < gate) & (np.linalg.norm(moved - there, axis=1) < 2 * gate)
-    return beside, np.where(alike, gap, np.nan), normal
-
-
-#: Metres for one standard deviation of a point beside a mask and off a surface.  Masks tell how large an offset there is; a round thing
-#: leaves them room of a centimetre, so that surfaces decide.
-EDGE, SURFACE = 0.006, 0.003
-
-
-def _cost(beside: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(...,): what contradictions (..., N) cost; a point whose surface the other camera does not see costs as much as one far off it."""
-    off = np.minimum((gap / SURFACE) ** 2, 9.0)
-    return np.sum(np.nan_to_num(off, nan=9.0) + np.minimum((beside / EDGE) ** 2, 9.0), axis=-1)
+        through = on & ~alike & (depth > local[:, 2] + gate)
+        off = np.where(alike, np.minimum((gap / SURFACE) ** 2, DEAREST), np.where(through, DEAREST, unseen))
+    return off + np.minimum((beside / EDGE) ** 2, DEAREST), alike
 
 
 def _motion(x: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -189,76 +193,139 @@ def _motion(x: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.f
     return turn
 
 
-def _told(
-    first: _Witness, second: _Witness, motion: NDArray[np.float64], gate: float
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """With the points of ``second`` moved (world): the cost, and of the points that both see their places (N, 3) as ``first`` has
-    them, the normals (N, 3) along which they are off, and by how much the motion must still carry ``second`` (N,)."""
-    back = transforms.inverse(motion)
-    moved = transforms.apply(motion, second.points)
-    beside, gap, normal = _contradictions(first, moved, second.normals @ motion[:3, :3].T, gate)
-    cost = float(_cost(beside, gap))
-    seen = np.isfinite(gap)
-    places, normals, offsets = [moved[seen]], [normal[seen]], [gap[seen]]
-    moved = transforms.apply(back, first.points)
-    beside, gap, normal = _contradictions(second, moved, first.normals @ back[:3, :3].T, gate)
-    cost += float(_cost(beside, gap))
-    seen = np.isfinite(gap)
-    # A point of the first above the surface of the second: the second must move along its normal by as much.
-    places.append(first.points[seen])
-    normals.append(normal[seen] @ motion[:3, :3].T)
-    offsets.append(-gap[seen])
-    return cost, np.concatenate(places), np.concatenate(normals), np.concatenate(offsets)
+@dataclass(frozen=True)
+class _Believed:
+    """The likeliest motion (3,) with the standard errors of its shift, m, and turn, rad, and what of it is believed (3,)."""
+
+    x: NDArray[np.float64]
+    errors: tuple[float, float]
+    sure: NDArray[np.float64]
 
 
-def _solve(
-    first: _Witness, second: _Witness, world_from_table: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int] | None:
-    """The motion (3,) of ``second`` that contradicts least, its covariance (3, 3), the middle (3,) that it turns about, in the table
-    frame, and how many points told; ``None`` where too few did."""
-    axes = world_from_table[:3, :3]
-    centre = transforms.apply(transforms.inverse(world_from_table), np.concatenate([first.points, second.points])).mean(axis=0)
-    # Where to begin: the shifts of a lattice that contradict least, and none.
-    steps = np.arange(-0.048, 0.0481, 0.008)
-    shifts = np.stack([a.ravel() for a in np.meshgrid(steps, steps)], axis=1)
-    world = np.column_stack([shifts, np.zeros(len(shifts))]) @ axes.T
-    total = 0.25 * np.sum((shifts / PRIOR[:2]) ** 2, axis=1)
-    for one, other, sign in ((second, first, 1), (first, second, -1)):
-        points, normals = one.points[::FEW], one.normals[::FEW]
-        moved = (points[None] + sign * world[:, None]).reshape(-1, 3)
-        beside, gap, _ = _contradictions(other, moved, np.tile(normals, (len(world), 1)), 0.02)
-        total = total + _cost(beside.reshape(len(world), -1), gap.reshape(len(world), -1))
-    starts = [np.zeros(3), np.append(shifts[int(np.argmin(total))], 0.0)]
-    found = [solved for x in starts if (solved := _refined(first, second, world_from_table, x, centre)) is not None]
-    if not found:
-        return None
-    _, x, covariance, count = min(found, key=lambda f: f[0])
-    return x, covariance, centre, count
+@dataclass(frozen=True)
+class _Pair:
+    """Two cameras, and the middle (3,), in the table frame, of what they see, about which the second is turned; motions are (3,): x, y, turn.
 
+    unseen: what a point costs that only one of them sees: as much as others do that both see, so that it is neither good nor bad to be seen by both.
+    """
 
-def _refined(
-    first: _Witness, second: _Witness, world_from_table: NDArray[np.float64], x: NDArray[np.float64], centre: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64], int] | None:
-    """From a motion ``x`` (3,) on, by surfaces: what is left contradictory, the motion, its covariance and how many points told; ``None`` where too few did."""
-    table_from_world = transforms.inverse(world_from_table)
-    axes = world_from_table[:3, :3]
-    middle = transforms.apply(world_from_table, centre)
-    for gate in (0.02, 0.015, 0.010, 0.010):
-        motion = world_from_table @ _motion(x, centre) @ table_from_world
-        _, places, normals, offsets = _told(first, second, motion, gate)
-        if len(offsets) < 40:
+    first: _Witness
+    second: _Witness
+    world_from_table: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    unseen: float = UNSEEN
+
+    @classmethod
+    def of(cls, first: _Witness, second: _Witness, world_from_table: NDArray[np.float64]) -> _Pair:
+        """About the middle of all points."""
+        points = np.concatenate([second.points, first.points])
+        return cls(first, second, world_from_table, transforms.apply(transforms.inverse(world_from_table), points).mean(axis=0))
+
+    def points(self, every: int = 1) -> NDArray[np.float64]:
+        """(N, 3): those of the second camera, then those of the first, in the table frame from the middle."""
+        points = np.concatenate([self.second.points[::every], self.first.points[::every]])
+        return transforms.apply(transforms.inverse(self.world_from_table), points) - self.centre
+
+    def compared(self, motions: NDArray[np.float64], every: int = 1, gate: float = GATE) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """What each point costs (M, N), and whether both cameras see it (M, N), with the second camera moved by ``motions`` (M, 3)."""
+        motions = np.atleast_2d(motions)
+        cos, sin, zero = np.cos(motions[:, 2]), np.sin(motions[:, 2]), np.zeros(len(motions))
+        turns = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], axis=1).reshape(-1, 3, 3)
+        shifts = np.column_stack([motions[:, :2], zero])[:, None]
+        axes, split = self.world_from_table[:3, :3], len(self.second.points[::every])
+        points = self.points(every)
+        told = []
+        for one, other, local, turn in (
+            (self.second, self.first, points[:split] @ turns.transpose(0, 2, 1) + shifts, turns.transpose(0, 2, 1)),
+            (self.first, self.second, (points[split:] - shifts) @ turns, turns),
+        ):
+            moved = transforms.apply(self.world_from_table, (local + self.centre).reshape(-1, 3))
+            turned = (one.normals[::every] @ axes @ turn).reshape(-1, 3) @ axes.T
+            told.append([values.reshape(len(motions), -1) for values in _compared(other, moved, turned, gate, self.unseen)])
+        return np.concatenate([told[0][0], told[1][0]], axis=1), np.concatenate([told[0][1], told[1][1]], axis=1)
+
+    def cost(self, motions: NDArray[np.float64], every: int = 1, gate: float = GATE) -> NDArray[np.float64]:
+        """(M,): what motions (M, 3) cost."""
+        return self.compared(motions, every, gate)[0].sum(axis=1) + _prior(motions)
+
+    def least(self, x: NDArray[np.float64], axes: int) -> NDArray[np.float64]:
+        """The motion (3,) from ``x`` (3,) on that costs least, by smaller and smaller steps along the first so many axes: 2, shifts alone, or 3."""
+        ways = np.concatenate([np.zeros((1, 3)), np.eye(3)[:axes], -np.eye(3)[:axes]])
+        for metres, radians in STEPS:
+            best = 1
+            while best:
+                tried = x + ways * [metres, metres, radians]
+                best = int(np.argmin(self.cost(tried, SOME)))
+                x = tried[best]
+        return x
+
+    def begin(self) -> NDArray[np.float64]:
+        """The shift (3,) of a lattice 96 mm wide that costs least."""
+        steps = np.arange(-0.048, 0.0481, 0.008)
+        lattice = np.array([(a, b, 0.0) for a in steps for b in steps])
+        return lattice[int(np.argmin(self.cost(lattice, FEW, WIDE)))]
+
+    def patches(self, x: NDArray[np.float64], every: int = 1) -> NDArray[np.float64]:
+        """(N, P): to which patch of a surface each point belongs, 0 or 1, with the second camera moved by ``x`` (3,)."""
+        points, split = self.points(every), len(self.second.points[::every])
+        points[:split] = points[:split] @ transforms.from_rpy(0, 0, float(x[2]))[:3, :3].T + [x[0], x[1], 0.0]
+        _, index = np.unique(np.floor(points / PATCH).astype(int), axis=0, return_inverse=True)
+        return np.eye(index.max() + 1)[index.ravel()]
+
+    def fall(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
+        """By how much contradictions fall from one motion (3,) to another, over the root of the sum of squares of what they fall by in each patch."""
+        costs, _ = self.compared(np.stack([before, after]))
+        falls = (costs[0] - costs[1]) @ self.patches(after)
+        return float(falls.sum() / max(np.sqrt(np.sum(falls**2)), 1e-9))
+
+    def errors(self, x: NDArray[np.float64]) -> tuple[float, float]:
+        """The standard errors of a motion's shift, m, in the direction that is known worst, and turn, rad: how it differs where other patches had been seen."""
+        steps = STEP * np.arange(-REACH, REACH + 1)
+        shifts = np.array([(0.0, 0.0, x[2]), *((x[0] + a, x[1] + b, x[2]) for a in steps for b in steps)])
+        turns = x + np.outer(TURN * np.arange(-REACH, REACH + 1), [0, 0, 1])
+        patches = self.patches(x, SOME)
+        count = patches.shape[1]
+        draws = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), DRAWS).T
+        found = [
+            tried[np.argmin(self.compared(tried, SOME)[0] @ patches @ draws + _prior(tried)[:, None], axis=0)] - x
+            for tried in (shifts, turns)
+        ]
+        spread = np.linalg.eigvalsh(found[0][:, :2].T @ found[0][:, :2] / DRAWS)[-1]
+        return float(np.sqrt(spread)) + FLOOR[0], float(np.sqrt(np.mean(found[1][:, 2] ** 2))) + FLOOR[1]
+
+    def solved(self, far: bool = True) -> _Believed | None:
+        """The motion that contradicts least, and what is believed of it; ``None`` where too few points are seen by both.  far: it may be far from none."""
+        nothing = np.zeros(3)
+        shift = self.cheapest([self.least(x, 2) for x in ((nothing, self.begin()) if far else (nothing,))])
+        costs, seen = self.compared(shift)
+        if np.count_nonzero(seen) < SEEN:
             return None
-        # A turn about the table's normal through the middle (which moves with the shift).
-        arm = np.cross(axes[:, 2], places - middle - axes[:, :2] @ x[:2])
-        jacobian = np.column_stack([normals @ axes[:, 0], normals @ axes[:, 1], np.sum(normals * arm, axis=1)]) / SURFACE
-        r = offsets / SURFACE
-        weight = 1 / np.maximum(1.0, np.abs(r))[:, None]
-        information = jacobian.T @ (weight * jacobian) / SPREAD**2 + np.diag(1 / PRIOR**2)
-        slope = jacobian.T @ (weight[:, 0] * r) / SPREAD**2 + x / PRIOR**2
-        x = x - np.clip(np.linalg.solve(information, slope), -LARGEST, LARGEST)
-    motion = world_from_table @ _motion(x, centre) @ table_from_world
-    cost, _, _, offsets = _told(first, second, motion, 0.010)
-    return cost, x, np.linalg.inv(information), len(offsets)
+        pair = replace(self, unseen=float(np.mean(np.minimum(costs[seen], DEAREST))))
+        shift = pair.cheapest([pair.least(x, 2) for x in (nothing, shift)])
+        motion = pair.least(shift, 3) if far else shift
+        x = motion if pair.fall(shift, motion) > FALL else shift
+        errors = pair.errors(x)
+        offset, angle = float(np.hypot(x[0], x[1])), abs(float(x[2]))
+        by_chance = offset < CHANCE * errors[0] and angle < CHANCE * errors[1]
+        if by_chance or pair.fall(nothing, x) < (BEYOND if offset > MOST_OFFSET else FALL):
+            return _Believed(x, errors, nothing)
+        return _Believed(x, errors, x)
+
+    def apart(self, x: NDArray[np.float64], first: NDArray[np.float64], second: NDArray[np.float64]) -> tuple[float, float]:
+        """How far, m, in the middle, and rad, the cameras were apart as their poses were given, where a motion (3,) is left once each was moved by (4, 4) onto the table."""
+        motion = self.world_from_table @ _motion(x, self.centre) @ transforms.inverse(self.world_from_table)
+        whole = transforms.inverse(first) @ motion @ second
+        middle = transforms.apply(transforms.inverse(second), transforms.apply(self.world_from_table, self.centre))
+        return float(np.linalg.norm(transforms.apply(whole, middle) - middle)), transforms.rotation_angle(whole, np.eye(4))
+
+    def cheapest(self, motions: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """That of several motions (3,) which costs least."""
+        return motions[int(np.argmin(self.cost(np.stack(motions))))]
+
+
+def _prior(motions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(M,): what motions (M, 3) cost by themselves."""
+    return DEAREST * np.sum((motions / PRIOR) ** 2, axis=-1)
 
 
 def shifted(
@@ -276,15 +343,8 @@ def shifted(
     )
     if one is None or two is None:
         return 0.0
-    centre = transforms.apply(transforms.inverse(world_from_table), np.concatenate([one.points, two.points])).mean(axis=0)
-    found = _refined(one, two, world_from_table, np.zeros(3), centre)
-    if found is None:
-        return 0.0
-    cost, x, covariance, _ = found
-    offset, error = float(np.hypot(x[0], x[1])), float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])) + FLOOR[0]
-    # Surfaces alone say little of what is flat: the masks have to fit better as well.
-    better = cost < FITS * _told(one, two, np.eye(4), 0.010)[0]
-    return offset if better and offset > CHANCE * error else 0.0
+    found = _Pair.of(one, two, world_from_table).solved(far=False)
+    return float(np.hypot(found.sure[0], found.sure[1])) if found is not None else 0.0
 
 
 def measure(
@@ -305,28 +365,14 @@ def measure(
     found = []
     for i, first in enumerate(witnesses):
         for j, second in enumerate(witnesses[i + 1 :], i + 1):
-            solved = _solve(first, second, world_from_table) if first is not None and second is not None else None
-            if solved is None:
+            if first is None or second is None:
                 continue
-            x, covariance, centre, _ = solved
-            motion = world_from_table @ _motion(x, centre) @ transforms.inverse(world_from_table)
-            whole = transforms.inverse(level[i]) @ motion @ level[j]
-            middle = transforms.apply(transforms.inverse(level[j]), transforms.apply(world_from_table, centre))
-            errors = (
-                float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])) + FLOOR[0],
-                float(np.sqrt(covariance[2, 2])) + FLOOR[1],
-            )
-            found.append(
-                Disagreement(
-                    looks[i].frame.camera,
-                    looks[j].frame.camera,
-                    float(np.linalg.norm(transforms.apply(whole, middle) - middle)),
-                    transforms.rotation_angle(whole, np.eye(4)),
-                    errors,
-                    x,
-                    centre,
-                )
-            )
+            pair = _Pair.of(first, second, world_from_table)
+            solved = pair.solved()
+            if solved is not None:
+                names = looks[i].frame.camera, looks[j].frame.camera
+                measured, sure = (pair.apart(x, level[i], level[j]) for x in (solved.x, solved.sure))
+                found.append(Disagreement(*names, *measured, solved.errors, sure, solved.sure, pair.centre))
     return found
 
 

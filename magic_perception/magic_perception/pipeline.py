@@ -130,7 +130,7 @@ def perceive(
         worst = _worst(report.cameras)
         report.notes += _about_poses(report.cameras, views)
         apart = _apart(worst, views)
-        if views.corrects and worst is not None and worst.certain:
+        if views.corrects and worst is not None and worst.certain and worst.motion.any():
             views = labelled(_brought_together(views, worst))
         report.notes += _about_glass(views)
 

@@ -72,13 +72,47 @@ def test_cameras_a_little_apart_are_brought_together(pair):
     report = Report()
     scene = perceive(moved(pair, motion), parameters=REGION, report=report)
     assert scene.camera_offset == pytest.approx(0.0076, abs=0.003) and "cameras disagree" in scene.notes[0]
-    # Each is moved half way, so that a tin is as round and as large as where they agree.
+    # Each is moved half way, so that a tin is as round and as large as where they agree, to within what the motion is known.
     tins = [
         min(s.objects, key=lambda o: np.linalg.norm(o.world_from_object[:2, 3] - [0.62, 0.12]))
         for s in (scene, perceive(pair, parameters=REGION))
     ]
-    np.testing.assert_allclose(tins[0].box_extents, tins[1].box_extents, atol=0.003)
+    np.testing.assert_allclose(tins[0].box_extents, tins[1].box_extents, atol=0.005)
     np.testing.assert_allclose(tins[0].world_from_object[:2, 3] - tins[1].world_from_object[:2, 3], motion[:2, 3] / 2, atol=0.003)
+
+
+@pytest.mark.parametrize(
+    ("things", "seed", "intrinsics"),
+    [
+        ([("l_hook", 43, 43.0, 0.5, 0.0)], 43, sensor.D435),
+        ([("l_hook", 45, 0.3, 0.44, -0.24), ("cylinder", 45, 0.0, 0.7, 0.0)], 45, Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)),
+    ],
+    ids=["hook alone", "hook and tin, few pixels"],
+)
+def test_little_on_the_table_does_not_set_right_cameras_against_each_other_and_tells_wrong_ones(things, seed, intrinsics):
+    """What surfaces alone made of a hook's masks and smear was 7 mm with 2.5 degrees, and 9 mm."""
+    caster = sensor.scene_raycaster([lying(*thing) for thing in things])
+    frames = [
+        sensor.capture([], intrinsics, pose, [seed, i], model=sensor.SMEARED, camera=name, raycaster=caster)
+        for i, (name, pose) in enumerate(sensor.STATION.items())
+    ]
+    report = Report()
+    perceive(frames, parameters=Parameters(), report=report)
+    assert not report.cameras[0].certain and not report.cameras[0].motion.any()
+    with pytest.raises(MagicError, match="CAMERAS_DISAGREE"):
+        perceive(moved(frames, transforms.make(translation=[0.013, 0.0125, 0])), parameters=Parameters())
+
+
+def test_cameras_that_see_opposite_sides_of_a_ball_are_not_drawn_together():
+    """A motion by which both see the same side, where they do not, is no better than none."""
+    ball = lying("sphere", 65, 0.0, 0.5, 0.0)
+    poses = [sensor.looking_at([0.5, y, 0.45], [0.5, 0.0, 0.03]) for y in (0.6, -0.6)]
+    caster = sensor.scene_raycaster([ball])
+    frames = [
+        sensor.capture([], sensor.D435, pose, [65, i], model=sensor.SMEARED, camera=name, raycaster=caster)
+        for i, (name, pose) in enumerate(zip(("left", "right"), poses, strict=True))
+    ]
+    assert perceive(frames, parameters=Parameters()).camera_offset < 0.005
 
 
 def test_a_table_below_the_base_is_used_and_said(pair):

@@ -124,8 +124,7 @@ def test_what_is_on_its_way_does_not_set_the_cameras_against_each_other(monkeypa
     assert not scene.camera_offset > 0.006
     np.testing.assert_allclose([o.world_from_box[:2, 3] for o in scene.objects if not o.hanging], [[0.45, -0.2]], atol=0.005)
     monkeypatch.setattr("magic_perception.pipeline._at_rest", lambda labels, _hanging: labels)
-    with pytest.raises(MagicError, match="CAMERAS_DISAGREE"):
-        perceive(pictures, (), REGION)
+    assert perceive(pictures, (), REGION).camera_offset > 0.02
 
 
 def across(frame, start, end, width):
