@@ -103,6 +103,18 @@ def test_little_on_the_table_does_not_set_right_cameras_against_each_other_and_t
         perceive(moved(frames, transforms.make(translation=[0.013, 0.0125, 0])), parameters=Parameters())
 
 
+def test_the_table_tells_a_tilt_whatever_stands_on_it():
+    """A ball alone tells no turn, and need not: that the table is tilted is seen on the table."""
+    frames = [
+        sensor.capture([], sensor.D435, pose, [40, i], camera=name, raycaster=sensor.scene_raycaster([lying("sphere", 40, 0.0, 0.5, 0.1)]))
+        for i, (name, pose) in enumerate(sensor.STATION.items())
+    ]
+    middle = transforms.make(translation=[0.5, 0.1, 0.03])
+    tilted = middle @ transforms.from_rpy(np.radians(2), 0, 0) @ transforms.inverse(middle)
+    with pytest.raises(MagicError, match="CAMERAS_DISAGREE"):
+        perceive(moved(frames, tilted), parameters=Parameters())
+
+
 def test_cameras_that_see_opposite_sides_of_a_ball_are_not_drawn_together():
     """A motion by which both see the same side, where they do not, is no better than none."""
     ball = lying("sphere", 65, 0.0, 0.5, 0.0)
