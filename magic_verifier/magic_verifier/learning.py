@@ -57,6 +57,8 @@ LED, DETOUR = 0.03, 1.1
 NEARLY = np.deg2rad(20.0)
 #: A tool that turns less than this (rad) keeps its attitude.
 ATTITUDE = np.deg2rad(15.0)
+#: A side of an outline faces a direction whose cosine with its normal is more than this.
+FACING = 0.3
 #: How far (m) a contact point may lie from the outline on which it is matched, and this share of the object's size.
 OFF_OUTLINE, OFF_SHARE = 0.006, 0.03
 #: A tool may have met the target so far beside where a strategy will have tools meet it, the middle of a side: share of the target's size.
@@ -193,8 +195,8 @@ def _drafted(
     """The strategy but for its phases, looked at so that both contacts are where they were shown, and how far (m) each is from there.
 
     The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  A round thing that was met a
-    millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led, and so does the tool: there the
-    normals are those of the way.  Raises BAD_REQUEST that says how near the best of them came.
+    millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led, and so does the tool; in a hollow
+    hardly wider than it any number of degrees.  There the normals are those of the way.  Raises BAD_REQUEST that says how near the best of them came.
     """
     tool, target = demonstration.tool, demonstration.target
     world_from_tool = target.world_from_object @ motion.target_from_tool[motion.index(made)]
@@ -234,15 +236,22 @@ def _drafted(
             continue
         try:
             draft, target_gap, tool_gap = drawn(direction, towards, found)
-            if (
-                draft.target_outline == "outer"
-                and draft.target_contact.disc_radius
-                and way @ towards < -np.cos(NEARLY) * np.linalg.norm(way)
-            ):
+            radius = draft.target_contact.disc_radius if draft.target_outline == "outer" else None
+            if radius and way @ towards < 0:
                 led = levelled(transforms.unit(way - (way @ direction) * direction))
-                read = replace(found, tool_normal=world_from_tool[:3, :3].T @ led, target_normal=-target.world_from_object[:3, :3].T @ led)
-                draft, target_gap, tool_gap = drawn(direction, -led, read)
-                draft = replace(draft, tool_contact=_led(draft.tool_view, draft.tool_contact, read.tool_normal))
+                tool_led, target_led = world_from_tool[:3, :3].T @ led, -target.world_from_object[:3, :3].T @ led
+                about = radius if _elsewhere(draft, found, tool_led, radius) <= OFF_OUTLINE else 0.0
+                if about or way @ towards < -np.cos(NEARLY) * np.linalg.norm(way):
+                    # On a round thing the place goes with the normal.
+                    met = found.target_point + radius * (target_led - found.target_normal)
+                    draft, _, tool_gap = drawn(
+                        direction, -led, replace(found, tool_normal=tool_led, target_point=met, target_normal=target_led)
+                    )
+                    draft = replace(draft, tool_contact=_led(draft, tool_led, about))
+                    off = draft.target_view.pixels(draft.target_contact.object_from_contact[:3, 3]) - draft.target_view.pixels(
+                        found.target_point
+                    )
+                    target_gap = float(np.linalg.norm(off)) * draft.target_view.metres_per_pixel
             return draft, tool_gap, target_gap
         except MagicError as error:
             why.append(error)
@@ -252,33 +261,61 @@ def _drafted(
 
 
 def _way(motion: _Motion, found: Replay, made: float, parted: float) -> Array:
-    """How far (3,), in the target's frame as it stood, the tool's contact point is led from when the contact is made until they part, m.
-
-    Zeros where that is less than LED, not straight, or the tool turns on it.
+    """How far (3,), in the target's frame as it stood, the tool's contact point is led from when the contact is made until they part, or the
+    tool turns, m.  Zeros where that is less than LED, or not straight.
     """
     first, last = motion.index(made), motion.index(parted)
     poses = motion.target_from_tool[first : last + 1]
+    turned = [k for k, pose in enumerate(poses) if _apart(pose, poses[0])[1] > TURNED]
+    poses = poses[: turned[0]] if turned else poses
     points = poses[:, :3, :3] @ found.tool_point + poses[:, :3, 3]
     way = points[-1] - points[0]
     long = float(np.linalg.norm(way))
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    turned = max(_apart(pose, poses[0])[1] for pose in poses)
-    return way if long >= LED and length <= DETOUR * long and turned <= TURNED else np.zeros(3)
+    return way if long >= LED and length <= DETOUR * long else np.zeros(3)
 
 
-def _led(view: CanonicalView, contact: Contact, normal: Array) -> Contact:
-    """A tool's contact with the outward normal (3,) along which it was led, in the tool's frame: where its edge is square to that, if it is nearby."""
+def _elsewhere(draft: Strategy, found: Replay, normal: Array, radius: float) -> float:
+    """How much elsewhere (m) the tool would have been, had it met a round target (radius, m) along a normal (3,) of its own frame instead of
+    as it was read; infinite where it has no such place.
+
+    In a hollow hardly wider than the target it is little, whatever the angle: a millimetre of the track turns the normal by ten degrees.
+    """
+    view = draft.tool_view
+    place = _square_to(draft, normal, radius)
+    if place is None:
+        return float("inf")
+    led, read = (transforms.unit(n @ view.object_from_view[:3, :2]) for n in (normal, found.tool_normal))
+    return float(np.linalg.norm((place - view.pixels(found.tool_point)) * view.metres_per_pixel + radius * (led - read)))
+
+
+def _led(draft: Strategy, normal: Array, about: float) -> Contact:
+    """The tool's contact with the outward normal (3,) along which it was led, in the tool's frame: where its edge is square to that, if it is nearby."""
+    view, contact = draft.tool_view, draft.tool_contact
+    place = _square_to(draft, normal, about)
+    if place is not None:
+        contour = contours.extract(view.mask)
+        contact = to_contact(view, curvature.estimate(contour, contour.nearest(place)))
+    towards = transforms.unit(normal @ view.object_from_view[:3, :2])
+    return replace(contact, normal=towards, object_from_contact=contact_frame(view, contact.pixel, towards))
+
+
+def _square_to(draft: Strategy, normal: Array, about: float) -> Array | None:
+    """The pixel (2,) at which the tool's outline is square to a normal (3,) of its frame, ``None`` where there is none within ``about`` (m) of
+    its contact, or as far from it as a contact may be off."""
+    view, contact = draft.tool_view, draft.tool_contact
     contour = contours.extract(view.mask)
     towards = transforms.unit(normal @ view.object_from_view[:3, :2])
-    index = contour.nearest(contact.pixel)
-    reach = max(OFF_OUTLINE / view.metres_per_pixel, OFF_SHARE * contour.size)
-    near, _ = contour.window(np.array([index]), np.arange(-round(reach), round(reach) + 1))
+    reach = round(max(max(OFF_OUTLINE, about) / view.metres_per_pixel, OFF_SHARE * contour.size))
+    near, _ = contour.window(np.array([contour.nearest(contact.pixel)]), np.arange(-reach, reach + 1))
+    # No farther than the side goes: over a lip is the back of a thin wall.
+    away = np.flatnonzero(contour.normals[near[0]] @ towards <= FACING)
+    first, last = (away[away < reach].max(initial=-1) + 1, away[away > reach].min(initial=2 * reach + 1))
+    side = contour.points[near[0, first:last]]
     # The bottom of a hollow, the top of a bulge; of a straight edge that is askew neither is there.
-    height = contour.points[near[0]] @ towards * (-1.0 if contact.concave else 1.0)
+    height = side @ towards * (-1.0 if contact.concave else 1.0)
     highest = np.flatnonzero(height >= height.max() - 0.25)
-    middle = int(highest[len(highest) // 2])
-    pixel = contour.points[near[0, middle]] if highest[0] > 0 and highest[-1] < len(height) - 1 else contact.pixel
-    return replace(contact, pixel=pixel, normal=towards, object_from_contact=contact_frame(view, pixel, towards))
+    return side[int(highest[len(highest) // 2])] if highest[0] > 0 and highest[-1] < len(height) - 1 else None
 
 
 def _target_contact(draft: Strategy, target: SceneObject, found: Replay | Meeting) -> tuple[Strategy, float]:
@@ -295,7 +332,7 @@ def _target_contact(draft: Strategy, target: SceneObject, found: Replay | Meetin
         size = contours.extract(seen.mask).size * seen.metres_per_pixel
         deep = abs(float(off @ touched.normal))
         gaps[outline] = float(np.linalg.norm(off))
-        facing = float(touched.normal @ (found.target_normal @ seen.object_from_view[:3, :2])) > 0.3
+        facing = float(touched.normal @ (found.target_normal @ seen.object_from_view[:3, :2])) > FACING
         if facing and deep <= max(OFF_OUTLINE, OFF_SHARE * size) and gaps[outline] <= max(OFF_OUTLINE, ASIDE_SHARE * size):
             return replace(tried, target_view=seen, target_contact=touched), gaps[outline]
     said = ", ".join(f"{1000 * gap:.0f} mm from the {PLACES[name]}" for name, gap in gaps.items())
@@ -469,7 +506,7 @@ def _on_outline(view: CanonicalView, read: Replay | Meeting) -> tuple[Contact | 
     """The place on the tool's outline where it met the target, ``None`` where that is not on it, and how far (m) it is from what was read."""
     contour = contours.extract(view.mask)
     pixel, towards = view.pixels(read.tool_point), read.tool_normal @ view.object_from_view[:3, :2]
-    away = np.linalg.norm(contour.points - pixel, axis=1) + np.where(contour.normals @ towards > 0.3, 0.0, np.inf)
+    away = np.linalg.norm(contour.points - pixel, axis=1) + np.where(contour.normals @ towards > FACING, 0.0, np.inf)
     index = int(away.argmin())
     gap = float(away[index]) * view.metres_per_pixel
     if gap > max(OFF_OUTLINE, OFF_SHARE * contour.size * view.metres_per_pixel):
@@ -491,7 +528,9 @@ def _with_motion(strategy: Strategy, motion: _Motion, made: float, parted: float
     target_from_contact, tool_from_contact = (c.object_from_contact for c in (strategy.target_contact, strategy.tool_contact))
     contacts = transforms.inverse(target_from_contact) @ motion.target_from_tool @ tool_from_contact
     at = motion.index(made)
-    contacts[:, :2, 3] -= contacts[at, :2, 3]
+    # What the surfaces and the track are off by goes along with the tool, as it turns.
+    off = contacts[at, :3, :3].T @ [*contacts[at, :2, 3], 0.0]
+    contacts = contacts @ transforms.make(translation=-off)
     away = np.linalg.norm(contacts[: at + 1, :3, 3] - contacts[at, :3, 3], axis=1)
     start, near = (int(np.flatnonzero(away >= d)[-1]) if (away >= d).any() else 0 for d in (APPROACH, NEAR))
     last = motion.index(parted) if motion.times[-1] - parted > PARTED else len(motion.times) - 1
