@@ -12,8 +12,9 @@ velocity, disturbed as a hand disturbs it) and corrected by what the frame shows
 What is nearer to the camera than the model hides it and says nothing: that is the hand, and whatever else comes between.  What touches
 the tool, the hand or the target, is no nearer than it: there its colour tells it, where the tool has another, and it hides the tool as
 well unless it is seen to be behind.  What else is of the tool's colour is given up by a loss for what is far (Geman and McClure).
-Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  An extended Kalman
-filter on SE(3) with velocities goes forward, a Rauch-Tung-Striebel smoother back.
+Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  What they say is
+filtered as they come, and smoothed when all have been seen (:mod:`magic_perception.paths`), where they are doubted as far as they
+contradict each other.
 
 The track is lost, and refused, where too much of the model is looked through, or where what is seen leaves it as uncertain as
 :data:`UNSURE`.
@@ -29,18 +30,16 @@ import cv2
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_perception.paths import CLEAR, Seen, State, changed, likeliest, moved, predicted
 from magic_perception.tool_colors import Said, ToolColors, lab
 
 Array = NDArray[np.float64]
-#: Spectral densities of a hand's accelerations: m^2/s^3 and rad^2/s^3.  It takes up 0.5 m/s and 3 rad/s within a quarter of a second.
-JERKY, TWISTY = 1.0, 36.0
-#: No hand moves a tool by so many standard deviations of that from one moment to the next.
+#: No hand moves a tool by so many standard deviations of what is expected of it from one moment to the next.
 JUMP = 3.0
 #: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).
 START = (0.004, 0.03, 0.01, 0.05)
@@ -54,8 +53,10 @@ EXPECTED = 0.015
 ROUNDS = 16
 #: The farthest that the search goes in a round: m, rad.
 STRIDE = (0.02, np.deg2rad(12.0))
-#: ... and where that does not find the tool; so few points looked through say that it is found.
-FAR, CLEAR = 0.06, 0.10
+#: ... and where that does not find the tool.
+FAR = 0.06
+#: So often (s) two cameras are asked each by itself, and how little is known of the tool then beside what they see: as START.
+ALONE, LOOSE = 0.5, (0.015, 0.3, 0.1, 0.5)
 #: Pictures whose stamps differ by no more (s) are of one moment.
 AT_ONCE = 0.01
 #: Measured points used of a frame, and points of the surface that stand for the model.
@@ -78,7 +79,7 @@ THROUGH, FEWEST = 0.35, 25
 #: A frame in which the tool was not found is left out; so long (s) none may be.
 BLIND = 0.4
 #: As unsure as a track may be: standard deviations, m and rad.
-UNSURE = (0.006, np.deg2rad(4.0))
+UNSURE = (0.006, np.deg2rad(5.0))
 
 
 @dataclass(frozen=True)
@@ -101,44 +102,6 @@ class _View:
     columns: slice
     mask: NDArray[np.bool_]
     depth: NDArray[np.float32]
-
-
-@dataclass
-class _State:
-    """Pose (4, 4) and velocity (6,): of the middle, and the rotation vector's, in the world; covariance (12, 12)."""
-
-    pose: Array
-    velocity: Array
-    covariance: Array
-
-    def moved(self, middle: Array, change: Array) -> _State:
-        """Changed by (12,), at the middle (3,) of the tool, in the tool's frame."""
-        return _State(_moved(self.pose, middle, change[:6]), self.velocity + change[6:], self.covariance)
-
-
-def _moved(pose: Array, middle: Array, change: Array) -> Array:
-    """The pose with the tool's middle shifted by change[:3] and the tool turned about it by change[3:]."""
-    turned = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
-    centre = transforms.apply(pose, middle) + change[:3]
-    return transforms.make(turned, centre - turned @ middle)
-
-
-def _apart(pose: Array, other: Array, middle: Array) -> Array:
-    """(6,): what takes ``other`` to ``pose``; the inverse of :func:`_moved`."""
-    shift = transforms.apply(pose, middle) - transforms.apply(other, middle)
-    return np.concatenate([shift, Rotation.from_matrix(pose[:3, :3] @ other[:3, :3].T).as_rotvec()])
-
-
-def _predicted(state: _State, middle: Array, step: float) -> tuple[_State, Array]:
-    """The state ``step`` seconds later, and the transition (12, 12)."""
-    transition = np.eye(12)
-    transition[:6, 6:] = step * np.eye(6)
-    density = np.repeat([JERKY, TWISTY], 3)
-    noise = np.block(
-        [[np.diag(density * step**3 / 3), np.diag(density * step**2 / 2)], [np.diag(density * step**2 / 2), np.diag(density * step)]]
-    )
-    pose = _moved(state.pose, middle, step * state.velocity)
-    return _State(pose, state.velocity.copy(), transition @ state.covariance @ transition.T + noise), transition
 
 
 class Follower:
@@ -364,7 +327,7 @@ class Follower:
         return (jacobian * sure[:, None]).T @ jacobian, (jacobian * sure[:, None]).T @ (shift * scale)
 
     def _information(self, frame: RgbdFrame, pose: Array, measured: tuple[Array, NDArray[np.bool_]], reach: float) -> tuple[Array, Array]:
-        """What a frame's depth says at a pose: (6, 6) and (6,), of a change of the pose as :func:`_moved` takes it."""
+        """What a frame's depth says at a pose: (6, 6) and (6,), of a change of the pose as :func:`moved` takes it."""
         middle = transforms.apply(pose, self.middle)
         points, own = measured
         matrix, vector = np.zeros((6, 6)), np.zeros(6)
@@ -405,8 +368,9 @@ class Follower:
                     matrix, vector = _add(matrix, vector, jacobian, length[fits] * scale, OUTLINE, REACH)
         return matrix, vector
 
-    def correct(self, frames: Sequence[RgbdFrame], state: _State, before: Array) -> tuple[_State, bool]:
-        """The state after the frames of one moment, and whether the tool was found in them; before (4, 4): where it was last."""
+    def correct(self, frames: Sequence[RgbdFrame], state: State, before: Array, compare: bool = False) -> tuple[State, Seen | None]:
+        """The state after the frames of one moment, and what they say there, ``None`` where the tool was not found in them; before (4, 4):
+        where it was last; compare: what two of them say, each by itself."""
         measured, colors = [], []
         for frame in frames:
             points, pixels = self._measured(frame, state.pose)
@@ -422,45 +386,67 @@ class Follower:
             fitted = self._fitted(frames, measured, colors, state, start, reach)
             on, through, _ = self.looked_at(frames, fitted.pose)
             share = through / max(on + through, 1)
-            jump = _apart(fitted.pose, state.pose, self.middle)
+            jump = changed(fitted.pose, state.pose, self.middle)
             if jump @ np.linalg.solve(state.covariance[:6, :6], jump) > JUMP**2:
                 continue
             if on >= FEWEST and share <= THROUGH and share < least:
                 best, least = fitted, share
             if best is not None and least < CLEAR:
                 break
-        return (state, False) if best is None else (best, True)
+        if best is None:
+            return state, None
+        said = [self._said(*seen, best.pose, CLOSE, SOUGHT[1]) for seen in zip(frames, measured, colors, strict=True)]
+        matrix, vector = (np.sum([one[k] for one in said], axis=0) for k in range(2))
+        apart = self._compared(frames, measured, colors, best.pose) if compare and len(frames) > 1 else math.nan
+        return best, Seen(best.pose, matrix, vector, least, apart)
+
+    def _compared(
+        self, frames: Sequence[RgbdFrame], measured: list[tuple[Array, NDArray[np.bool_]]], colors: list[Said], pose: Array
+    ) -> float:
+        """How far apart the first two frames, each by itself, say the tool to be about a pose: a chi-squared over its degrees of freedom."""
+        loose = State(pose, np.zeros(6), np.diag(np.repeat(LOOSE, 3)) ** 2)
+        one, other = (self._fitted([frames[k]], [measured[k]], [colors[k]], loose, pose, EXPECTED) for k in range(2))
+        off = changed(one.pose, other.pose, self.middle)
+        return float(off @ np.linalg.solve((one.covariance + other.covariance)[:6, :6], off)) / len(off)
+
+    def _said(
+        self, frame: RgbdFrame, measured: tuple[Array, NDArray[np.bool_]], colors: Said, pose: Array, reach: float, sought: int
+    ) -> tuple[Array, Array]:
+        """What a frame says at a pose by depth and colours: (6, 6) and (6,), as :meth:`_information`."""
+        information, pull = self._information(frame, pose, measured, reach)
+        outlined, shift = self._outlined(frame, pose, colors, sought)
+        return information + outlined, pull + shift
 
     def _fitted(
         self,
         frames: Sequence[RgbdFrame],
         measured: list[tuple[Array, NDArray[np.bool_]]],
         colors: list[Said],
-        state: _State,
+        state: State,
         start: Array,
         far: float,
-    ) -> _State:
+    ) -> State:
         """The most likely state by what is expected and what is seen, sought from a pose (4, 4)."""
         prior = np.linalg.inv(state.covariance)
         pose, velocity = start, state.velocity
         matrix = prior
         for turn in range(ROUNDS):
             reach = CLOSE + (far - CLOSE) * max(0.0, 1 - 2 * turn / ROUNDS)
-            off = np.concatenate([_apart(pose, state.pose, self.middle), velocity - state.velocity])
+            off = np.concatenate([changed(pose, state.pose, self.middle), velocity - state.velocity])
             matrix, vector = prior.copy(), -prior @ off
             sought = round(SOUGHT[1] + (SOUGHT[0] - SOUGHT[1]) * max(0.0, 1 - 2 * turn / ROUNDS))
-            for frame, seen, color in zip(frames, measured, colors, strict=True):
-                for information, pull in (self._information(frame, pose, seen, reach), self._outlined(frame, pose, color, sought)):
-                    matrix[:6, :6] += information
-                    vector[:6] += pull
+            for seen in zip(frames, measured, colors, strict=True):
+                information, pull = self._said(*seen, pose, reach, sought)
+                matrix[:6, :6] += information
+                vector[:6] += pull
             change = np.linalg.solve(matrix, vector)
             change *= min(
                 1.0, *(most / max(np.linalg.norm(part), 1e-12) for most, part in zip(STRIDE, np.split(change[:6], 2), strict=True))
             )
-            pose, velocity = _moved(pose, self.middle, change[:6]), velocity + change[6:]
+            pose, velocity = moved(pose, self.middle, change[:6]), velocity + change[6:]
             if reach == CLOSE and np.abs(change[:6]).max() < 2e-5:
                 break
-        return _State(pose, velocity, np.linalg.inv(matrix))
+        return State(pose, velocity, np.linalg.inv(matrix))
 
 
 def _add(matrix: Array, vector: Array, jacobian: Array, residual: Array, noise: float, reach: float) -> tuple[Array, Array]:
@@ -512,23 +498,23 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
     follower = Follower(mesh, world_from_tool, table, others)
     middle = follower.middle
     deviations = np.repeat(START, 3)
-    state = _State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(deviations**2))
+    start = state = State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(deviations**2))
     times: list[float] = []
-    after: list[_State] = []
-    before: list[tuple[_State, Array]] = []
-    last = math.nan
-    seen = 0
+    told: list[Seen | None] = []
+    last, compared = math.nan, -math.inf
     for moment in _moments(frames):
         now = moment[-1].stamp
         if not times:
             last = now
             follower.learn_colors(moment)
-        expected, transition = _predicted(state, middle, now - times[-1] if times else 0.0)
-        state, found = follower.correct(moment, expected, state.pose)
+        expected, _ = predicted(state, middle, now - times[-1] if times else 0.0)
+        compare = now - compared >= ALONE
+        compared = now if compare else compared
+        state, seen = follower.correct(moment, expected, state.pose, compare)
         times.append(now)
-        if found:
+        told.append(seen)
+        if seen is not None:
             follower.see_around(moment, state.pose)
-            seen += 1
             last = now
         elif now - last > BLIND:
             on, through, hidden = follower.looked_at(moment, state.pose)
@@ -538,22 +524,28 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
                 f"{on} points seen, {through} looked through, {hidden} hidden",
                 f"at least {FEWEST} seen, at most {100 * THROUGH:.0f} % looked through: not too fast for the cameras, the hand not over all of it",
             )
-        before.append((expected, transition))
-        after.append(state)
     if len(times) < 2:
         raise MagicError(Code.NO_FRAMES, "pictures to follow the tool in", len(times), "two or more")
-    smooth = _smoothed(after, before, middle)
+    smooth = likeliest(start, np.array(times), told, middle)
     shift = np.sqrt([np.linalg.eigvalsh(s.covariance[:3, :3])[-1] for s in smooth])
     turn = np.sqrt([np.linalg.eigvalsh(s.covariance[3:6, 3:6])[-1] for s in smooth])
+    kept = _known(np.array(times), shift, turn)
+    times, smooth, shift, turn = times[:kept], smooth[:kept], shift[:kept], turn[:kept]
     worst = int(np.argmax(np.maximum(shift / UNSURE[0], turn / UNSURE[1])))
     if shift[worst] > UNSURE[0] or turn[worst] > UNSURE[1]:
         raise MagicError(
             Code.BAD_MOTION,
             f"where the tool is {times[worst] - times[0]:.2f} s after the first picture",
             f"known to {1000 * shift[worst]:.1f} mm and {np.degrees(turn[worst]):.1f} degrees (standard deviations)",
-            f"{1000 * UNSURE[0]:g} mm and {np.degrees(UNSURE[1]):g} degrees: more of it in sight, or more pictures a second",
+            f"{1000 * UNSURE[0]:g} mm and {np.degrees(UNSURE[1]):g} degrees: more of it in sight, nearer cameras that are not moved, or more pictures a second",
         )
-    return Followed(np.array(times), np.stack([s.pose for s in smooth]), shift, turn, seen)
+    return Followed(np.array(times), np.stack([s.pose for s in smooth]), shift, turn, sum(seen is not None for seen in told))
+
+
+def _known(times: Array, shift: Array, turn: Array) -> int:
+    """How many of the moments (T,) there are without those at the end, BLIND seconds at most, that are not sure: no later picture tells of them."""
+    sure = np.flatnonzero((shift <= UNSURE[0]) & (turn <= UNSURE[1]))
+    return int(sure[-1]) + 1 if len(sure) and times[-1] - times[sure[-1]] <= BLIND else len(times)
 
 
 def _moments(frames: Iterable[RgbdFrame]) -> Iterator[list[RgbdFrame]]:
@@ -569,17 +561,3 @@ def _moments(frames: Iterable[RgbdFrame]) -> Iterator[list[RgbdFrame]]:
         group.append(frame)
     if group:
         yield group
-
-
-def _smoothed(after: list[_State], before: list[tuple[_State, Array]], middle: Array) -> list[_State]:
-    """The states with what later frames say of them."""
-    result = [after[-1]]
-    for k in range(len(after) - 2, -1, -1):
-        expected, transition = before[k + 1]
-        gain = after[k].covariance @ transition.T @ np.linalg.inv(expected.covariance)
-        later = result[-1]
-        off = np.concatenate([_apart(later.pose, expected.pose, middle), later.velocity - expected.velocity])
-        covariance = after[k].covariance + gain @ (later.covariance - expected.covariance) @ gain.T
-        changed = after[k].moved(middle, gain @ off)
-        result.append(_State(changed.pose, changed.velocity, (covariance + covariance.T) / 2))
-    return result[::-1]

@@ -1,5 +1,7 @@
 """A tool is followed through ray-cast pictures of a motion that is known, with a hand about its handle."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,11 +11,13 @@ from magic_core.errors import Code, MagicError
 from magic_core.sensor import SMEARED, STATION, capture, scene_raycaster
 from magic_core.shapes import make
 from magic_core.testing.hand import coming, hand
-from magic_perception.following import BLIND, Followed, Follower, _apart, _moved, _predicted, _State, follow
+from magic_perception.following import BLIND, UNSURE, Followed, Follower, _known, follow
+from magic_perception.tool_colors import Said, ToolColors
 
 SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 RATE = 10.0
+SPOON = {"bowl_half_length": 0.046, "bowl_half_width": 0.044, "depth": 0.030, "wall": 0.003, "handle": 0.24, "rise": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +45,12 @@ def path(hook):
     return times, transforms.interpolate(knots, np.stack([rest, rest, up, over]), eased)
 
 
-def pictures(hook, times, poses, held=True, model=SMEARED, gone=np.inf, held_at=(-0.09, 0.0, 0.0)):
+def pictures(hook, times, poses, held=True, model=SMEARED, gone=np.inf, held_at=(-0.09, 0.0, 0.0), beside=()):
     grip = transforms.frame(held_at, [1.0, 0, 0], [0, 0, 1.0])
     skin = hand(0.02)
     for k, (t, pose) in enumerate(zip(times, poses, strict=True)):
         meshes = [hook.mesh.transformed(pose)] if t < gone else []
+        meshes += beside[k : k + 1]
         if held and t > 0.15:
             meshes.append(skin.transformed(pose @ grip @ transforms.make(translation=coming(t - 0.15, 0.15))))
         caster = scene_raycaster(meshes)
@@ -80,6 +85,49 @@ def test_a_thin_tool_in_a_hand_is_held_by_its_colours(hanger):
     assert shift.max() < 0.005 and turn.max() < np.deg2rad(3)
 
 
+def scooped():
+    """A spoon with a hand on its handle, and a ball of another colour that stands about at first, then lies in its bowl: spoon, poses (T, 4, 4), times (T,),
+    pictures, and the ball where it stood."""
+    spoon, ball = make("spoon", 1, **SPOON), make("sphere", 3, radius=0.035)
+    times, poses = path(spoon)
+    middle = spoon.contact("bowl", spoon.view("section"), towards=(0, 0, 1)).object_from_contact[:3, 3] + [0, 0, 0.035]
+    stood = transforms.make(translation=[0.5, 0.15, 0.035])
+    held_at = (float(spoon.mesh.bounds[0, 0]) + 0.03, 0.0, 0.0)
+    balls = [ball.mesh.transformed(stood if k < 4 else pose @ transforms.make(translation=middle)) for k, pose in enumerate(poses)]
+    return spoon, times, poses, pictures(spoon, times, poses, held_at=held_at, beside=balls), ball.mesh.transformed(stood)
+
+
+def test_a_ball_in_the_bowl_of_a_spoon_is_not_the_bowl():
+    spoon, times, poses, frames, ball = scooped()
+    found = follow(spoon.mesh, poses[0], TABLE, frames, [ball])
+    shift, turn = errors(found, spoon, times, poses)
+    assert shift.max() < 0.005 and turn.max() < np.deg2rad(6)
+    assert np.sqrt(((turn / found.turn)[1:] ** 2).mean()) < 1.5  # and it is known how well
+
+
+def test_where_no_colour_tells_the_ball_from_the_spoon_the_track_is_refused(monkeypatch):
+    spoon, _, poses, frames, ball = scooped()
+    monkeypatch.setattr(
+        ToolColors, "said", lambda _, frame: Said(np.full(frame.depth.shape, 0.1, np.float32), np.zeros(frame.depth.shape, bool))
+    )
+    with pytest.raises(MagicError, match=r"known to .* mm and .* degrees") as caught:
+        follow(spoon.mesh, poses[0], TABLE, frames, [ball])
+    assert caught.value.code == Code.BAD_MOTION
+
+
+def test_a_track_that_cameras_contradict_is_refused(hook):
+    """One camera is moved by 20 mm on the way: nothing else tells of it."""
+    times, poses = path(hook)
+    aside = transforms.make(translation=[0.02, 0.0, 0.0])
+    frames = [
+        frame if frame.camera == "left" or frame.stamp < 100.9 else replace(frame, world_from_camera=aside @ frame.world_from_camera)
+        for frame in pictures(hook, times, poses)
+    ]
+    with pytest.raises(MagicError, match=r"known to .* mm and .* degrees") as caught:
+        follow(hook.mesh, poses[0], TABLE, frames)
+    assert caught.value.code == Code.BAD_MOTION and "more of it in sight" in caught.value.message
+
+
 def test_colours_tell_the_tool_from_the_ground_and_from_what_comes(hook):
     times, poses = path(hook)
     frames = [frame for frame in pictures(hook, times, poses) if frame.camera == "left"]
@@ -109,6 +157,14 @@ def test_a_tool_that_is_gone_is_lost_and_not_guessed_on(hook):
     assert 1.0 - BLIND < moment < 1.0 + 2 / RATE
 
 
+def test_a_path_ends_where_it_was_known_last_if_that_is_near_its_end():
+    times = np.arange(20) / RATE
+    turn = np.where(times > 1.65, 2.0, 0.5) * UNSURE[1]
+    assert _known(times, np.zeros(20), turn) == 17
+    assert _known(times, np.zeros(20), np.where(times > 1.9 - BLIND - 0.15, 2.0, 0.5) * UNSURE[1]) == 20  # too much for that: it is refused
+    assert _known(times, np.where(times == times[5], 2.0, 0.5) * UNSURE[0], np.zeros(20)) == 20
+
+
 def test_pictures_come_in_the_order_of_their_stamps(hook):
     times, poses = path(hook)
     frames = list(pictures(hook, times[:3], poses[:3], held=False))
@@ -117,25 +173,3 @@ def test_pictures_come_in_the_order_of_their_stamps(hook):
     with pytest.raises(MagicError) as caught:
         follow(hook.mesh, poses[0], TABLE, frames[:1])
     assert caught.value.code == Code.NO_FRAMES
-
-
-def test_a_change_of_pose_is_undone_by_its_inverse():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        pose = transforms.from_rotvec(rng.normal(size=3), rng.normal(size=3))
-        middle, change = rng.normal(size=3), rng.normal(size=6) * 0.5
-        moved = _moved(pose, middle, change)
-        np.testing.assert_allclose(_apart(moved, pose, middle), change, atol=1e-12)
-        np.testing.assert_allclose(transforms.apply(moved, middle) - transforms.apply(pose, middle), change[:3], atol=1e-12)
-
-
-def test_a_prediction_goes_on_as_before_and_knows_less_the_longer_it_is():
-    velocity = np.array([0.3, 0.0, 0.1, 0.0, 0.0, 1.0])
-    state = _State(np.eye(4), velocity, np.eye(12) * 1e-6)
-    middle = np.array([0.1, 0.0, 0.0])
-    later, _ = _predicted(state, middle, 0.2)
-    np.testing.assert_allclose(transforms.apply(later.pose, middle), middle + 0.2 * velocity[:3])
-    assert transforms.rotation_angle(later.pose, state.pose) == pytest.approx(0.2)
-    halves, _ = _predicted(_predicted(state, middle, 0.1)[0], middle, 0.1)
-    np.testing.assert_allclose(halves.covariance, later.covariance, atol=1e-12)  # the steps do not matter
-    assert np.all(np.diag(later.covariance)[:6] > np.diag(state.covariance)[:6])
