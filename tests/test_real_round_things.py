@@ -17,7 +17,7 @@ CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data" / "rgbd"
 pytestmark = pytest.mark.skipif(not CAPTURES.is_dir(), reason="the shared captures are not here")
 
 #: Of each capture pixels (column, row) of things: what solid each is to become, whether a hole shows in it from the side, and its width in mm
-#: (YCB's bowl of 159 mm at the widest; the others read from depth).
+#: (read from depth).
 SEEN = {
     "realsense_single/red_mug": {(343, 264): ("round with handle", True, 123)},
     "realsense_single/cylinder": {(326, 139): ("cylinder", False, 66)},
