@@ -63,10 +63,12 @@ class Spread:
 
 @dataclass(frozen=True)
 class Eyes:
-    """How well an object is known: where it is (m), how turned (rad), and what is wrong with its shape (m)."""
+    """How well an object is known: where it is (m), how turned (rad), and what is wrong with its shape (m), by a factor more or less of one
+    object than of another (``shape``)."""
 
     place: Spread
     turn: Spread
+    shape: Spread
     size: Spread
     thickness: Spread
     pieces: Spread
@@ -246,6 +248,7 @@ def draw(uncertainty: Uncertainty, tool: tuple[Eyes, float], target: tuple[Eyes,
     rng = np.random.default_rng([int(seed), int(index)])
 
     def shape(eyes: Eyes, wider: float) -> ShapeError:
+        wider *= float(eyes.shape.draw(rng, 1)[0])
         size = eyes.size.draw(rng, 3, wider)
         thickness = float(eyes.thickness.draw(rng, 1, wider)[0])
         # A sum of K sines of amplitude a has the standard deviation a sqrt(K / 2).
