@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.contact import OPPOSED
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan, ToolMotion
 from magic_planner import timing
@@ -136,7 +137,9 @@ class ArmPlanner:
             raise MagicError(Code.START_IN_COLLISION, "stage approach: the arm at its start", str(pair), "a start clear of everything")
         feedback("grasp", "looking for grasps that serve the whole motion" if held is None else "the tool is in the hand")
         tool_from_contact = placed_contact_frame(problem.strategy, problem.candidate, problem.reflection)
-        choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact)
+        met = problem.candidate.target
+        tool_from_target = None if met is None else tool_from_contact @ OPPOSED @ transforms.inverse(met.object_from_contact)
+        choice = GraspChoice(robot, self.grasping, self.settings, request, tool_from_contact, tool_from_target)
         pace = Pace(robot, choice.grasping, request.tool, tool_from_contact)
         return _Search(self, request, held, pace, problem.attempt).plan(choice.lots() if held is None else iter([[held]]))
 

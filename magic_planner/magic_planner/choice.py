@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_planner.collision import Body, mass_centre, solid_pieces
+from magic_planner.collision import Body, grown, mass_centre, solid_pieces
 from magic_planner.grasps import Grasp, GraspSettings, collision_free, propose, surface
 from magic_planner.margins import grip_at_rest
 from magic_planner.request import ArmSettings, Request
@@ -24,12 +24,24 @@ HEIGHTS, PASSES = 10, 7
 CLOSER = 4
 #: Points on each other thing for the first test of the hand.
 POINTS = 200
+#: Grasps whose hand comes within so many metres of where the target lies in the tool stand back by so much: the target rolls about there.
+BESIDE, BACK = 0.01, 5.0
 
 
 class GraspChoice:
     """Chooses grasps for one request."""
 
-    def __init__(self, robot: Robot, grasping: GraspSettings, settings: ArmSettings, request: Request, tool_from_contact: Array) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        grasping: GraspSettings,
+        settings: ArmSettings,
+        request: Request,
+        tool_from_contact: Array,
+        tool_from_target: Array | None = None,
+    ) -> None:
+        """tool_from_target (4, 4): where the target is in the tool where their contacts meet; ``None`` where no contact of the target is known."""
+        self.tool_from_target = tool_from_target
         self.robot, self.settings, self.request, self.tool_from_contact = robot, settings, request, tool_from_contact
         self.fixed = request.strategy.physics.target_is_fixed
         self.last = len(request.poses) - 1
@@ -56,7 +68,13 @@ class GraspChoice:
                 continue
             blocked: dict[str, int] = {}
             free = collision_free(
-                self.robot, grasps, self.request.tool, self._checks(), blocked, self.request.budget, self.settings.standoff / 2
+                self.robot,
+                self._beside_target(grasps),
+                self.request.tool,
+                self._checks(),
+                blocked,
+                self.request.budget,
+                self.settings.standoff / 2,
             )
             shares: list[Array] = []
             for size in sizes:
@@ -116,6 +134,23 @@ class GraspChoice:
         frames = np.stack([grasp.tool_from_tcp for grasp in lot])
         poses = request.poses[request.keys]
         return grip_at_rest(self.robot, self.grasping, request.tool, frames, self.tool_from_contact, poses, pushed)
+
+    def _beside_target(self, grasps: list[Grasp]) -> list[Grasp]:
+        """The grasps, those last whose hand would be in the way of a target that the tool takes along.  A ball that is met with a scoop's lip
+        rolls on to the place that was matched, and lay on the fingers there."""
+        if self.tool_from_target is None or self.fixed:
+            return grasps
+        hand, target = self.robot.hand_body(), Body(self.request.target.id, grown(solid_pieces(self.request.target), BESIDE))
+        target.move(self.tool_from_target)
+
+        def in_the_way(grasp: Grasp) -> bool:
+            hand.move(grasp.tool_from_tcp)
+            return hand.touches(target)
+
+        # In the order that they have, which is not quite that of their costs.
+        costs = np.maximum.accumulate([grasp.cost for grasp in grasps])
+        ranks = costs + BACK * np.array([in_the_way(grasp) for grasp in grasps])
+        return [grasps[index] for index in np.argsort(ranks, kind="stable")]
 
     def _there(self, index: int) -> bool:
         """Whether the target is where it was when the motion's pose ``index`` is reached: once touched it goes along, unless it is fixed."""

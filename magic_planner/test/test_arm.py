@@ -15,7 +15,8 @@ from magic_core.joint_limits import PUBLISHED
 from magic_core.strategy import Waypoint
 from magic_planner import timing
 from magic_planner.budget import Budget
-from magic_planner.collision import Body, grown, roomy_shell, shell
+from magic_planner.choice import GraspChoice
+from magic_planner.collision import Body, grown, roomy_shell, shell, solid_pieces
 from magic_planner.free_motion import LONGEST
 from magic_planner.margins import margins
 from magic_planner.object_motion import plan_tool_motion, tool_contact_frame
@@ -62,6 +63,27 @@ def test_the_hand_carries_the_tool_along_the_asked_path(arm, solved):
     np.testing.assert_allclose(plan.tool_motion.world_from_tool[task][0], asked[0], atol=1e-3)
     np.testing.assert_allclose(plan.tool_motion.world_from_tool[-1], asked[-1], atol=1e-3)
     np.testing.assert_array_equal(plan.tool_motion.world_from_tool[0], tool.world_from_object)
+
+
+def test_the_hand_leaves_room_for_the_target_in_the_tool(arm):
+    """A ball that is met with a scoop's lip rolls on into the bowl: where the contacts meet, not where it is met, no finger may be."""
+    strategy, tool, target, candidate, reflection, motion = problem()
+    request = arm._request(Problem(strategy, tool, target, candidate, reflection, motion), Budget(), lambda stage, message: None)
+    frame = tool_contact_frame(candidate, reflection)
+
+    def best(tool_from_target):
+        lots = GraspChoice(arm.robot, arm.grasping, arm.settings, request, frame, tool_from_target).lots()
+        return np.stack([grasp.tool_from_tcp for grasp in next(lots)])
+
+    def beside(frames, tool_from_target):
+        hand, ball = arm.robot.hand_body(), Body("ball", solid_pieces(target))
+        ball.move(tool_from_target)
+        return [hand.move(frame) or hand.touches(ball) for frame in frames]
+
+    anywhere = best(None)
+    finger = anywhere[0] @ transforms.make(translation=0.045 * arm.robot.closing)
+    assert any(beside(anywhere, finger)) and not any(beside(best(finger), finger))
+    np.testing.assert_array_equal(best(transforms.make(translation=[0, 0, 1.0])), anywhere)
 
 
 def test_the_contact_is_reached_at_the_end_of_its_phase(solved):
