@@ -23,6 +23,8 @@ HASTES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 #: Pictures of so long (s) are wrong together: what cameras take an edge or a face for changes with how they look at it.  So long to either
 #: side what two cameras say is compared.
 TOGETHER, COMPARED = 0.5, 1.0
+#: ... and where there is no second camera to contradict the first, variances are so many times larger than said: as much as they were found to be.
+UNCONTRADICTED = 6.0
 #: What the reconstructed surface is off by is the same in all moments: standard deviations, m and rad.
 SURFACE = (0.003, np.deg2rad(1.0))
 #: So few points of the model that are looked through say that the tool is found.
@@ -104,7 +106,7 @@ def doubted(times: Array, told: Sequence[Seen | None]) -> Array:
     apart = np.array([np.nan if seen is None else seen.apart for seen in told])
     looked = (np.abs(times[:, None] - times) <= COMPARED) & np.isfinite(apart)
     count = looked.sum(axis=1)
-    pooled = np.divide(looked @ np.nan_to_num(apart), count, out=np.ones(len(times)), where=count > 0)
+    pooled = np.divide(looked @ np.nan_to_num(apart), count, out=np.full(len(times), UNCONTRADICTED), where=count > 0)
     through = np.array([0.0 if seen is None else seen.through for seen in told])
     return np.maximum(pooled, 1.0) * np.maximum(through / CLEAR, 1.0) ** 2
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magic_core import transforms
-from magic_perception.paths import CLEAR, COMPARED, SURFACE, Seen, State, changed, doubted, likeliest, moved, predicted
+from magic_perception.paths import CLEAR, COMPARED, SURFACE, UNCONTRADICTED, Seen, State, changed, doubted, likeliest, moved, predicted
 
 RATE = 10.0
 SURE = np.diag([1 / 0.002**2] * 3 + [1 / 0.02**2] * 3)
@@ -46,7 +46,7 @@ def test_what_cameras_tell_apart_or_look_through_is_doubted_and_only_about_then(
     np.testing.assert_allclose(doubts[30 + around :], 4.0)
     told[5], told[7] = None, seen_at(through=3 * CLEAR)
     assert doubted(times, told)[7] == pytest.approx(9.0) and doubted(times, told)[4] == 1.0
-    np.testing.assert_allclose(doubted(times, [seen_at()] * 60), 1.0)  # of one camera nothing is known
+    np.testing.assert_allclose(doubted(times, [seen_at()] * 60), UNCONTRADICTED)  # one camera: nothing tells what it is wrong in
 
 
 def test_what_is_doubted_is_known_less():
@@ -63,7 +63,7 @@ def test_a_quiet_motion_is_smoothed_and_a_quick_one_is_kept(pace):
     times = np.arange(60) / RATE
     true = np.stack([transforms.from_rpy(0.3 * np.sin(pace * t), 0, 0, [0.2 * np.sin(0.5 * pace * t), 0, 0]) for t in times])
     noise = rng.multivariate_normal(np.zeros(6), np.linalg.inv(SURE), len(times))
-    told = [seen_at(moved(pose, np.zeros(3), off)) for pose, off in zip(true, noise, strict=True)]
+    told = [seen_at(moved(pose, np.zeros(3), off), apart=1.0) for pose, off in zip(true, noise, strict=True)]
     start = State(true[0], np.array([0.1 * pace, 0, 0, 0.3 * pace, 0, 0]), np.diag(np.repeat([0.002, 0.02, 0.05, 0.5], 3) ** 2))
     states = likeliest(start, times, told, np.zeros(3))
     off = np.array([changed(state.pose, pose, np.zeros(3)) for state, pose in zip(states, true, strict=True)])
