@@ -10,16 +10,18 @@ is kept with its stage, and the failure that came furthest is the one reported.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
-from magic_core.contact import OPPOSED
+from magic_core.contact import OPPOSED, ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan, ToolMotion
+from magic_core.scene import SceneObject
+from magic_core.strategy import Strategy
 from magic_planner import timing
 from magic_planner.budget import Budget
 from magic_planner.choice import GraspChoice
@@ -72,6 +74,26 @@ class ArmPlanner:
         timing.parameterise(np.stack([self.robot.home, self.robot.home + 0.05]), self.robot.limits, 0.02)
 
     def plan(
+        self,
+        strategy: Strategy,
+        tool: SceneObject,
+        target: SceneObject,
+        candidate: ContactCandidate,
+        reflection: str,
+        motion: ToolMotion,
+        table: Array | Sequence[float] = (0.0, 0.0, 1.0, 0.0),
+        obstacles: Sequence[SceneObject] = (),
+        start: Array | None = None,
+        attempt: int = 0,
+        seed: int = 0,
+        budget: Budget | None = None,
+        feedback: Callable[[str, str], None] = lambda stage, message: None,
+    ) -> MotionPlan:
+        """:meth:`solve` of a problem by its parts (:class:`Problem`), as scripts outside this repository ask for it."""
+        problem = Problem(strategy, tool, target, candidate, reflection, motion, table, obstacles, start, attempt, seed)
+        return self.solve(problem, budget, feedback)
+
+    def solve(
         self,
         problem: Problem,
         budget: Budget | None = None,

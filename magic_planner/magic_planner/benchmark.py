@@ -187,7 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
                     continue
                 if motion is not None:
                     try:
-                        plan = planner.plan(
+                        plan = planner.solve(
                             Problem(strategy, case.tool, case.target, case.candidate, "keep", motion, (0, 0, 1, 0), case.obstacles),
                             budget=Budget(options.timeout),
                         )

@@ -172,7 +172,7 @@ class PlannerNode(Node):
             attempt=int(goal.attempt),
             seed=int(goal.seed),
         )
-        return self._arm.plan(problem, budget, feedback)
+        return self._arm.solve(problem, budget, feedback)
 
     def _start(self, state: JointState) -> NDArray[np.float64] | None:
         """Joint positions of the arm out of a JointState (in any order, fingers and others left out); None where it is empty."""

@@ -85,7 +85,7 @@ class Problem:
 
 @dataclass
 class Request:
-    """A problem as one call of :meth:`ArmPlanner.plan` works on it: checked, with what follows from it."""
+    """A problem as one call of :meth:`ArmPlanner.solve` works on it: checked, with what follows from it."""
 
     strategy: Strategy
     tool: SceneObject

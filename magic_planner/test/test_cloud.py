@@ -90,9 +90,9 @@ def test_a_wall_of_points_without_pieces_is_gone_around(arm):
     given = problem()
     wall = scenes.item("wall", [scenes.box([0.15, 0.02, 0.25])], transforms.make(translation=[0.45, 0.12, 0.185]))
     obstacle = seen(grid([0.375, 0.11, 0.06], [0.525, 0.13, 0.31]))
-    through = ArmPlanner(arm.robot, cloud=CloudSettings(use=False)).plan(Problem(*given, obstacles=[obstacle]))
+    through = ArmPlanner(arm.robot, cloud=CloudSettings(use=False)).solve(Problem(*given, obstacles=[obstacle]))
     assert blocked(arm.robot, through, given, wall) > 0
-    around = ArmPlanner(arm.robot).plan(Problem(*given, obstacles=[obstacle]))
+    around = ArmPlanner(arm.robot).solve(Problem(*given, obstacles=[obstacle]))
     assert blocked(arm.robot, around, given, wall) == 0
 
 
@@ -100,7 +100,7 @@ def test_a_start_among_points_names_them(arm):
     tip = arm.robot.chain.forward(arm.robot.home)[:3, 3]
     obstacle = seen(grid(tip + [-0.03, -0.03, 0.08], tip + [0.03, 0.03, 0.14]))
     with pytest.raises(MagicError, match="points of seen") as raised:
-        arm.plan(Problem(*problem(), obstacles=[obstacle]))
+        arm.solve(Problem(*problem(), obstacles=[obstacle]))
     assert raised.value.code == Code.START_IN_COLLISION
 
 
@@ -113,6 +113,6 @@ def test_the_points_of_tool_and_target_do_not_stand_in_the_way(arm):
     ]
     measured = [dataclasses.replace(o, points=np.repeat(o.points, 20, axis=0)) for o in measured]
     measured = [dataclasses.replace(o, points=o.points + rng.normal(0, 0.002, o.points.shape)) for o in measured]
-    plan = arm.plan(Problem(strategy, tool, target, candidate, keep, motion))
-    same = arm.plan(Problem(strategy, measured[0], measured[1], candidate, keep, motion))
+    plan = arm.solve(Problem(strategy, tool, target, candidate, keep, motion))
+    same = arm.solve(Problem(strategy, measured[0], measured[1], candidate, keep, motion))
     np.testing.assert_array_equal(plan.arm_motion.positions, same.arm_motion.positions)

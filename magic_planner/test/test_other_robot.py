@@ -53,7 +53,7 @@ def test_it_pulls_with_the_hook(planner):
     target, target_contact = scenes.standing_cylinder(at=(0.72, 0.0))
     strategy, candidate = scenes.pulling(), scenes.candidate(tool, tool_contact, target_contact)
     motion = plan_tool_motion(strategy, tool, target, candidate)
-    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion))
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion))
     arm, chain = plan.arm_motion, planner.robot.chain
     assert arm.joint_names == chain.names and arm.positions.shape[1] == 6
     assert np.all(arm.positions >= chain.lower) and np.all(arm.positions <= chain.upper)
@@ -67,7 +67,7 @@ def test_it_pulls_with_the_hook(planner):
     across = arm.tool_from_tcp[:3, 0]
     assert abs(across[1]) > 0.9 or abs(across[2]) > 0.9
     assert 0.01 < arm.grasp_width < 0.1
-    again = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion))
+    again = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion))
     np.testing.assert_array_equal(arm.positions, again.arm_motion.positions)
 
 
@@ -80,10 +80,10 @@ def test_a_wider_gripper_takes_what_a_narrow_one_cannot(planner, config):
     motion = plan_tool_motion(strategy, block, target, candidate)
     narrow = ArmPlanner(Robot(dataclasses.replace(config, opening=0.08)))
     with pytest.raises(MagicError) as refused:
-        narrow.plan(Problem(strategy, block, target, candidate, "keep", motion))
+        narrow.solve(Problem(strategy, block, target, candidate, "keep", motion))
     assert refused.value.code == Code.NO_GRASP and "0.074" in refused.value.message
     try:
-        plan = planner.plan(Problem(strategy, block, target, candidate, "keep", motion))
+        plan = planner.solve(Problem(strategy, block, target, candidate, "keep", motion))
         assert plan.arm_motion.grasp_width == pytest.approx(0.085, abs=1e-3)
     except MagicError as error:
         assert "apart" not in error.message, "it is not the width that stops the wide one"
@@ -134,7 +134,7 @@ def test_the_preset_of_an_fr3_plans_within_its_limits():
     tool, tool_contact = scenes.hook()
     target, target_contact = scenes.standing_cylinder(at=(0.62, 0.0))
     strategy, candidate = scenes.pulling(), scenes.candidate(tool, tool_contact, target_contact)
-    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", plan_tool_motion(strategy, tool, target, candidate)))
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", plan_tool_motion(strategy, tool, target, candidate)))
     arm, limits = plan.arm_motion, PUBLISHED["fr3"]
     assert np.all(arm.positions >= limits.lower) and np.all(arm.positions <= limits.upper)
     low, high = limits.braking.velocities(arm.positions)

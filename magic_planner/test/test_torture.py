@@ -55,7 +55,7 @@ def attempt(arm, tool, target=None):
     started = time.monotonic()
     try:
         motion = plan_tool_motion(strategy, tool, target, candidate)
-        plan = arm.plan(Problem(strategy, tool, target, candidate, "keep", motion), budget=Budget(60.0))
+        plan = arm.solve(Problem(strategy, tool, target, candidate, "keep", motion), budget=Budget(60.0))
         assert np.all(np.isfinite(plan.arm_motion.positions))
         code, message = Code.OK, "planned"
     except MagicError as error:
@@ -132,7 +132,7 @@ def test_a_mirrored_match_turns_the_tool_over(arm):
     candidate = scenes.candidate(tool, tool_contact, target_contact, flipped=True)
     motion = plan_tool_motion(strategy, tool, target, candidate, "turn")
     assert np.all(motion.world_from_tool[:, 2, 2] < -0.999)  # upside down all the way
-    plan = arm.plan(Problem(strategy, tool, target, candidate, "turn", motion))
+    plan = arm.solve(Problem(strategy, tool, target, candidate, "turn", motion))
     assert plan.tool_motion.world_from_tool[0, 2, 2] > 0.999 and plan.tool_motion.world_from_tool[-1, 2, 2] < -0.999
     when = next(p for p in plan.arm_motion.phases if p.name == "contact").end
     pose = transforms.interpolate(plan.tool_motion.times, plan.tool_motion.world_from_tool, [when])[0]
@@ -147,7 +147,7 @@ def test_a_flat_tool_cannot_be_turned_over_on_the_table_and_that_is_said(arm):
     strategy = scenes.pulling()
     motion = plan_tool_motion(strategy, tool, target, candidate, "turn")
     with pytest.raises(MagicError, match="table|tool|target|panda") as raised:
-        arm.plan(Problem(strategy, tool, target, candidate, "turn", motion), budget=Budget(60.0))
+        arm.solve(Problem(strategy, tool, target, candidate, "turn", motion), budget=Budget(60.0))
     assert raised.value.code in (Code.NO_GRASP, Code.NO_IK, Code.JOINT_LIMIT, Code.PATH_IN_COLLISION)
 
 
@@ -166,10 +166,10 @@ def test_a_path_around_a_wall_is_the_same_on_a_loaded_machine(arm, monkeypatch):
     # A search is only ended by time where it finds nothing; on a machine that the whole suite keeps busy half a second is little.
     monkeypatch.setattr(arm.free, "settings", dataclasses.replace(arm.settings, free_time=10.0))
     given, obstacles = walled()
-    plan = arm.plan(Problem(*given, obstacles=obstacles, seed=3))
+    plan = arm.solve(Problem(*given, obstacles=obstacles, seed=3))
     load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     try:
-        again = arm.plan(Problem(*given, obstacles=obstacles, seed=3))
+        again = arm.solve(Problem(*given, obstacles=obstacles, seed=3))
     finally:
         for process in load:
             process.kill()
@@ -193,7 +193,7 @@ def test_a_cancel_is_answered_within_one_search(arm):
             return asked >= cancel_at
 
         try:
-            arm.plan(Problem(*given, obstacles=obstacles), budget=Budget(30.0, cancelled))
+            arm.solve(Problem(*given, obstacles=obstacles), budget=Budget(30.0, cancelled))
         except MagicError as error:
             assert error.code == Code.CANCELED
             return asked, time.monotonic() - since

@@ -72,7 +72,7 @@ def planned(strategy: Strategy, case: Case, variant: str, planner: ArmPlanner | 
     motion = plan_tool_motion(*scene, TABLE, case.obstacles, GAP if variant == "fg" else GAP_IN_HAND)
     if planner is None or variant == "fg":
         return MotionPlan("fg", motion)
-    return planner.plan(Problem(*scene, motion, TABLE, case.obstacles), budget=Budget(10.0))
+    return planner.solve(Problem(*scene, motion, TABLE, case.obstacles), budget=Budget(10.0))
 
 
 def summary(timings: list[Timing], rollouts: int) -> str:

@@ -143,7 +143,7 @@ def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, pla
     The motion of whatever holds the tool stays as it was planned, so that the true tool is held where it truly is.
     """
     from magic_verifier.rollout import Limits
-    from magic_verifier.verification import Proposal, verify
+    from magic_verifier.verification import Proposal, verify_proposal
 
     true = replace(layout.tools[index], id=seen.id)
     seen_from_true = transforms.inverse(seen.world_from_object) @ true.world_from_object
@@ -157,7 +157,7 @@ def judge(strategy: Strategy, layout: Layout, index: int, seen: SceneObject, pla
     # A real hand gives way as the verifier's drawn rollouts have it.
     limits = Limits().yielding()
     obstacles = (*layout.fixtures, *others)
-    return verify(Proposal(truth, true, layout.target, obstacles, TABLE, plan, seed, limits=limits), repetitions=1)
+    return verify_proposal(Proposal(truth, true, layout.target, obstacles, TABLE, plan, seed, limits=limits), repetitions=1)
 
 
 def sheet(frames: list[RgbdFrame], scene: Scene, path: Any) -> None:

@@ -322,7 +322,7 @@ def _try(
     from magic_planner.giving_way import GAP, GAP_IN_HAND
     from magic_planner.object_motion import plan_tool_motion
     from magic_planner.request import Problem
-    from magic_verifier.verification import Proposal, verify
+    from magic_verifier.verification import Proposal, verify_proposal
 
     started = time.perf_counter()
     candidate, reflection = trial.candidate, trial.reflection
@@ -333,7 +333,7 @@ def _try(
         if options.variant == "arm":
             given = (strategy, tool, target, candidate, reflection, motion, table, obstacles)
             budget = Budget(PLANNING_TIME, clock=time.process_time)
-            plan = _arm_planner().plan(Problem(*given, attempt=trial.attempt, seed=options.seed), budget=budget)
+            plan = _arm_planner().solve(Problem(*given, attempt=trial.attempt, seed=options.seed), budget=budget)
         else:
             plan = MotionPlan("fg", motion)
     except MagicError as error:
@@ -342,7 +342,7 @@ def _try(
         answer["seconds"]["plan"] += time.perf_counter() - started
     limits = Limits(required_rate=options.required_rate)
     proposal = Proposal(strategy, tool, target, obstacles, table, plan, options.seed, limits=limits)
-    verdict = verify(proposal, tried=answer["simulations"])
+    verdict = verify_proposal(proposal, tried=answer["simulations"])
     answer["seconds"]["verify"] += verdict.seconds
     answer["simulations"] += 1
     metrics = {k: round(v, 5) for k, v in verdict.metrics.items() if math.isfinite(v)}

@@ -37,7 +37,7 @@ from magic_verifier.demonstration import Meeting, Replay, replay
 from magic_verifier.floating import TARGET
 from magic_verifier.inference import Changed, changed, proposals
 from magic_verifier.posing import box_axes
-from magic_verifier.verification import Proposal, Verdict, verify
+from magic_verifier.verification import Proposal, Verdict, verify_proposal
 
 Array = NDArray[np.float64]
 #: The track is taken every TICK and smoothed over WINDOW seconds.
@@ -643,7 +643,7 @@ def _tried(demonstration: Demonstration, strategy: Strategy) -> Verdict | None:
         motion = plan_tool_motion(strategy, *scene, candidate, "keep", demonstration.table, demonstration.obstacles)
     except MagicError as error:
         return Verdict(False, error.code, error.message)
-    return verify(Proposal(strategy, *scene, demonstration.obstacles, demonstration.table, MotionPlan("fg", motion)))
+    return verify_proposal(Proposal(strategy, *scene, demonstration.obstacles, demonstration.table, MotionPlan("fg", motion)))
 
 
 def _shown(demonstration: Demonstration, strategy: Strategy, motion: _Motion, made: float, parted: float) -> Verdict | None:
@@ -665,7 +665,7 @@ def _shown(demonstration: Demonstration, strategy: Strategy, motion: _Motion, ma
             start = until
     plan = MotionPlan("fg", ToolMotion(times, poses, tuple(phases)))
     scene = demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table
-    return verify(Proposal(strategy, *scene, plan), repetitions=1)  # it was made once, in the scene as it was
+    return verify_proposal(Proposal(strategy, *scene, plan), repetitions=1)  # it was made once, in the scene as it was
 
 
 def advice(learned: Learned) -> list[str]:

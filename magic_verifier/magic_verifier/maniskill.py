@@ -40,7 +40,7 @@ from magic_verifier.rates import fewest, wilson
 from magic_verifier.rollout import Limits
 from magic_verifier.simulation import Settings
 from magic_verifier.uncertainty import Uncertainty
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 Array = NDArray[np.float64]
 NAME = "PullCubeTool-v1"
@@ -383,7 +383,7 @@ class Solver:
             arm_options=hand(given),
             robot=self.arm,
         )
-        verdict = verify(proposal, repetitions=fewest(LIMITS.required_rate, simulated), tried=simulated)
+        verdict = verify_proposal(proposal, repetitions=fewest(LIMITS.required_rate, simulated), tried=simulated)
         what = {
             "code": verdict.code.name,
             "message": verdict.message,
@@ -411,12 +411,12 @@ class Solver:
         for planner in lower:
             planner.grasping = grasping
             try:
-                return planner.plan(problem, Budget(PLANNING_TIME, clock=time.process_time))
+                return planner.solve(problem, Budget(PLANNING_TIME, clock=time.process_time))
             except MagicError as error:
                 if error.code != Code.PATH_IN_COLLISION:
                     raise
         highest.grasping = grasping
-        return highest.plan(problem, Budget(PLANNING_TIME, clock=time.process_time))
+        return highest.solve(problem, Budget(PLANNING_TIME, clock=time.process_time))
 
 
 def hand(given: Episode) -> Any:

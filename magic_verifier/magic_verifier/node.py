@@ -23,7 +23,7 @@ from magic_verifier import motion_check, node_parameters
 from magic_verifier.articulation import Articulation
 from magic_verifier.node_parameters import MAX_REPETITIONS
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
-from magic_verifier.verification import Proposal, Verdict, verify
+from magic_verifier.verification import Proposal, Verdict, verify_proposal
 from magic_verifier.workers import Workers
 
 NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
@@ -110,7 +110,7 @@ class VerifierNode(Node):
         mark = mark_of(goal, proposal)
         if goal.want_film and self._last is not None and mark == self._last[0]:
             return self._with_film(self._last[1], proposal)
-        verdict = verify(
+        verdict = verify_proposal(
             proposal,
             repetitions=int(goal.repetitions) or given.rollouts,
             deadline=started + (goal.timeout or given.timeout),

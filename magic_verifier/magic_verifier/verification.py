@@ -1,6 +1,6 @@
 """Run a plan in physics and judge it by the strategy's goal.
 
-:func:`verify` is the one entry point: it never raises for anything that the scene,
+:func:`verify_proposal` is the one entry point: it never raises for anything that the scene,
 the plan or the simulation may bring up, but answers a :class:`Verdict` with a code
 and a sentence, within its deadline.
 
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.contact import ContactCandidate
 from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.robot import Description
@@ -98,7 +99,7 @@ class Verdict:
     failures: tuple[str, ...] = ()
 
 
-def verify(
+def verify_proposal(
     proposal: Proposal,
     repetitions: int = 0,
     tried: int = 0,
@@ -137,6 +138,25 @@ def verify(
         runs = tuple(outcome.judgement for outcome in outcomes)
         return Verdict(False, error.code, error.message, 0.0, {}, _simulated(outcomes), clock.monotonic() - started, None, runs)
     return _verdict(task, outcomes, most, tried, _simulated(outcomes), clock.monotonic() - started)
+
+
+def verify(
+    strategy: Strategy,
+    tool: SceneObject,
+    target: SceneObject,
+    obstacles: Sequence[SceneObject],
+    table: NDArray[np.float64],
+    candidate: ContactCandidate | None,
+    plan: MotionPlan,
+    seed: int = 0,
+    **options: Any,
+) -> Verdict:
+    """:func:`verify_proposal` of a plan by its parts, as scripts outside this repository ask for it; options: those of both.
+
+    ``candidate``, the contact that the plan was made for, goes into no verdict.
+    """
+    proposed = {name: options.pop(name) for name in ("settings", "spreads", "limits", "arm_options", "robot") if name in options}
+    return verify_proposal(Proposal(strategy, tool, target, obstacles, table, plan, seed, **proposed), **options)
 
 
 def _simulated(outcomes: list[Outcome]) -> float:

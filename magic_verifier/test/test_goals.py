@@ -10,11 +10,11 @@ from magic_core import transforms
 from magic_core.errors import Code
 from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.strategy import Physics
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 
 def judge(strategy, tool, target, motion, obstacles=()):
-    return verify(Proposal(strategy, tool, target, tuple(obstacles), scenes.TABLE, motion), repetitions=1)
+    return verify_proposal(Proposal(strategy, tool, target, tuple(obstacles), scenes.TABLE, motion), repetitions=1)
 
 
 def refused(verdict, code, *words):

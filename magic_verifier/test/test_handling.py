@@ -16,7 +16,7 @@ from magic_core.shapes import make
 from magic_planner.object_motion import plan_tool_motion
 from magic_verifier import evaluate as ev
 from magic_verifier.subjects import scene_for
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 
 def shown(name, change=lambda offset, phase: offset):
@@ -29,7 +29,7 @@ def shown(name, change=lambda offset, phase: offset):
     item = make(entry["family"], entry["seed"], **entry["parameters"]).as_object("tool", transforms.make(translation=[0.4, -0.3, 0.02]))
     candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
     motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
-    return verify(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=1)
+    return verify_proposal(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=1)
 
 
 def shorter(by):
@@ -76,7 +76,7 @@ def shunted(change=lambda w: w, contact=lambda c: c):
     further = tuple(Companion(pair.name, contact(pair.tool), pair.target) for pair in strategy.contacts)
     candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4), further)
     motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
-    return verify(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=1)
+    return verify_proposal(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=1)
 
 
 def test_shunting_takes_both_contacts():
@@ -105,7 +105,7 @@ def test_cornering_takes_both_sides_at_once(aside, words):
     further = (Companion(pair.name, told, pair.target),)
     candidate = ContactCandidate("tool", strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4), further)
     motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
-    verdict = verify(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=1)
+    verdict = verify_proposal(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=1)
     assert verdict.success == (aside == 0.0) and words in verdict.message, verdict.message
 
 

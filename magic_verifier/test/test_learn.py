@@ -33,7 +33,7 @@ from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
 from magic_verifier.learn import Recorded, choose, every_frame, left_first, main, track_of, write
 from magic_verifier.learning import Demonstration, Task, learn
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 STRATEGIES = BAGS.with_name("ros2_ws") / "src/magic_bringup/strategies"
@@ -72,7 +72,7 @@ def test_what_was_learned_serves_a_tool_that_was_never_seen(learned, family, see
     verdicts = []
     for candidate in candidates:
         motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE)
-        verdicts.append(verify(Proposal(strategy, tool, target, (), scenes.TABLE, MotionPlan("fg", motion))))
+        verdicts.append(verify_proposal(Proposal(strategy, tool, target, (), scenes.TABLE, MotionPlan("fg", motion))))
     assert any(v.success for v in verdicts), [v.message for v in verdicts]
 
 

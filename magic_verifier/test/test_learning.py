@@ -75,7 +75,7 @@ def test_a_ball_met_aside_of_its_middle_is_pulled_the_way_it_was_led(aside, turn
     poses = seen.world_from_tool @ transforms.from_rpy(0, 0, np.deg2rad(turn))
     poses[:, 1, 3] += aside
     task = replace(task, physics=replace(task.physics, friction=0.5))
-    monkeypatch.setattr(learning, "verify", lambda *given, **named: None)
+    monkeypatch.setattr(learning, "verify_proposal", lambda *given, **named: None)
     strategy = learn(replace(seen, world_from_tool=poses), task).strategy
     # By the normals of where they met the way is 2.4 degrees askew of the contact for the turned tool.
     np.testing.assert_allclose(strategy.target_normal, [1, 0, 0], atol=0.005)
@@ -101,7 +101,7 @@ def test_a_ball_met_in_a_bowl_was_met_the_way_it_was_led(bowl, higher, monkeypat
         )
         poses = poses @ transforms.make(translation=(annotated.tool_contact.object_from_contact - contact)[:3, 3])
     poses[:, 2, 3] += higher
-    monkeypatch.setattr(learning, "verify", lambda *given, **named: None)
+    monkeypatch.setattr(learning, "verify_proposal", lambda *given, **named: None)
     strategy = learn(replace(seen, tool=tool, world_from_tool=poses), task).strategy
     assert strategy.target_normal @ annotated.target_normal > np.cos(np.deg2rad(2))
     off = transforms.inverse(contact) @ strategy.tool_contact.object_from_contact

@@ -14,7 +14,7 @@ from magic_core.motion import ArmMotion, MotionPlan, Phase, ToolMotion
 from magic_core.presets import PRESETS
 from magic_core.robot import Description, RobotConfig
 from magic_verifier import motion_check
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 ROBOT = Description()
 COUNT, JOINTS = 101, 7
@@ -239,7 +239,7 @@ def test_what_is_refused_is_refused_before_any_physics():
     poses = plan.tool_motion.world_from_tool.copy()
     poses[50:, 2, 3] += 0.3
     jump = replace(plan, tool_motion=replace(plan.tool_motion, world_from_tool=poses))
-    verdict = verify(Proposal(strategy, tool, target, (), scenes.TABLE, jump))
+    verdict = verify_proposal(Proposal(strategy, tool, target, (), scenes.TABLE, jump))
     assert (verdict.code, verdict.runs, verdict.simulated) == (Code.BAD_MOTION, (), 0.0)
     assert "waypoint 50" in verdict.message
 

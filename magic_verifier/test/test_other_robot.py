@@ -30,7 +30,7 @@ from magic_verifier import verification
 from magic_verifier.articulation import ArmOptions, Articulation, collision_groups
 from magic_verifier.film import film_strip
 from magic_verifier.simulation import Settings, World
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 #: One gain for all joints: neither of these arms has the Panda's seven.
 GAINS = ArmOptions(stiffness=(3000.0,), damping=(100.0,))
@@ -41,7 +41,7 @@ def planned(config, name):
     strategy, tool, target, obstacles, candidate = demonstration(name)
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
     planner = ArmPlanner(Robot(config))
-    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(60.0))
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(60.0))
     return (strategy, tool, target, obstacles, scenes.TABLE), plan
 
 
@@ -70,7 +70,7 @@ def edited(config, folder, *changes):
 def test_a_six_axis_arm_pulls_with_the_hook(config, pull):
     scene, plan = pull
     robot = Description(config)
-    verdict = verify(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1)
+    verdict = verify_proposal(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1)
     assert verdict.success, verdict.message
     assert verdict.recording.joints.shape[1] == 8
     metrics = verdict.metrics
@@ -78,7 +78,7 @@ def test_a_six_axis_arm_pulls_with_the_hook(config, pull):
     assert metrics["tracking_error"] < 0.02 and "tracking_error_slide" not in metrics
     # The fingers close along x of the tip, as far apart as planned.
     assert metrics["grip_width"] == pytest.approx(plan.arm_motion.grasp_width, abs=1e-3)
-    again = verify(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1)
+    again = verify_proposal(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1)
     assert np.array_equal(verdict.recording.joints, again.recording.joints)
     film = film_strip(verdict.recording, *scene[1:5], frames=2, columns=2, size=(160, 120), robot=robot)
     assert film.std() > 10
@@ -94,10 +94,10 @@ def test_a_tool_that_is_in_the_hand_off_its_place_is_carried_on(config, pull):
     off = arm.tool_from_tcp @ transforms.make(translation=[0.0, 0.0, 0.004])
     held = replace(tool, world_from_object=robot.forward(start)[0] @ transforms.inverse(off), hanging=True)
     motion = plan_tool_motion(strategy, held, target, candidate, "keep", table, obstacles)
-    plan = ArmPlanner(Robot(config)).plan(
+    plan = ArmPlanner(Robot(config)).solve(
         Problem(strategy, held, target, candidate, "keep", motion, table, obstacles, start=start), budget=Budget(60.0)
     )
-    verdict = verify(Proposal(strategy, held, target, obstacles, table, plan, arm_options=GAINS, robot=robot), repetitions=3)
+    verdict = verify_proposal(Proposal(strategy, held, target, obstacles, table, plan, arm_options=GAINS, robot=robot), repetitions=3)
     assert len(verdict.runs) > 1 and all(run.code == Code.OK for run in verdict.runs), verdict.message
     assert verdict.metrics["pulled_distance"] > 0.25 and verdict.metrics["grasp_slip"] < 0.005
     assert verdict.metrics["grasp_shift"] < 0.002  # it is held where it is said to be, and has not fallen meanwhile
@@ -115,14 +115,14 @@ def test_a_tool_that_is_in_the_hand_off_its_place_is_carried_on(config, pull):
 )
 def test_what_an_arm_cannot_do_is_found_out(config, pull, tmp_path, options, changes, code, words):
     scene, plan = pull
-    verdict = verify(Proposal(*scene, plan, arm_options=options, robot=edited(config, tmp_path, *changes)), repetitions=1)
+    verdict = verify_proposal(Proposal(*scene, plan, arm_options=options, robot=edited(config, tmp_path, *changes)), repetitions=1)
     assert verdict.code == code, verdict.message
     assert words in verdict.message
 
 
 def test_a_plan_for_another_arm_is_refused(pull):
     scene, plan = pull
-    verdict = verify(Proposal(*scene, plan))
+    verdict = verify_proposal(Proposal(*scene, plan))
     assert verdict.code == Code.BAD_MOTION
     assert "panda_joint1" in verdict.message and "joint_turn" in verdict.message
 
@@ -130,7 +130,7 @@ def test_a_plan_for_another_arm_is_refused(pull):
 def test_a_thing_that_calls_itself_the_arm_is_refused(config, pull):
     (strategy, tool, target, _, table), plan = pull
     thing = scenes.item("arm", [scenes.block((-0.5, -0.4), (-0.5, -0.4), (0, 0.1))])
-    verdict = verify(Proposal(strategy, tool, target, (thing,), table, plan, arm_options=GAINS, robot=Description(config)))
+    verdict = verify_proposal(Proposal(strategy, tool, target, (thing,), table, plan, arm_options=GAINS, robot=Description(config)))
     assert verdict.code == Code.BAD_SCENE and "'arm'" in verdict.message
 
 
@@ -147,7 +147,7 @@ def test_what_a_urdf_leaves_out_of_masses_is_filled_in(config, pull, tmp_path, w
     assert shoulder.mass == pytest.approx(1000 * size.prod() if what == "mass" else 5.0, rel=1e-3)
     np.testing.assert_allclose(np.sort(shoulder.inertia), np.sort(shoulder.mass * ((size**2).sum() - size**2) / 12), rtol=1e-3)
     scene, plan = pull
-    assert verify(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1).success
+    assert verify_proposal(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1).success
 
 
 @pytest.mark.parametrize("content", ["", "solid nothing\nendsolid nothing\n", "garbage"])
@@ -185,7 +185,7 @@ def test_a_sliding_joint_is_measured_in_metres_and_newtons(config, pull, tmp_pat
     scene, plan = pull
     monkeypatch.setattr(verification.motion_check, "check", lambda *_: None)  # the plan was made for the arm as it was
     soft = ArmOptions(stiffness=(200.0,) + (3000.0,) * 5, damping=(100.0,))
-    verdict = verify(Proposal(*scene, plan, arm_options=soft, robot=robot), repetitions=1)
+    verdict = verify_proposal(Proposal(*scene, plan, arm_options=soft, robot=robot), repetitions=1)
     assert verdict.code == Code.LIMIT_EXCEEDED and "joint_turn lags" in verdict.message and "up to 0.01 m" in verdict.message
     assert 0.01 < verdict.metrics["tracking_error_slide"] < 0.1
 
@@ -195,7 +195,7 @@ def test_a_ur5_with_frankas_hand_does_the_tasks(tmp_path, task):
     config = robots.ur5_with_franka_hand(tmp_path)
     scene, plan = planned(config, task)
     robot = Description(config)
-    verdict = verify(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1)
+    verdict = verify_proposal(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1)
     assert verdict.success, verdict.message
     assert verdict.metrics["torque_ratio"] < 0.6
     film = film_strip(verdict.recording, *scene[1:5], frames=1, columns=1, size=(160, 120), robot=robot)

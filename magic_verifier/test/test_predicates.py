@@ -10,7 +10,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.goal import PREDICATES, from_data, leaf_words
 from magic_verifier.predicates import DECIDED, Asked, told
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 BOX = scenes.block((-0.02, 0.02), (-0.03, 0.03), (-0.05, 0.05))
 
@@ -113,7 +113,7 @@ def test_directions_are_those_of_the_target():
 def pulled(test, trial=None):
     scene, tool, target, motion = scenes.hooking("L", noise=0.0)
     scene = replace(scene, goal=from_data({"test": test, **({"trial": trial} if trial else {})}))
-    return verify(Proposal(scene, tool, target, (), scenes.TABLE, motion), repetitions=1)
+    return verify_proposal(Proposal(scene, tool, target, (), scenes.TABLE, motion), repetitions=1)
 
 
 def moved(by, **beside):
@@ -201,5 +201,5 @@ def test_a_fixed_target_is_not_tried(trial):
     scene, tool, target, motion = scenes.hooking("L", noise=0.0)
     physics = replace(scene.physics, target_is_fixed=True)
     scene = replace(scene, physics=physics, goal=from_data({"test": {"all": [moved(0.1)]}, "trial": trial}))
-    verdict = verify(Proposal(scene, tool, target, (), scenes.TABLE, motion), repetitions=1)
+    verdict = verify_proposal(Proposal(scene, tool, target, (), scenes.TABLE, motion), repetitions=1)
     assert verdict.code == Code.BAD_STRATEGY and "nothing moves it" in verdict.message

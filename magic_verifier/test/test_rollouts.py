@@ -19,7 +19,7 @@ from magic_verifier.rates import decided, fewest, passes, wilson
 from magic_verifier.rollout import Limits, Task, rollout, standing
 from magic_verifier.simulation import DYNAMIC, Probe, World, usable_pieces
 from magic_verifier.uncertainty import ShapeError, Spread
-from magic_verifier.verification import DEFAULTS, ROLLOUTS, Proposal, verify
+from magic_verifier.verification import DEFAULTS, ROLLOUTS, Proposal, verify_proposal
 
 RNG = np.random.default_rng
 
@@ -27,7 +27,7 @@ RNG = np.random.default_rng
 def verdict_of(scene, **options):
     strategy, tool, target, *obstacles, plan = scene
     proposed = {name: options.pop(name) for name in ("seed", "settings", "spreads", "limits") if name in options}
-    return verify(Proposal(strategy, tool, target, tuple(obstacles), scenes.TABLE, plan, **proposed), **options)
+    return verify_proposal(Proposal(strategy, tool, target, tuple(obstacles), scenes.TABLE, plan, **proposed), **options)
 
 
 def test_a_good_motion_is_verified_with_its_interval():

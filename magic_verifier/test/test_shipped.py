@@ -21,7 +21,7 @@ from magic_verifier import rollout, uncertainty, verification
 from magic_verifier.articulation import ArmOptions
 from magic_verifier.demonstration import replay
 from magic_verifier.film import film_strip
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def planner():
 def test_the_floating_demonstration_passes_its_goal_test(name):
     strategy, tool, target, obstacles, candidate = demonstration(name)
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    verdict = verify(Proposal(strategy, tool, target, obstacles, scenes.TABLE, MotionPlan("fg", motion)))
+    verdict = verify_proposal(Proposal(strategy, tool, target, obstacles, scenes.TABLE, MotionPlan("fg", motion)))
     assert verdict.success, verdict.message
 
 
@@ -43,10 +43,10 @@ def test_the_arm_does_the_demonstrated_task(name, planner):
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
     verdicts = []
     for attempt in range(3):
-        plan = planner.plan(
+        plan = planner.solve(
             Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles, attempt=attempt), budget=Budget(30.0)
         )
-        verdicts.append(verify(Proposal(strategy, tool, target, obstacles, scenes.TABLE, plan), repetitions=1))
+        verdicts.append(verify_proposal(Proposal(strategy, tool, target, obstacles, scenes.TABLE, plan), repetitions=1))
         if verdicts[-1].success:
             break
     assert verdicts[-1].success, [v.message for v in verdicts]
@@ -59,18 +59,18 @@ def test_the_arm_does_the_demonstrated_task(name, planner):
 def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
     scene = (strategy, tool, target, obstacles, scenes.TABLE)
-    first, again = verify(Proposal(*scene, plan), repetitions=1), verify(Proposal(*scene, plan), repetitions=1)
+    first, again = verify_proposal(Proposal(*scene, plan), repetitions=1), verify_proposal(Proposal(*scene, plan), repetitions=1)
     assert np.array_equal(first.recording.joints, again.recording.joints)
     assert np.array_equal(first.recording.poses["target"], again.recording.poses["target"])
 
-    weak = verify(Proposal(*scene, plan, arm_options=ArmOptions(grip_force=0.3)), repetitions=1)
+    weak = verify_proposal(Proposal(*scene, plan, arm_options=ArmOptions(grip_force=0.3)), repetitions=1)
     assert weak.code == Code.GRASP_SLIPPED, weak.message
-    soft = verify(Proposal(*scene, plan, arm_options=ArmOptions(stiffness=(20.0,) * 7, damping=(200.0,) * 7)), repetitions=1)
+    soft = verify_proposal(Proposal(*scene, plan, arm_options=ArmOptions(stiffness=(20.0,) * 7, damping=(200.0,) * 7)), repetitions=1)
     assert soft.code == Code.LIMIT_EXCEEDED, soft.message
     away = replace(tool, world_from_object=transforms.make(translation=[0, 0.12, 0]) @ tool.world_from_object)
-    missed = verify(Proposal(strategy, away, *scene[2:], plan))
+    missed = verify_proposal(Proposal(strategy, away, *scene[2:], plan))
     assert missed.code in (Code.GRASP_SLIPPED, Code.LIMIT_EXCEEDED, Code.PRE_CONTACT_COLLISION), missed.message
 
     film = film_strip(first.recording, tool, target, obstacles, scenes.TABLE, frames=2, columns=2, size=(160, 120))
@@ -86,17 +86,17 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
 def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
     # 4 g pull 0.2 kg, whose friction is a hundredth of what the pads hold: the load is that of the motion, as with heavier tools.
     light = replace(strategy, physics=replace(strategy.physics, tool_density=40.0, target_density=3000.0))
-    verdict = verify(Proposal(light, tool, target, obstacles, scenes.TABLE, plan), repetitions=1)
+    verdict = verify_proposal(Proposal(light, tool, target, obstacles, scenes.TABLE, plan), repetitions=1)
     assert verdict.success and verdict.metrics["grip_load"] < 0.5, (verdict.message, verdict.metrics)
 
 
 def test_a_seen_tool_is_taken_hold_of_in_each_rollout(planner, monkeypatch):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
-    plan = planner.plan(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
 
     def drawn_rollout(item):
         task = verification.make_task(Proposal(strategy, item, target, obstacles, scenes.TABLE, plan))

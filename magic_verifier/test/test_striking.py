@@ -18,7 +18,7 @@ from magic_planner.object_motion import plan_tool_motion
 from magic_verifier import evaluate as ev
 from magic_verifier.cases import Options, all_cases, tool_names
 from magic_verifier.subjects import scene_for
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
 
@@ -32,7 +32,7 @@ def shown(name, repetitions=1, tool=None, contact=None, **physics):
     item = tool.as_object("tool", transforms.make(translation=[0.4, -0.3, 0.02]))
     candidate = ContactCandidate("tool", contact or strategy.tool_contact, strategy.target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
     motion = plan_tool_motion(strategy, item, target, candidate, "keep", ev.TABLE, obstacles)
-    return verify(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=repetitions)
+    return verify_proposal(Proposal(strategy, item, target, obstacles, ev.TABLE, MotionPlan("fg", motion)), repetitions=repetitions)
 
 
 @pytest.mark.parametrize("name", ["hammering", "sweeping"])

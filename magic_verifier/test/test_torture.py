@@ -16,7 +16,7 @@ from magic_core.strategy import Physics
 from magic_verifier import posing
 from magic_verifier.floating import settled
 from magic_verifier.simulation import MAX_PIECES, usable_pieces
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify_proposal
 
 
 def hook(tool=None, target=None, obstacles=()):
@@ -24,7 +24,7 @@ def hook(tool=None, target=None, obstacles=()):
     strategy, own_tool, own_target, motion = scenes.hooking("L")
     started = time.process_time()
     given = strategy, tool or own_tool, target or own_target, obstacles, scenes.TABLE, motion
-    verdict = verify(Proposal(*given), repetitions=1, deadline=time.monotonic() + 20.0)
+    verdict = verify_proposal(Proposal(*given), repetitions=1, deadline=time.monotonic() + 20.0)
     return verdict, time.process_time() - started
 
 

@@ -14,13 +14,13 @@ from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, ToolMotion
 from magic_verifier.rollout import Limits
 from magic_verifier.simulation import Settings
-from magic_verifier.verification import Proposal, verify
+from magic_verifier.verification import Proposal, verify, verify_proposal
 
 
 def judge(strategy, tool, target, motion, obstacles=(), **options):
     """The scene as given alone, unless told otherwise: what a goal test says does not hang on what is drawn."""
     proposed = {name: options.pop(name) for name in ("seed", "settings", "limits") if name in options}
-    return verify(Proposal(strategy, tool, target, obstacles, scenes.TABLE, motion, **proposed), **{"repetitions": 1, **options})
+    return verify_proposal(Proposal(strategy, tool, target, obstacles, scenes.TABLE, motion, **proposed), **{"repetitions": 1, **options})
 
 
 @pytest.mark.parametrize("radius", [0.015, 0.025, 0.035])
@@ -189,3 +189,12 @@ def test_an_exploding_simulation_is_reported():
 def test_frequency_changes_little():
     pulled = [judge(*scenes.hooking("L", noise=0.0), settings=Settings(frequency=f)).metrics["pulled_distance"] for f in (240.0, 480.0)]
     assert pulled[0] == pytest.approx(pulled[1], abs=0.003)
+
+
+def test_a_plan_by_its_parts_is_judged_as_a_proposal_is():
+    strategy, tool, target, motion = scenes.hooking("L", 0.03, 0.0)
+    limits = Limits(required_rate=0.5)
+    proposal = Proposal(strategy, tool, target, (), scenes.TABLE, motion, 3, limits=limits)
+    one = verify_proposal(proposal, repetitions=2)
+    other = verify(strategy, tool, target, (), scenes.TABLE, None, motion, seed=3, limits=limits, repetitions=2, deadline=None)
+    assert (one.code, one.message, one.metrics) == (other.code, other.message, other.metrics)

@@ -36,7 +36,7 @@ def replay(
     strategy: Strategy, tool: Shape, tool_contact: object, target: Shape, target_contact: object, world_from_target: np.ndarray
 ) -> object:
     from magic_planner.object_motion import plan_tool_motion
-    from magic_verifier.verification import Proposal, verify
+    from magic_verifier.verification import Proposal, verify_proposal
 
     further = tuple(Companion(pair.name, pair.tool, pair.target) for pair in strategy.contacts)
     candidate = ContactCandidate("tool", tool_contact, target_contact, 0.0, False, 1.0, 1.0, 1.0, np.eye(4), further)
@@ -44,7 +44,7 @@ def replay(
     target_object = target.as_object("target", world_from_target)
     motion = plan_tool_motion(strategy, tool.as_object("tool", np.eye(4)), target_object, candidate, obstacles=obstacles)
     tool_object = tool.as_object("tool", motion.world_from_tool[0])
-    return verify(Proposal(strategy, tool_object, target_object, obstacles, TABLE, MotionPlan("fg", motion)), repetitions=1)
+    return verify_proposal(Proposal(strategy, tool_object, target_object, obstacles, TABLE, MotionPlan("fg", motion)), repetitions=1)
 
 
 def test_the_files_are_those_of_the_script(strategy: Strategy, tmp_path: Path) -> None:
