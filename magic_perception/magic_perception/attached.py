@@ -7,7 +7,6 @@ wide whose depth is torn from the outside's; a bent wire has the table's depth b
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,9 +14,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_perception import smear
-
-if TYPE_CHECKING:
-    from magic_perception.segmentation import Looked
+from magic_perception.looks import Looked
 
 #: The widest gap and least height over the table of what hangs in the air, m; the largest difference in chromaticity (R, G, B over their sum); pixels in
 #: which both are neighbours.

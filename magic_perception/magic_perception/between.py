@@ -7,14 +7,12 @@ colour stays one: a thin thing's mask may be torn.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from magic_perception.segmentation import Clusters, Looked
+from magic_perception.clustered import Clusters
+from magic_perception.looks import Looked
 
 #: Least difference of two things' middle colours, in the two colour axes or in lightness (OpenCV's Lab of 8 bits): sides in the shade differ in lightness.
 HUE, LIGHTNESS = 12.0, 60.0

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_perception import convexity
-from magic_perception.segmentation import Looked
+from magic_perception.looks import Looked
 
 #: Metres and radians up to which cameras are brought together: half of it is how far either may be from the truth.
 MOST_OFFSET, MOST_ANGLE = 0.010, float(np.radians(1.5))
@@ -357,7 +357,7 @@ def measure(
     """The disagreement of each pair of cameras that see the same sides of things.
 
     looks and labels (H, W) as a segmenter has them; given (4, 4) each: the cameras' poses as they were given, before
-    :func:`magic_perception.segmentation.look` put each camera's own plane onto the table.
+    :func:`magic_perception.looks.look` put each camera's own plane onto the table.
     """
     rng = np.random.default_rng(seed)
     witnesses = [_witness(look, image, POINTS, rng) for look, image in zip(looks, labels, strict=True)]

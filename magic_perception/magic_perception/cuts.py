@@ -13,16 +13,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import clusters, logistic
-
-if TYPE_CHECKING:
-    from magic_perception.segmentation import Clusters, Looked
+from magic_perception.clustered import Clusters
+from magic_perception.looks import Looked
 
 #: What is measured at an upright plane between two sides of a cluster, and what it means.
 CRITERIA = {

@@ -35,9 +35,10 @@ from magic_core.rendering import Raycaster
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.views import find_view, holes_of
 from magic_perception import coverage, measures, speed
+from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
-from magic_perception.segmentation import Looked, Segmenter, _frame_on, find_table, look
+from magic_perception.segmentation import Segmenter
 from magic_perception.segmenters import make_segmenter
 from magic_perception.table import camera_over_table
 
@@ -92,7 +93,7 @@ def osd_scenes(folder: Path) -> Iterator[tuple[str, RgbdFrame, NDArray[np.int64]
 def looked_at(frame: RgbdFrame, parameters: Parameters) -> Looked:
     """A frame over the table that it sees."""
     table, own = find_table([frame], parameters)
-    return look(frame, own[0], _frame_on(table, np.eye(4)), parameters)
+    return look(frame, own[0], frame_on(table, np.eye(4)), parameters)
 
 
 def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_perception.segmentation import Looked, color_distance
+from magic_perception.foreground import color_distance
+from magic_perception.looks import Looked
 
 #: Least size of a region without depth, m; least share of its surroundings that is seen to be the table; least share of its pixels
 #: of another colour than the table there, and how that differs, in squared standard deviations.

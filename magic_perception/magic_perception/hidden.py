@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.camera import SURELY
 from magic_core.mesh import Mesh
-from magic_perception.segmentation import Looked
+from magic_perception.looks import Looked
 
 #: In images of labels: the robot, or what else of no interest stands before the scene (``RgbdFrame.blind``).
 ROBOT = -2

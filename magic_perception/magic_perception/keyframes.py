@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_perception import cameras
-from magic_perception.segmentation import Looked
+from magic_perception.looks import Looked
 
 #: Two frames show the same from places nearer than this, m, with axes nearer than this, rad; and a camera has stood still within these.
 NEAR, TURNED = 0.08, float(np.radians(12))

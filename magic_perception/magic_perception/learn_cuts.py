@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import cuts, logistic, neighbours
+from magic_perception.clustered import clustered
+from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import Parameters
 from magic_perception.piles import Pile, pile
 from magic_perception.seams import learned
-from magic_perception.segmentation import DepthSegmenter, Looked, _frame_on, clustered, find_table, look, uncut
+from magic_perception.segmentation import DepthSegmenter, uncut
 
 #: What has so little of a cluster is no thing of it; a plane leaves a thing whole that has so little of itself on one side.
 TRACE, WHOLE = 0.05, 0.1
@@ -47,7 +49,7 @@ class Cluster:
 def looked_at(made: Pile, parameters: Parameters) -> list[Looked]:
     """The frames of a procedural scene over their table."""
     table, own = find_table(made.frames, parameters)
-    return [look(frame, plane, _frame_on(table, np.eye(4)), parameters) for frame, plane in zip(made.frames, own, strict=True)]
+    return [look(frame, plane, frame_on(table, np.eye(4)), parameters) for frame, plane in zip(made.frames, own, strict=True)]
 
 
 def clusters_of(made: Pile, parameters: Parameters, scene: int, kind: str) -> list[Cluster]:

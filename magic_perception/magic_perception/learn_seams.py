@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import convexity, evaluate, logistic, measures, seams
+from magic_perception.clustered import clustered, surfaces
+from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import Parameters
 from magic_perception.piles import pile
-from magic_perception.segmentation import DepthSegmenter, Looked, _frame_on, clustered, find_table, look, surfaces
+from magic_perception.segmentation import DepthSegmenter
 
 #: A part is a thing's where so much of it is; less tells nothing.
 PURE = 0.8
@@ -153,7 +155,7 @@ def _procedural(seed: int) -> _Scene:
     made = pile(seed)
     parameters = Parameters(region_low=(-0.3, -0.8, -0.05), region_high=(1.3, 0.8, 0.6))
     table, own = find_table(made.frames, parameters)
-    looks = [look(frame, plane, _frame_on(table, np.eye(4)), parameters) for frame, plane in zip(made.frames, own, strict=True)]
+    looks = [look(frame, plane, frame_on(table, np.eye(4)), parameters) for frame, plane in zip(made.frames, own, strict=True)]
     found = clusters_of(looks, list(made.truth), parameters)
     return _Scene(f"pile {seed}", [], np.zeros((0, 0)), found, examples(found, 1.0), made.things)
 

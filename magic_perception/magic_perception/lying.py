@@ -13,8 +13,8 @@ from shapely.geometry import Polygon
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate
 from magic_perception import polygons
+from magic_perception.foreground import open_by_two
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import open_by_two
 from magic_perception.sight import Sight, carve, surfaces
 from magic_perception.solids import Reconstruction, extruded, joined
 

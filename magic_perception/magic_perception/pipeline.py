@@ -22,11 +22,12 @@ from magic_perception import attached, cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
 from magic_perception.glass import once, unmeasured
 from magic_perception.hidden import ROBOT, hangs, mostly_held, parted, veil
+from magic_perception.looks import Looked, each, find_table, frame_on, look
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.room import bordered, room
 from magic_perception.seen import cut_off, joined, witnessed
-from magic_perception.segmentation import DepthSegmenter, Looked, Segmenter, _frame_on, each, find_table, look
+from magic_perception.segmentation import DepthSegmenter, Segmenter
 from magic_perception.sight import agreement
 from magic_perception.smear import behind
 from magic_perception.solids import hangs_together, hull_of
@@ -176,7 +177,7 @@ def _table_frame(table: Plane, parameters: Parameters) -> NDArray[np.float64]:
     near = abs(table.heights(np.zeros(3))) < parameters.snap_height
     if parameters.snap_height > 0 and table.tilt() < parameters.snap_tilt and near:
         return np.eye(4)
-    return _frame_on(table, np.eye(4))
+    return frame_on(table, np.eye(4))
 
 
 @dataclass(frozen=True)

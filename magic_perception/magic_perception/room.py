@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.mesh import Mesh
 from magic_perception.hidden import ROBOT
-from magic_perception.segmentation import Looked
+from magic_perception.looks import Looked
 
 #: Edge of a cell, m, where there are no more cells than the second; so far about the solid they are looked at.
 CELL, CELLS, MARGIN = 0.004, 300_000, 0.045

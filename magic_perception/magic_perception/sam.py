@@ -16,8 +16,11 @@ from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters
+from magic_perception.foreground import foreground
+from magic_perception.labels import sizeable
+from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import DepthSegmenter, Looked, _sizeable, foreground
+from magic_perception.segmentation import DepthSegmenter
 
 #: Weights taken where none are named; the hub is asked only then.
 DEFAULTS = {"sam": "facebook/sam-vit-base", "sam2": "facebook/sam2.1-hiera-tiny"}
@@ -29,7 +32,7 @@ _STD = np.array([0.229, 0.224, 0.225], np.float32)
 class SamSegmenter:
     """The ``depth`` segmenter's clusters as prompts (a box and three points each), SAM's masks as the answer.
 
-    Both go through :func:`magic_perception.segmentation.foreground`, so that edges and holes are as sharp as those of ``depth``.
+    Both go through :func:`magic_perception.foreground.foreground`, so that edges and holes are as sharp as those of ``depth``.
     weights: a hub name or a local folder.  A mask that does not agree with its prompt (IoU below ``agree``) is refused,
     and the cluster's own mask kept: a confident network is no reason to lose an object.
     Raises ``SEGMENTER_WEIGHTS`` where the weights cannot be loaded.
@@ -62,7 +65,7 @@ class SamSegmenter:
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`magic_perception.segmentation.Segmenter`."""
         labels = DepthSegmenter().segment(looks, known, parameters)
-        return _sizeable([self._refine(looked, image, parameters) for looked, image in zip(looks, labels, strict=True)], looks, parameters)
+        return sizeable([self._refine(looked, image, parameters) for looked, image in zip(looks, labels, strict=True)], looks, parameters)
 
     def _refine(self, looked: Looked, labels: NDArray[np.int32], parameters: Parameters) -> NDArray[np.int32]:
         numbers = [int(n) for n in np.unique(labels) if n > 0]

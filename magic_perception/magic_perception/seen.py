@@ -12,8 +12,8 @@ from magic_core import scene, transforms
 from magic_core.mesh import Mesh
 from magic_core.scene import FIXTURE, PICTURE, REGION
 from magic_perception.hidden import ROBOT
+from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import Looked
 from magic_perception.sight import Sight
 
 #: A thing is cut off where at least so much of its outline, m, borders on what hides it.

@@ -13,8 +13,8 @@ import trimesh
 from magic_core import transforms
 from magic_core.mesh import Mesh
 from magic_perception import attached
+from magic_perception.looks import look
 from magic_perception.parameters import Parameters
-from magic_perception.segmentation import look
 from magic_perception.table import Plane
 
 PLANE = Plane(np.array([0.0, 0.0, 1.0, 0.0]))

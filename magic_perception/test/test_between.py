@@ -12,9 +12,9 @@ from magic_core.mesh import Mesh, concatenate
 from magic_core.rendering import canonical_view
 from magic_core.scene import SceneObject
 from magic_perception import between
+from magic_perception.looks import look
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import perceive
-from magic_perception.segmentation import look
 from magic_perception.table import Plane
 
 BLUE, RED = (60, 90, 200), (180, 60, 50)

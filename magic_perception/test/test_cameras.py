@@ -13,10 +13,10 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate
 from magic_core.scene import SceneObject
 from magic_core.views import find_view
+from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.seen import joined
-from magic_perception.segmentation import Looked
 from magic_perception.solids import hangs_together
 from magic_perception.surface_error import distance
 from magic_perception.table import camera_over_table, table_in_view

@@ -18,9 +18,13 @@ from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.mesh import Mesh
 from magic_perception import evaluate, measures
 from magic_perception.averaging import average
+from magic_perception.behind_one import one_face
+from magic_perception.labels import with_depth
+from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import perceive
-from magic_perception.segmentation import DepthSegmenter, Looked, _on_surfaces, _one_face, _with_depth
+from magic_perception.segmentation import DepthSegmenter
+from magic_perception.surface_edges import on_surfaces
 
 RED, BLUE, WOOD, DARK, BLACK, LACQUER = (180, 60, 50), (50, 80, 170), (186, 152, 112), (34, 32, 31), (12, 12, 13), (90, 88, 86)
 POSE = scenes.pose([0.12, 0.30, 0.55], [0.5, 0.0, 0.02])
@@ -147,7 +151,7 @@ def test_a_seam_in_steps_follows_the_surfaces():
     )
     stepped[(truth > 0) & (stepped == 0)] = 1
     stepped = np.where(truth > 0, stepped, 0)
-    sharp = _on_surfaces(stepped, look)
+    sharp = on_surfaces(stepped, look)
     seams = [(image != truth) & (truth > 0) for image in (stepped, sharp)]
     assert np.count_nonzero(seams[1]) < 0.7 * np.count_nonzero(seams[0])
     assert np.array_equal(sharp > 0, stepped > 0)
@@ -162,7 +166,7 @@ def test_a_thin_bar_before_another_thing_keeps_its_width():
     depth += np.random.default_rng(0).normal(0, 0.001, depth.shape).astype(np.float32)
     frame = RgbdFrame(np.zeros((200, 200, 3), np.uint8), depth, Intrinsics(200, 200, 600.0, 600.0, 100.0, 100.0), np.eye(4), "camera")
     look = Looked(frame, depth, depth, np.ones_like(labels, bool), np.full_like(depth, 0.0015))
-    assert np.array_equal(_on_surfaces(labels, look), labels)
+    assert np.array_equal(on_surfaces(labels, look), labels)
 
 
 def test_what_has_hardly_any_depth_of_its_own_is_no_thing():
@@ -176,7 +180,7 @@ def test_what_has_hardly_any_depth_of_its_own_is_no_thing():
     depth = np.where(np.isfinite(heights), 0.8, np.nan).astype(np.float32)
     frame = RgbdFrame(np.zeros((*shape, 3), np.uint8), depth, Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0), np.eye(4), "camera")
     look = Looked(frame, heights, heights, np.ones(shape, bool), np.full(shape, 0.001, np.float32))
-    (kept,) = _with_depth([labels], [look], Parameters())
+    (kept,) = with_depth([labels], [look], Parameters())
     assert kept[40, 40] == 1 and kept.max() == 1
 
 
@@ -188,7 +192,7 @@ def test_a_face_that_the_picture_ends_is_one_with_what_lies_in_its_plane(behind,
     depth[:, 100:] += behind
     frame = RgbdFrame(np.zeros((*labels.shape, 3), np.uint8), depth, Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0), np.eye(4), "camera")
     look = Looked(frame, depth, depth, np.ones(labels.shape, bool), np.full_like(depth, 0.001), np.array([0.0, -1.0, 0.0]))
-    assert _one_face(look, labels, 1, 2) == one
+    assert one_face(look, labels, 1, 2) == one
 
 
 def test_beside_a_post_a_cup_does_not_end():

@@ -18,10 +18,10 @@ from magic_core.sensor import D435, capture, looking_at, scene_raycaster
 from magic_core.shapes import make
 from magic_perception.averaging import average, unchanged
 from magic_perception.hidden import ROBOT, parted
+from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.robot_in_view import Held, RobotInView
-from magic_perception.segmentation import Looked
 
 CAMERAS = {"left": looking_at([0.94, 0.42, 0.66], [0.52, 0.0, 0.04]), "right": looking_at([0.94, -0.42, 0.66], [0.52, 0.0, 0.04])}
 OVER_THE_TABLE = np.array([0.0, 0.35, 0.0, -2.1, 0.0, 2.45, np.pi / 4, 0.04, 0.04])

@@ -1,0 +1,133 @@
+"""What is above the table, by what hangs together in space, and the surfaces that seams are found by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.mesh import Mesh
+from magic_perception import clusters, convexity, smear
+from magic_perception.foreground import foreground, near_known
+from magic_perception.looks import Looked, each
+from magic_perception.parameters import Parameters
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """What is above the table, by what hangs together in space.
+
+    masks (H, W) for each look, without what is known; fixed (H, W): what is; table (H, W): what has the table's colour.  spots: rows and columns of the mask's pixels with depth in
+    each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1 for noise.
+    """
+
+    masks: list[NDArray[np.bool_]]
+    fixed: list[NDArray[np.bool_]]
+    table: list[NDArray[np.bool_]]
+    spots: list[tuple[NDArray, NDArray]]
+    cloud: NDArray[np.float32]
+    instance: NDArray[np.int64]
+
+
+def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> Clusters:
+    """The clusters in all looks together; known: meshes (world) that are left out."""
+    masks, tables = zip(*each(lambda looked: foreground(looked, parameters), looks, parameters.workers), strict=True)
+    fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
+    masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
+    spots = [
+        np.nonzero(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights))
+        for mask, looked in zip(masks, looks, strict=True)
+    ]
+    cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
+    between = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]
+    instance = clusters.cluster(np.concatenate([cloud, *between]), parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
+    # A cluster of nothing but bridges is none.
+    instance = instance[: len(cloud)]
+    instance[instance >= 0] = np.unique(instance[instance >= 0], return_inverse=True)[1]
+    return Clusters(masks, fixed, list(tables), spots, cloud, instance)
+
+
+#: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise, m.
+STEEP, NOISE = 1.0, 0.004
+
+
+def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> NDArray[np.float32]:
+    """Points (N, 3), world, across the gaps in a mask's depth: what colour shows to be one thing is not two for want of depth.
+
+    Each pixel without depth goes to the nearest that has it; where two of these regions meet, straight lines join the pixels they go to.
+    """
+    x, y, w, h = cv2.boundingRect((mask & ~np.isfinite(looked.frame.depth)).view(np.uint8))
+    # As wide a margin as a pixel without depth may be from one with it.
+    cut = (slice(max(y - 16, 0), y + h + 16), slice(max(x - 16, 0), x + w + 16))
+    own, z = mask[cut], looked.frame.depth[cut]
+    seen = own & np.isfinite(z)
+    if w == 0 or not seen.any():
+        return np.zeros((0, 3), np.float32)
+    _, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    source = np.zeros(int(index.max()) + 1, np.int64)
+    source[index[seen]] = np.flatnonzero(seen)
+    goes, flat = source[index], cv2.connectedComponents(own.view(np.uint8), connectivity=8)[1].ravel()
+    meetings = []
+    for axis in range(2):
+        one, two, here, there, first, second = (
+            np.moveaxis(image, axis, 0)[part] for image in (goes, own, seen) for part in (slice(None, -1), slice(1, None))
+        )
+        meet = here & there & (one != two) & ~(first & second)
+        meetings.append(np.minimum(one[meet], two[meet]) * own.size + np.maximum(one[meet], two[meet]))
+    a, b = np.divmod(np.unique(np.concatenate(meetings)), own.size)
+    (v0, u0), (v1, u1) = (np.divmod(i, own.shape[1]) for i in (a, b))
+    z0, z1, apart = z.ravel()[a].astype(float), z.ravel()[b].astype(float), np.hypot(u1 - u0, v1 - v0)
+    k = looked.frame.intrinsics
+    even = (apart > 2) & (flat[a] == flat[b]) & (np.abs(z1 - z0) < STEEP * apart * np.minimum(z0, z1) / k.fx + NOISE)
+    t = np.linspace(0, 1, samples)[1:-1, None]
+    u, v = (((1 - t) * p[even] + t * q[even]).ravel() for p, q in ((u0, u1), (v0, v1)))
+    middle = (1 / ((1 - t) / z0[even] + t / z1[even])).ravel()
+    local = np.column_stack([(u + cut[1].start - k.cx) / k.fx * middle, (v + cut[0].start - k.cy) / k.fy * middle, middle])
+    return transforms.apply(looked.frame.world_from_camera, local).astype(np.float32)
+
+
+#: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
+POINTS, TALL = 1500, 0.05
+
+#: From this height on, m, a cluster may be the inside or the outside of another.
+RAISED = 0.02
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The points of all clusters (N,): unit normals (N, 3), NaN outside of the raised clusters and where there is none; heights (N,) above the table, m;
+    colours (N, 3), 0..255.  tall: the indices of the points of each cluster that may be more than one thing."""
+
+    normal: NDArray[np.float32]
+    heights: NDArray[np.float32]
+    rgb: NDArray[np.float32]
+    tall: list[NDArray[np.int64]]
+
+
+def surfaces(looks: list[Looked], found: Clusters) -> Surfaces:
+    """Of the clusters what their seams are found by."""
+    heights = np.concatenate([looked.heights[where] for looked, where in zip(looks, found.spots, strict=True)])
+    rgb = np.concatenate([looked.frame.color[where] for looked, where in zip(looks, found.spots, strict=True)]).astype(np.float32)
+    members = [np.nonzero(found.instance == label)[0] for label in range(int(found.instance.max(initial=-1)) + 1)]
+    tops = [float(np.percentile(heights[mine], 97)) if len(mine) >= POINTS else 0.0 for mine in members]
+    tall = [mine for mine, top in zip(members, tops, strict=True) if top >= TALL]
+    normal = np.full((len(found.cloud), 3), np.nan, np.float32)
+    flags = np.zeros(len(found.cloud), bool)
+    for mine, top in zip(members, tops, strict=True):
+        flags[mine] = top >= RAISED
+    start = 0
+    for looked, (rows, columns) in zip(looks, found.spots, strict=True):
+        here = flags[start : start + len(rows)]
+        if here.any():
+            v, u = rows[here], columns[here]
+            r0, r1 = max(int(v.min()) - 8, 0), min(int(v.max()) + 9, looked.heights.shape[0])
+            c0, c1 = max(int(u.min()) - 8, 0), min(int(u.max()) + 9, looked.heights.shape[1])
+            window = looked.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
+            field = convexity.normals(window, looked.frame.world_from_camera[:3, 3])
+            near = np.nonzero((rows >= r0) & (rows < r1) & (columns >= c0) & (columns < c1))[0]
+            normal[start + near] = field[rows[near] - r0, columns[near] - c0]
+        start += len(rows)
+    return Surfaces(normal, heights, rgb, tall)

@@ -1,0 +1,242 @@
+"""Which pixels are of things on the table, by depth and the table's colour together: no table, shadow or smear, nothing that is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core import transforms
+from magic_core.mesh import Mesh
+from magic_perception import clusters, smear
+from magic_perception.looks import Looked
+from magic_perception.parameters import Parameters
+
+
+def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean of values over a size x size window, counting only where weights are, and the share of the window that counts."""
+    share = cv2.blur(weights, (size, size), borderType=cv2.BORDER_CONSTANT)
+    total = cv2.blur(values * (weights[..., None] if values.ndim == 3 else weights), (size, size), borderType=cv2.BORDER_CONSTANT)
+    safe = np.maximum(share, 1e-6)
+    return total / (safe[..., None] if values.ndim == 3 else safe), share
+
+
+def masked_mean_at(
+    values: NDArray[np.float32], weights: NDArray[np.float32], size: int, where: tuple[NDArray, NDArray]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """:func:`masked_mean` of values (H, W, C) at some pixels only: (N, C) and (N,)."""
+    share = cv2.blur(weights, (size, size), borderType=cv2.BORDER_CONSTANT)[where]
+    total = cv2.blur(values * weights[..., None], (size, size), borderType=cv2.BORDER_CONSTANT)[where]
+    return total / np.maximum(share, np.float32(1e-6))[:, None], share
+
+
+def open_by_two(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Morphological opening by 2 x 2 pixels; with OpenCV's own even kernels the mask would move by a pixel."""
+    kernel = np.ones((2, 2), np.uint8)
+    return cv2.dilate(cv2.erode(mask.astype(np.uint8), kernel, anchor=(0, 0)), kernel, anchor=(1, 1)) > 0
+
+
+def _total(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The sum over three channels, which numpy's own sum does slowly along a short axis."""
+    return values[..., 0] + values[..., 1] + values[..., 2]
+
+
+#: How dark a shadow is at the darkest, in the lightness of what lies in it.
+DARKEST = 0.45
+
+
+def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+    """How far each pixel's colour is from the table's around it, in squared standard deviations, the same where darkness
+    may be a shadow's (both (H, W)), and the threshold of notice.
+
+    The table's colour and its spread are local means over the pixels of ``table`` (a wooden grain has a large
+    spread, so nothing stands out from it lightly); the threshold is what 99.7 % of the table stays below, at least 25.
+    """
+    lab = cv2.cvtColor(cv2.GaussianBlur(looked.frame.color, (3, 3), 0), cv2.COLOR_RGB2LAB)
+    small = cv2.resize(lab, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32)
+    weights = (cv2.resize(table.astype(np.float32), small.shape[1::-1], interpolation=cv2.INTER_AREA) > 0.99).astype(np.float32)
+    mean, share = masked_mean(small, weights, 31)
+    variance, _ = masked_mean((small - mean) ** 2, weights, 31)
+    far = share < 0.05
+    if weights.sum() > 50:
+        whole = small[weights > 0]
+        mean[far], variance[far] = whole.mean(axis=0), whole.var(axis=0)
+    size = lab.shape[1::-1]
+    # Floor: 3 grey levels of noise in lightness, 2 in colour.
+    weight = 1 / (variance + np.array([9.0, 4.0, 4.0], np.float32))
+    distance, shaded = np.zeros(lab.shape[:2], np.float32), np.zeros(lab.shape[:2], np.float32)
+    for channel in range(3):
+        here, scale = cv2.resize(mean[..., channel], size), cv2.resize(weight[..., channel], size)
+        offset = cv2.subtract(cv2.extractChannel(lab, channel), here, dtype=cv2.CV_32F)
+        if channel == 0:
+            shade = np.minimum(1 + offset / np.maximum(here, 1), 1)
+            light = np.where(shade > DARKEST, np.maximum(offset, 0), offset)
+            cv2.accumulateProduct(light * light, scale, shaded)
+        else:
+            # In a shadow both colour axes shrink with the lightness.
+            less = offset + (1 - shade) * (here - 128)
+            cv2.accumulateProduct(less * less, scale, shaded)
+        offset *= offset
+        cv2.accumulateProduct(offset, scale, distance)
+    sample = np.flatnonzero(table)
+    threshold = max(25.0, float(np.percentile(np.take(distance, sample[::7]), 99.7))) if len(sample) > 500 else np.inf
+    return distance, shaded, threshold
+
+
+def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it; and (H, W)
+    those of the table's colour, in the light or in a shadow."""
+    h, inside = looked.heights, looked.open
+    valid = np.isfinite(h)
+    zero = np.where(valid, h, np.float32(0))
+    limit = np.maximum(np.float32(parameters.min_height), np.float32(4.0) * looked.sigma)
+    raised = (zero > limit) & inside
+    raised = cv2.morphologyEx(raised.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(bool)
+    if not parameters.use_color:
+        return raised, np.zeros_like(raised)
+    around = cv2.dilate(raised.view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
+    table = _outside(valid & (np.abs(zero) < limit) & inside & ~around, raised)
+    if np.count_nonzero(table) < 500:
+        return raised, np.zeros_like(raised)
+    distance, shaded, threshold = color_distance(looked, table)
+    if not np.isfinite(threshold):
+        return raised, np.zeros_like(raised)
+    other = (distance > threshold) & inside
+    # Of another colour and a little above the table on the average of a window: a thin thing.  A shadow or a print lies at 0.
+    near = other & valid & (zero < 0.03)
+    total = cv2.blur(np.where(near, looked.raw, np.float32(0)), (9, 9), borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(near.astype(np.float32), (9, 9), borderType=cv2.BORDER_CONSTANT)
+    thin = other & (share * np.float32(81) > 8) & (total > share * np.maximum(np.float32(0.0015), looked.sigma * np.float32(1.2)))
+    core = raised | thin
+    # Grow into pixels without depth that have another colour and touch what is there.
+    unseen = other & ~valid
+    result = clusters.connected(core | unseen, core)
+    result = _fill_bowls(result, looked, other, parameters)
+    color, depth, focal = looked.frame.color, looked.frame.depth, looked.frame.intrinsics.fx
+    # Where depth goes on beyond a thing's edge it was not carried there.
+    firm = result & ~(jump := smear.falls_back(result, depth, focal))
+    result = smear.cleared(result, color, depth, table, shaded, inside & (distance > 9), jump, focal)
+    result = _two_colors(result, looked, table, firm)
+    return open_by_two(result), shaded < smear.LIKE
+
+
+def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:
+    """The table without what lies in the convex hull of something raised: the floor of a bowl is as low as the table, but has the bowl's colour.
+
+    What spans more than ``share`` of the picture (a tray's rim, a wall) encloses the table itself.
+    """
+    covered = np.zeros(table.shape, np.uint8)
+    outlines, _ = cv2.findContours(raised.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    for outline in outlines:
+        hull = cv2.convexHull(outline)
+        if cv2.contourArea(hull) < share * table.size:
+            cv2.fillConvexPoly(covered, hull, 1)
+    return table & (covered == 0)
+
+
+def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_], parameters: Parameters) -> NDArray[np.bool_]:
+    """Fill holes of a mask that are not the table: of another colour, or a little higher (the floor of a spoon's bowl is a few mm up)."""
+    outside = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
+    cv2.floodFill(outside, None, (0, 0), 2)
+    holes = (outside[1:-1, 1:-1] == 1).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
+    result = mask.copy()
+    for i in range(1, count):
+        x, y, w, h, area = stats[i]
+        window = (slice(y, y + h), slice(x, x + w))
+        part = labels[window] == i
+        heights = looked.raw[window][part]
+        heights = heights[np.isfinite(heights)]
+        # The fewer that are raised one by one are smear of the hole's rim: they tell nothing of its floor.
+        high = heights > max(parameters.min_height, 4.0 * float(np.median(looked.sigma[window][part])))
+        heights = heights[~high] if 2 * np.count_nonzero(high) <= len(heights) else heights
+        if area < 12 or other[window][part].mean() > 0.7:
+            result[window] |= part
+        elif len(heights) > 15:
+            # Standard error of the middle of a hole, for noise that is correlated over some 5 pixels.
+            error = float(np.median(looked.sigma[window][part])) * 3.0 / np.sqrt(len(heights) / 5)
+            if np.median(heights) > max(0.0012, 3 * error):
+                result[window] |= part
+    return result
+
+
+def _two_colors(
+    mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], firm: NDArray[np.bool_], reach: int = 3
+) -> NDArray[np.bool_]:
+    """Move a mask's edge to where the colour is half way between the thing's and the table's next to it.
+
+    Depth fattens edges by some pixels and a threshold on colour by one; pixels within ``reach`` of the edge are judged
+    anew by the share of the thing's colour in theirs, wherever the two colours differ enough to tell; those of ``firm`` (H, W) stay.
+    """
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    small = mask.astype(np.uint8)
+    wide = cv2.dilate(small, kernel)
+    band = (wide > 0) & ~(cv2.erode(small, kernel) > 0) & looked.open
+    if not band.any():
+        return mask
+    inner = (cv2.erode(small, np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
+    # A thread of two pixels has no inside: its own pixels stand for it.
+    thin = mask & (cv2.dilate(inner, np.ones((7, 7), np.uint8)) == 0)
+    inner[thin] = 1.0
+    free = (table & ~(cv2.dilate(small, np.ones((5, 5), np.uint8)) > 0)).astype(np.float32)
+    result = mask.copy()
+    # Each thing in its own window; the means look at most 15 pixels around, so that the windows change nothing.
+    _, _, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
+    for x, y, w, h, _ in stats[1:]:
+        margin = 16
+        r0, r1, c0, c1 = max(y - margin, 0), min(y + h + margin, mask.shape[0]), max(x - margin, 0), min(x + w + margin, mask.shape[1])
+        cut = (slice(r0, r1), slice(c0, c1))
+        lab = cv2.cvtColor(np.ascontiguousarray(looked.frame.color[cut]), cv2.COLOR_RGB2LAB).astype(np.float32)
+        where = np.zeros(lab.shape[:2], bool)
+        middle = (slice(y - r0, y - r0 + h), slice(x - c0, x - c0 + w))
+        where[middle] = band[cut][middle]
+        where = np.nonzero(where)
+        own, share = masked_mean_at(lab, inner[cut], 13, where)
+        ground, ground_share = masked_mean_at(lab, free[cut], 31, where)
+        difference = own - ground
+        length = _total(difference**2)
+        offset = lab[where] - ground
+        part = _total(offset * difference) / np.maximum(length, 1.0)
+        # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
+        rest = _total((offset - part[..., None] * difference) ** 2)
+        before = mask[cut][where]
+        told = ~(firm[cut][where] & before) & ((rest < 9.0**2) | ~before) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
+        # Grow only into what depth does not contradict, and by what touches the mask.
+        with np.errstate(invalid="ignore"):
+            possible = ~(looked.heights[cut][where] <= -0.006)
+        result[cut][where] = np.where(told, (part > 0.5) & (before | possible), result[cut][where])
+    return clusters.connected(result, mask, 8)
+
+
+def near_known(looked: Looked, mask: NDArray[np.bool_], known: tuple[Mesh, ...], margin: float) -> NDArray[np.bool_]:
+    """(H, W): pixels of ``mask`` that belong to known meshes (world): within ``margin`` of them, or seen inside or behind them."""
+    result = np.zeros_like(mask)
+    if not known:
+        return result
+    import open3d as o3d
+
+    where = np.nonzero(mask & np.isfinite(looked.heights))
+    scene = o3d.t.geometry.RaycastingScene()
+    for mesh in known:
+        scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    if len(where[0]):
+        points = np.ascontiguousarray(looked.points(*where))
+        near = scene.compute_distance(o3d.core.Tensor(points), nthreads=2).numpy() < margin
+        eye = looked.frame.world_from_camera[:3, 3].astype(np.float32)
+        rays = np.concatenate([np.broadcast_to(eye, points.shape), points - eye], axis=1)
+        # t = 1 is the measured point: a hit before it means that the point lies inside of or behind a known thing.
+        behind = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)), nthreads=2)["t_hit"].numpy() < 1.0
+        result[where] = near | behind
+    # Pixels without depth on the known thing's silhouette.
+    rest = mask & ~np.isfinite(looked.heights)
+    if rest.any():
+        for mesh in known:
+            hull = np.concatenate([mesh.vertices])
+            pixels = looked.frame.intrinsics.project(transforms.apply(transforms.inverse(looked.frame.world_from_camera), hull))
+            if np.all(np.isfinite(pixels)):
+                drawn = np.zeros(mask.shape, np.uint8)
+                for face in mesh.faces:
+                    cv2.fillConvexPoly(drawn, np.clip(pixels[face], -4000, 4000).round().astype(np.int32), 1)
+                drawn = cv2.dilate(drawn, np.ones((7, 7), np.uint8)).astype(bool)
+                result |= rest & drawn
+    return result
