@@ -27,11 +27,11 @@ SIMULATED: list[int] = []
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory):
     """A client of a verifier that counts its simulations."""
-    simulate = verifier_node.verify
-    verifier_node.verify = lambda *a, **k: SIMULATED.append(1) or simulate(*a, **k)
+    simulate = verifier_node.verify_proposal
+    verifier_node.verify_proposal = lambda *a, **k: SIMULATED.append(1) or simulate(*a, **k)
     with verifier(tmp_path_factory.mktemp("strategies")) as client:
         yield client
-    verifier_node.verify = simulate
+    verifier_node.verify_proposal = simulate
 
 
 def test_a_good_motion_passes_with_metrics_film_and_feedback(graph):
