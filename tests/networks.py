@@ -8,9 +8,10 @@ precision; how good their answers are is another question. Weights are made in a
 
 One row a network and device: millions of weights, seconds to load, the first pass and the median of the following ones for one new
 object (features and the best places on it; masks: a 640x480 picture with four prompts; words: four pictures, four texts), for features
-the seconds that a reference's 24 views take once, the most GPU memory, and how far the answer is from that of the first device's
-neighbour in the list: features in pixels of a 768 px picture (median and worst over eight objects, of the best place), masks by their
-least IoU, words by the largest difference of a logit. ``--tiny`` takes networks of a few thousand weights, to try the command itself.
+the seconds that a reference's 24 views take once, the most GPU memory, and how far the answer is from that of the device in the row
+above: features in pixels of a 768 px picture (median and worst over eight objects, of the best place), masks by their
+least IoU, words by the largest difference of a logit. ``--tiny`` takes networks of a few thousand weights,
+but for SAM 2, to try the command itself.
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def measure_masks(name: str, weights: Path, device: str, repeat: int) -> tuple[d
     """Times of a segmenter's network, and its masks about four objects."""
     meshes = [shapes.make(f, n).mesh for f, n in (("mug", 3), ("l_hook", 1), ("cylinder", 1), ("caliper", 2))]
     meshes = [
-        m.transformed(transforms.from_rpy(0, 0, 0, [0.45 + 0.12 * (i // 2), 0.2 * (i % 2) - 0.1, -m.bounds[0, 2]]))
+        m.transformed(transforms.make(translation=[0.45 + 0.12 * (i // 2), 0.2 * (i % 2) - 0.1, -m.bounds[0, 2]]))
         for i, m in enumerate(meshes)
     ]
     frame = sensor.capture(meshes, sensor.D435, sensor.looking_at((0.25, 0.45, 0.62), (0.55, 0.0, 0.02)), 0)

@@ -202,15 +202,10 @@ def _hull(place: NDArray[np.float64]) -> NDArray[np.float32]:
     return cv2.convexHull(np.ascontiguousarray(place, np.float32)[:, None])
 
 
-def judge_by(model: logistic.Logistic) -> Judge:
-    """The judge by the weights of the :data:`CRITERIA`."""
-    return model.odds
-
-
 @cache
 def learned() -> Judge:
     """The judge by the weights that ship with the package."""
-    return judge_by(logistic.load(Path(__file__).with_name("cuts.json"), CRITERIA))
+    return logistic.load(Path(__file__).with_name("cuts.json"), CRITERIA).odds
 
 
 def best(seen: Seen, judge: Judge) -> Plane | None:
