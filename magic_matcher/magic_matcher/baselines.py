@@ -30,7 +30,9 @@ from magic_core.strategy import Strategy
 from magic_core.views import as_it_stands
 from magic_matcher import contour as contours
 from magic_matcher import curvature, global_stage, score
-from magic_matcher.matching import SAME_PLACE, Target, to_contact
+from magic_matcher.candidates import to_contact
+from magic_matcher.matching import SAME_PLACE
+from magic_matcher.targets import Target
 
 #: Points of a cloud; the voxel of FPFH as a share of the reference's diagonal; RANSAC's draws.
 POINTS, VOXEL, DRAWS = 3000, 0.03, 100_000

@@ -24,7 +24,7 @@ from magic_core.scene import CanonicalView
 from magic_matcher import contour as contours
 from magic_matcher import holding
 from magic_matcher.contour import Contour
-from magic_matcher.matching import Target
+from magic_matcher.targets import Target
 
 
 @dataclass(frozen=True)

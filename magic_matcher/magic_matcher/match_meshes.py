@@ -33,7 +33,7 @@ from magic_core import mesh as meshes
 from magic_core import shapes
 from magic_core import strategy as strategies
 from magic_core.contact import Contact
-from magic_core.errors import MagicError
+from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.views import find_view
 from magic_matcher import curvature, drawing, features, global_stage, jobs, matching
@@ -62,7 +62,7 @@ def files(names: Sequence[str]) -> list[str]:
             continue
         found = sorted(str(path) for path in Path(name).iterdir() if path.suffix.lower() in SUFFIXES)
         if not found:
-            raise MagicError(matching.Code.BAD_REQUEST, "--tools", name, f"a folder with files of {', '.join(SUFFIXES)}")
+            raise MagicError(Code.BAD_REQUEST, "--tools", name, f"a folder with files of {', '.join(SUFFIXES)}")
         result += found
     return result
 
@@ -150,9 +150,9 @@ def main(argv: list[str] | None = None) -> None:
     given = parser().parse_args(argv)
     try:
         if given.columns < 0:
-            raise MagicError(matching.Code.BAD_REQUEST, "--columns", given.columns, "0 or more")
+            raise MagicError(Code.BAD_REQUEST, "--columns", given.columns, "0 or more")
         if not (np.isfinite(given.radius) and given.radius > 0):
-            raise MagicError(matching.Code.BAD_REQUEST, "--radius", given.radius, "a length in metres above 0")
+            raise MagicError(Code.BAD_REQUEST, "--radius", given.radius, "a length in metres above 0")
         data, sheet = run(given)
         given.out.mkdir(parents=True, exist_ok=True)
         (given.out / "matches.json").write_text(json.dumps(data, indent=1) + "\n")

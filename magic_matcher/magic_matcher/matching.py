@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,22 +21,23 @@ from magic_core import transforms
 from magic_core.contact import Companion, Contact, ContactCandidate, contact_frame, turned_over
 from magic_core.content import digest
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
 from magic_core.placement import Relative, placement, relative
 from magic_core.placement import mirrored as mirrored_place
 from magic_core.recent import Recent
-from magic_core.rendering import canonical_view
-from magic_core.scene import CanonicalView, Scene, SceneObject
-from magic_core.shapes import section_view
+from magic_core.scene import CanonicalView, SceneObject
 from magic_core.strategy import Strategy
 from magic_core.surface import Surface
-from magic_core.views import as_it_stands, mirrored, own_views, same_direction, square_view
+from magic_core.views import mirrored
 from magic_matcher import contour as contours
 from magic_matcher import curvature, enclosing, facing, global_stage, holding, score
+from magic_matcher.candidates import heatmap_seen_from, on_surface, seen_from, squared, to_contact
 from magic_matcher.contour import Contour
 from magic_matcher.embedded import EmbeddedFeatures
 from magic_matcher.global_stage import Features, Proposal, Reference
 from magic_matcher.plausible import Demands, Refusal, demands, lesser, refusals, room_for
+from magic_matcher.selection import choose_target, select
+from magic_matcher.targets import Target, contact_on, target_view
+from magic_matcher.tools import Tool, tool_of
 
 #: Proposals looked at for each candidate that is asked for: the local stage may merge or re-rank them; and those looked at where
 #: all of these are refused.
@@ -47,12 +48,8 @@ SAME_PLACE = 0.06
 COMPANIONS = 8
 #: Places of a target that are looked at where it is met at a feature.
 FEATURES = 8
-#: Narrower ways across (share of the object's size) are the raster's.
-LEAST_ACROSS = 0.03
 #: Bytes of the pictures of targets that are kept: some fifteen.
 DRAWN = 16 * 2**20
-#: A place whose outward normal points so far below the level, rad, faces what a tool lies on.
-DOWN = np.deg2rad(20.0)
 #: By so much a match in another view must be better for the tool to be turned for it.
 WORTH_TURNING = 0.05
 #: A tool that is turned by so much (rad) for a place is held and led another way; one that need not be turned at all by so much.
@@ -76,41 +73,6 @@ class MatchResult:
 
 
 @dataclass(frozen=True)
-class Tool:
-    """A tool to consider: its id, the view in which contacts are matched, and what draws further ones, where it can be turned.
-
-    askew: the view is not square to the tool, and stands back behind the others.  seen_share: how much of its surface was seen;
-    unseen_side: the level direction (2,), in the world, that the rest of it faces, where that is known.  told_in: the view in which what is
-    found in ``view`` is told, where that is another.  up (3,): the vertical, in the object's frame, of what cameras saw as it lies, and in a
-    cut shows sides that none of them saw; ``None``: all sides are known.  mesh: on whose surface contacts are put, ``None`` where there are pictures alone.
-    """
-
-    id: str
-    view: CanonicalView
-    others: Callable[[], Sequence[CanonicalView]] = tuple
-    askew: bool = False
-    seen_share: float = 1.0
-    unseen_side: Callable[[], NDArray[np.float64] | None] = lambda: None
-    told_in: CanonicalView | None = None
-    mesh: Mesh | None = None
-    up: NDArray[np.float64] | None = None
-
-    def hides(self, view: CanonicalView, normal: NDArray[np.float64]) -> bool:
-        """Whether a place of a cut, with that outward normal (2,) in the picture, faces what the tool lies on: its shape there is a guess."""
-        return self.up is not None and view.kind == "section" and float(view.directions(normal) @ self.up) < -np.sin(DOWN)
-
-
-@dataclass(frozen=True)
-class Target:
-    """The object to act on: its id, the view along the strategy's direction and p_O on it; further: where the strategy's further contacts meet it."""
-
-    id: str
-    view: CanonicalView
-    contact: Contact
-    further: tuple[Contact, ...] = ()
-
-
-@dataclass(frozen=True)
 class Further:
     """A further contact of a reference: its name, the place in the reference's view, its contact, and the radius (m) that the target has there."""
 
@@ -120,105 +82,6 @@ class Further:
     target_radius: float | None
 
 
-# ---------------------------------------------------------------- views
-
-
-def tool_of(item: SceneObject, kind: str) -> Tool:
-    """An object as a tool: seen in the view of a kind as it stands, and, where that is not enough, in those of its own shape.
-
-    A hanger that lies on the table is edge-on in the side view of how it lies; the plane in which it is used is its own.  The view as
-    it stands, where it is square to the tool, says from where to look; the picture is drawn along and in the tool's own axes, so that it
-    is the same however the tool lies, and so is the place that is found in it.
-    """
-
-    def own(apart_from: NDArray[np.float64] | None) -> Sequence[CanonicalView]:
-        return own_views(item.mesh, item.pieces, kind, apart_from)
-
-    known: dict[str, Any] = {"seen_share": item.seen_share, "unseen_side": lambda: enclosing.unseen_side(item), "mesh": item.mesh}
-    if item.source == "camera":
-        known["up"] = item.world_from_object[2, :3].copy()
-    try:
-        stands = as_it_stands(item, kind)
-    except MagicError as error:
-        if error.code is not Code.BAD_MESH:
-            raise
-        views = own(None)
-        if not views:
-            raise
-        return Tool(item.id, views[0], lambda: views[1:], **known)
-    view = square_view(item, stands, kind)
-    if view is None:
-        return Tool(item.id, stands, lambda: own(None), True, **known)
-    # What lies is told as seen from right above: it is used as it lies.  Else the axis is, of whose two sides the view is on one.
-    side = view if view.direction @ stands.direction > 0 else mirrored(view)
-    told_in = stands if kind == "top" or same_direction(side.direction, stands.direction) else side
-    return Tool(item.id, view, lambda: own(view.direction), told_in=told_in, **known)
-
-
-def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
-    """The target as seen along the strategy's direction, world up (world x where it looks down) at the top of the picture.
-
-    Where the strategy's contact is on the target's outline as cut through its middle, the cut is what is drawn.
-    """
-    object_from_world = transforms.inverse(item.world_from_object)
-    direction = strategy.target_view_direction
-    up = np.array([0.0, 0.0, 1.0]) if abs(direction[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    rotation = object_from_world[:3, :3]
-    if strategy.target_outline == "cut":
-        return replace(section_view(item.mesh, rotation @ direction, rotation @ up), kind=strategy.view)
-    return canonical_view(item.mesh, rotation @ direction, rotation @ up, strategy.view)
-
-
-# ---------------------------------------------------------------- contacts
-
-
-def to_contact(view: CanonicalView, found: curvature.Estimate) -> Contact:
-    """A Contact (metres) from an estimate (pixels of the view)."""
-    scale = view.metres_per_pixel
-    normal = found.normal / np.linalg.norm(found.normal)
-    return Contact(found.point, normal, found.radius * scale, found.concave, found.scale * scale, contact_frame(view, found.point, normal))
-
-
-def support_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
-    """Index of the contour point farthest along a picture direction (2,); in the middle of a flat side."""
-    return _middle_of_highest(contour, np.nonzero(contour.loop == 0)[0], direction, tolerance)
-
-
-def inner_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
-    """Index of the contour point that a tool meets which is led against a picture direction (2,) inside the object.
-
-    Inside is where, going from the object along ``direction``, one comes to the object again: a hole, a notch.  Of several the one
-    with the widest way across is taken, in it the point that lies farthest against ``direction``, in the middle of a flat side.
-    Raises ``NO_MATCH`` where the outline has no such place.
-    """
-    towards = np.nonzero(contour.normals @ direction > np.cos(facing.FACING))[0]
-    way = np.arange(2.0, contour.size + 2.0)
-    ahead = (contour.points[towards, None] + way[:, None] * direction).astype(np.float32)
-    solid = contour.sample(ahead[..., 0], ahead[..., 1]) > 0.5
-    across = np.where(solid.any(axis=1), way[np.argmax(solid, axis=1)], 0.0)
-    towards, across = towards[across > LEAST_ACROSS * contour.size], across[across > LEAST_ACROSS * contour.size]
-    if not len(towards):
-        raise MagicError(
-            Code.NO_MATCH,
-            "places inside the target's outline that face the tool",
-            0,
-            "a hole or a notch that is open towards the strategy's target normal",
-        )
-    # Stretches: neighbours on one loop.  A loop that begins within a stretch cuts it in two, which changes nothing that counts.
-    stretch = np.concatenate([[0], np.cumsum((np.diff(towards) > 3) | (np.diff(contour.loop[towards]) != 0))])
-    widest = stretch[int(np.argmax(across))]
-    return _middle_of_highest(contour, towards[stretch == widest], -direction, tolerance)
-
-
-def _middle_of_highest(contour: Contour, among: NDArray[np.int64], direction: NDArray[np.float64], tolerance: float) -> int:
-    """Index of the point farthest along a direction (2,) of those ``among`` (K,) the contour's; in the middle of a flat side."""
-    height = contour.points[among] @ direction
-    level = among[height >= float(height.max()) - tolerance]
-    across = contour.points[level] @ np.array([-direction[1], direction[0]])
-    middle = 0.5 * (float(across.min()) + float(across.max()))
-    return int(level[np.argmin(np.abs(across - middle))])
-
-
 def further_of(strategy: Strategy) -> tuple[Further, ...]:
     """The references of a strategy's contacts after the first."""
     found = []
@@ -226,87 +89,6 @@ def further_of(strategy: Strategy) -> tuple[Further, ...]:
         alone = replace(strategy, tool_contact=pair.tool, target_contact=pair.target)
         found.append(Further(pair.name, global_stage.from_strategy(alone), pair.tool, pair.target.disc_radius))
     return tuple(found)
-
-
-def target_contact(
-    strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64], matcher: Matcher | None = None
-) -> Contact:
-    """p_O': what of the target's silhouette a tool meets that is led against the strategy's target normal (:mod:`magic_matcher.facing`), with its
-    curvature; where that is neither flat, round nor a corner, the place that reaches farthest.
-
-    For a strategy that meets its target inside, the place inside that faces that normal (:func:`inner_point`); for one that meets
-    it at a feature, what :meth:`Matcher.feature_of` finds, by default with the features that ship.
-    """
-    normal = world_from_object[:3, :3].T @ strategy.target_normal
-    picture = normal @ view.object_from_view[:3, :2]
-    if np.linalg.norm(picture) < 0.1:
-        raise MagicError(
-            Code.BAD_STRATEGY, "target normal", strategy.target_normal.round(3).tolist(), "a direction that is seen in the target's view"
-        )
-    direction = picture / np.linalg.norm(picture)
-    if strategy.target_outline == "feature":
-        return (matcher or Matcher(EmbeddedFeatures())).feature_of(strategy, view, direction)
-    contour = contours.extract(view.mask)
-    met = facing.side(contour, direction) if strategy.target_outline == "outer" else None
-    if met is not None:
-        contact = Contact(
-            met.point,
-            direction,
-            met.radius * view.metres_per_pixel,
-            False,
-            met.scale * view.metres_per_pixel,
-            contact_frame(view, met.point, direction),
-        )
-    else:
-        place = support_point if strategy.target_outline == "outer" else inner_point
-        contact = to_contact(view, curvature.estimate(contour, place(contour, direction)))
-    # The normal asked for is the one acted along; the picture's own differs from it by raster noise only.
-    if float(contact.normal @ direction) > np.cos(np.deg2rad(20)):
-        contact = replace(contact, normal=direction, object_from_contact=contact_frame(view, contact.pixel, direction))
-    return contact
-
-
-def likeness(reference: CanonicalView, view: CanonicalView) -> float:
-    """How alike two silhouettes are, 0..1: overlap of the outlines at equal size, best of four turns, times the ratio of their sizes."""
-    import cv2
-
-    def crop(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        v, u = np.nonzero(mask)
-        if len(v) == 0:
-            raise MagicError(Code.EMPTY_MASK, "pixels of the view that are on the object", 0, "at least 16")
-        side = max(int(np.ptp(v)), int(np.ptp(u))) + 1
-        square = np.zeros((side, side), np.uint8)
-        top, left = (side - int(np.ptp(v)) - 1) // 2, (side - int(np.ptp(u)) - 1) // 2
-        part = mask[v.min() : v.max() + 1, u.min() : u.max() + 1]
-        square[top : top + part.shape[0], left : left + part.shape[1]] = part
-        return cv2.resize(square, (64, 64), interpolation=cv2.INTER_AREA) > 0
-
-    def extent(item: CanonicalView) -> float:
-        return float(np.sqrt(item.mask.sum())) * item.metres_per_pixel
-
-    a, b = crop(reference.mask), crop(view.mask)
-    overlap = max(float((a & t).sum() / (a | t).sum()) for t in (np.rot90(b, k) for k in range(4)))
-    sizes = sorted((extent(reference), extent(view)))
-    return overlap * (sizes[0] / max(sizes[1], 1e-12))
-
-
-def choose_target(
-    strategy: Strategy, objects: Sequence[SceneObject], seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view
-) -> SceneObject:
-    """The object that looks most like the demonstration's target, seen as the target is, in shape and size; seen: what draws it (:func:`target_view`)."""
-    if not objects:
-        raise MagicError(Code.UNKNOWN_OBJECT, "objects to choose the target from", 0, "at least one")
-
-    def alike(item: SceneObject) -> float:
-        try:
-            return likeness(strategy.target_view, seen(item, strategy))
-        except MagicError:  # what cannot be drawn as the target was (a mesh that is not closed has no cut) is not like it
-            return -1.0
-
-    return max(objects, key=alike)
-
-
-# ---------------------------------------------------------------- the matcher
 
 
 @dataclass
@@ -496,8 +278,8 @@ class Matcher:
             replace(strategy, target_normal=pair.target_normal, target_outline=pair.target_outline, target_contact=pair.target)
             for pair in strategy.contacts
         )
-        first = target_contact(strategy, view, world_from_object, self)
-        return first, tuple(target_contact(one, view, world_from_object, self) for one in further)
+        first = contact_on(strategy, view, world_from_object, self.feature_of)
+        return first, tuple(contact_on(one, view, world_from_object, self.feature_of) for one in further)
 
     def _seen_best(self, task: _Task, tool: Tool) -> _Seen:
         """The tool's candidates: those of the one of its views that shows the contact best, then those of its other views.
@@ -617,7 +399,7 @@ class Matcher:
         The score is the mean of all contacts' times how well they agree (:mod:`magic_core.placement`).  Where the demonstrated contact is
         straight, what was found is the straight side that is there.
         """
-        candidates = [_squared(view, contour, candidate, task.reference_contact) for candidate in candidates]
+        candidates = [squared(view, contour, candidate, task.reference_contact) for candidate in candidates]
         sizes = task.reference.contour.size * task.reference.view.metres_per_pixel, contour.size * view.metres_per_pixel
         wanted = [
             relative(task.reference_contact.object_from_contact, one.reference_contact.object_from_contact) for _, one in task.further
@@ -631,7 +413,7 @@ class Matcher:
                 return [], [replace(refusal, what=f"{name}: {refusal.what}") for refusal in why]
             points = np.array([c.tool.pixel for c in found])
             order = global_stage.suppress(points, np.array([c.score for c in found]), SAME_PLACE * contour.size, COMPANIONS)
-            choices.append([_squared(view, contour, found[i], one.reference_contact) for i in order])
+            choices.append([squared(view, contour, found[i], one.reference_contact) for i in order])
         joined = []
         for candidate in candidates:
             frame = candidate.tool.object_from_contact
@@ -786,83 +568,20 @@ def _told(task: _Task, tool: Tool, seen: _Seen) -> _Seen:
     That is, where the tool says nothing else, the view itself, of one and its opposite that which looks down, of level ones along -y, then -x: a view
     of the tool's own shape is looked at from the side that turns with it, while how it is to be held follows from which face is up.
     """
-    view = seen.view
-    if tool.mesh is not None:
-        surface = Surface(tool.mesh)
-        seen = replace(seen, candidates=[_on_surface(surface, view, task.reference_contact, c) for c in seen.candidates])
-        if view is tool.view and tool.told_in is not None:
-            return seen if tool.told_in is view else _retold(task, seen, tool.told_in)
-        if next((v for v in view.direction[::-1] if abs(v) > 1e-6), -1.0) > 0:
-            return _retold(task, seen, mirrored(view))
-    return seen
-
-
-def _squared(view: CanonicalView, contour: Contour, candidate: ContactCandidate, reference: Contact) -> ContactCandidate:
-    """A candidate of a straight reference as the straight side of its outline at its place, where there is one."""
-    met = None if np.isfinite(reference.radius) else facing.straight_at(contour, candidate.tool.pixel, candidate.tool.normal)
-    if met is None:
-        return candidate
-    side, normal = met
-    scale = side.scale * view.metres_per_pixel
-    contact = Contact(side.point, normal, np.inf, False, scale, contact_frame(view, side.point, normal))
-    return _with_contact(candidate, contact, candidate.flipped, candidate.rotation, reference)
-
-
-def _on_surface(surface: Surface, view: CanonicalView, reference: Contact, candidate: ContactCandidate) -> ContactCandidate:
-    """The candidate with its frame as deep along the line of sight as the surface is, and the surface's own frame there.
-
-    A section's plane cuts the surface where the contact is.
-    """
-
-    def put(contact: Contact) -> Contact:
-        frame = contact.object_from_contact.copy()
-        depth = 0.0 if view.kind == "section" else surface.depth_of_edge(view, contact.pixel, contact.normal)
-        if depth is None:  # a pocket: the contact is between parts of the tool
-            depth = surface.depth_beside(view, contact.pixel)
-        frame[:3, 3] += depth * view.direction
-        return replace(contact, object_from_contact=frame, surface=surface.principal_frame(frame))
-
-    candidate = _with_companions(candidate, put)
-    return _with_contact(candidate, put(candidate.tool), candidate.flipped, candidate.rotation, reference)
-
-
-def _with_contact(candidate: ContactCandidate, contact: Contact, flipped: bool, rotation: float, reference: Contact) -> ContactCandidate:
-    frame = turned_over(contact.object_from_contact) if flipped else contact.object_from_contact
-    aligned = frame @ transforms.inverse(reference.object_from_contact)
-    return replace(candidate, tool=contact, flipped=flipped, rotation=rotation, tool_from_reference=aligned)
-
-
-def _with_companions(candidate: ContactCandidate, changed: Callable[[Contact], Contact]) -> ContactCandidate:
-    return replace(candidate, companions=tuple(replace(c, tool=changed(c.tool)) for c in candidate.companions))
-
-
-def _retold(task: _Task, seen: _Seen, view: CanonicalView) -> _Seen:
-    """What was found in one view as it is in another along nearly the same direction, or nearly the opposite one: mirrored there."""
-    over = bool(seen.view.direction @ view.direction < 0)
-
-    def there(contact: Contact) -> Contact:
-        frame = contact.object_from_contact
-        point, across = frame[:3, 3], frame[:3, 0] - (frame[:3, 0] @ view.direction) * view.direction
-        normal = transforms.unit(across @ view.object_from_view[:3, :2])
-        return replace(
-            contact, pixel=view.pixels(point), normal=normal, object_from_contact=transforms.frame(point, across, view.direction)
-        )
-
-    def told(candidate: ContactCandidate) -> ContactCandidate:
-        contact, flipped = there(candidate.tool), candidate.flipped != over
-        rotation = global_stage.rotation_between(task.reference.normal, contact.normal, flipped)
-        return _with_contact(_with_companions(candidate, there), contact, flipped, rotation, task.reference_contact)
-
-    heatmap = seen.heatmap
-    if heatmap is not None:
-        import cv2
-
-        corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        moved = view.pixels(seen.view.points(corners)).astype(np.float32)
-        height, width = view.mask.shape
-        heatmap = cv2.warpAffine(heatmap, cv2.getAffineTransform(corners.astype(np.float32), moved), (width, height))
-        heatmap = np.where(view.mask, np.clip(heatmap, 0, 1), 0).astype(np.float32)
-    return replace(seen, view=view, candidates=[told(c) for c in seen.candidates], heatmap=heatmap)
+    if tool.mesh is None:
+        return seen
+    before, reference, surface = seen.view, task.reference_contact, Surface(tool.mesh)
+    seen = replace(seen, candidates=[on_surface(surface, before, reference, c) for c in seen.candidates])
+    view = before
+    if before is tool.view and tool.told_in is not None:
+        view = tool.told_in
+    elif next((v for v in before.direction[::-1] if abs(v) > 1e-6), -1.0) > 0:
+        view = mirrored(before)
+    if view is before:
+        return seen
+    told = [seen_from(c, before, view, task.reference.normal, reference) for c in seen.candidates]
+    heatmap = None if seen.heatmap is None else heatmap_seen_from(seen.heatmap, before, view)
+    return replace(seen, view=view, candidates=told, heatmap=heatmap)
 
 
 def _no_match(tool_id: str, refusal: Refusal | None) -> MagicError:
@@ -894,6 +613,13 @@ def _not_seen(task: _Task, tool: Tool, looked: Sequence[CanonicalView], error: M
     )
 
 
+def target_contact(
+    strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64], matcher: Matcher | None = None
+) -> Contact:
+    """p_O' (:func:`magic_matcher.targets.contact_on`); where a strategy meets its target at a feature, with the matcher's features, by default those that ship."""
+    return contact_on(strategy, view, world_from_object, (matcher or Matcher(EmbeddedFeatures())).feature_of)
+
+
 def match(
     strategy: Strategy,
     tools: Sequence[SceneObject | Tool],
@@ -906,64 +632,6 @@ def match(
     return Matcher(backend).match(strategy, tools, target, top_k, heatmap)
 
 
-def select(
-    scene: Scene,
-    strategy: Strategy,
-    tool_ids: Sequence[str],
-    target_id: str,
-    seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view,
-) -> tuple[list[SceneObject], SceneObject]:
-    """The tools and the target that a request names, or that are meant by naming none; seen: as for :func:`choose_target`.
-
-    No tool: every object that was seen by the cameras, but the target; where there is
-    none of them, every other object.  No target: the one most like the demonstration's
-    among the objects not named as tools.  What was seen in part is no tool: left out where
-    tools are chosen; ``OBJECT_CUT_OFF`` where one is named, or none is left.  Raises
-    ``SOMETHING_HANGS`` where something is above the table with nothing below that
-    carries it: nothing is planned around a hand.
-    """
-    hanging = [item for item in scene.objects if item.hanging]
-    if hanging:
-        places = (f"{item.id} at ({', '.join(f'{x:.2f}' for x in item.world_from_box[:3, 3])}) m" for item in hanging)
-        raise MagicError(
-            Code.SOMETHING_HANGS,
-            "something hangs above the table, with nothing below that carries it",
-            ", ".join(places),
-            "nothing there: hands away; an arm that the cameras see is cut out where its joint_states are there and fit",
-        )
-    named = [scene.find(name) for name in tool_ids]
-    for item in named:
-        if item.cut_off:
-            raise _cut_off([item])
-    if target_id:
-        target = scene.find(target_id)
-    else:
-        rest = [item for item in scene.objects if item.id not in set(tool_ids)]
-        if not rest:
-            raise MagicError(
-                Code.UNKNOWN_OBJECT, "objects left to be the target", 0, "name a target_id, or have one more object on the table"
-            )
-        target = choose_target(strategy, rest, seen)
-    if target.id in set(tool_ids):
-        raise MagicError(Code.BAD_REQUEST, "target_id", target.id, "an object that is not one of tool_ids")
-    if named:
-        return named, target
-    others = [item for item in scene.objects if item.id != target.id]
-    tools = [item for item in others if item.source != "known"] or others
-    if not tools:
-        raise MagicError(Code.UNKNOWN_OBJECT, "objects to use as the tool", 0, f"at least one besides the target {target.id}")
-    whole = [item for item in tools if not item.cut_off]
-    if not whole:
-        raise _cut_off(tools)
-    return whole, target
-
-
-def _cut_off(tools: Sequence[SceneObject]) -> MagicError:
-    """Why these cannot be tools."""
-    told = "; ".join(f"{item.id}, cut off by {' and '.join(item.cut_off)}" for item in tools)
-    return MagicError(Code.OBJECT_CUT_OFF, "tool seen in part only", told, "a thing that is seen whole: move it, or what hides it")
-
-
 __all__ = [
     "Further",
     "MatchResult",
@@ -973,11 +641,10 @@ __all__ = [
     "Tool",
     "choose_target",
     "further_of",
-    "likeness",
     "match",
     "select",
-    "support_point",
     "target_contact",
     "target_view",
+    "to_contact",
     "tool_of",
 ]

@@ -21,7 +21,7 @@ from magic_core.strategy import Strategy
 from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
-from magic_matcher import features, global_stage, matching
+from magic_matcher import features, global_stage, matching, score
 from magic_matcher.cache import Cache
 from magic_matcher.features import BACKENDS
 from magic_matcher.remembered import Remembered
@@ -52,7 +52,7 @@ class MatcherNode(Node):
             self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50, read_only=False
         )
         weight = nodes.parameter(
-            self, "curvature_weight", matching.score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True
+            self, "curvature_weight", score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True
         )
         self._root = nodes.parameter(self, "strategies", "", "folder of strategies; empty: the installed ones", read_only=True)
         cache = nodes.parameter(

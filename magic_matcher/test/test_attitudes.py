@@ -9,7 +9,7 @@ from magic_core import shapes, transforms
 from magic_core import strategy as strategies
 from magic_core.scene import SceneObject
 from magic_core.views import find_view
-from magic_matcher import attitudes, features, matching
+from magic_matcher import attitudes, features, matching, tools
 
 STRATEGIES = Path(__file__).resolve().parents[2] / "ros2_ws" / "src" / "magic_bringup" / "strategies"
 if not STRATEGIES.is_dir():
@@ -83,7 +83,7 @@ def test_the_side_that_a_seen_tool_lies_on_is_no_place():
     assert outward(lying(back, "camera"))[0][2] > 0.9
     # A given mesh is known all around, and its hollow is found whichever way it faces.
     assert outward(lying(face, "known"))[0][2] < -0.9
-    assert all(normal[2] > -np.sin(matching.DOWN) for normal in outward(lying(face, "camera")))
+    assert all(normal[2] > -np.sin(tools.DOWN) for normal in outward(lying(face, "camera")))
 
 
 def test_what_faces_the_table_in_a_cut_alone_is_hidden():

@@ -14,7 +14,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import from_trimesh
 from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.views import find_view, view_of_contact
-from magic_matcher import contour, curvature, features, jobs, matching, plain, plausible
+from magic_matcher import contour, curvature, features, jobs, matching, plain, plausible, targets
 from magic_matcher.cache import Cache
 from magic_matcher.global_stage import make_reference
 
@@ -381,7 +381,7 @@ def test_support_point_is_in_the_middle_of_a_flat_side():
     mask = np.zeros((100, 200), bool)
     mask[30:70, 20:180] = True
     c = contour.extract(mask)
-    assert c.points[matching.support_point(c, np.array([0.0, -1.0]))] == pytest.approx([99.5, 29.5], abs=1.0)
+    assert c.points[targets.support_point(c, np.array([0.0, -1.0]))] == pytest.approx([99.5, 29.5], abs=1.0)
 
 
 @pytest.mark.parametrize("angle", np.deg2rad([0.0, 37.0, 90.0, 200.0]))
@@ -391,7 +391,7 @@ def test_a_tool_meets_a_ring_at_the_side_of_its_hole_against_which_it_is_led(ang
     ring &= np.hypot(u + 75, v) > 8  # a small hole beside the wide one
     direction = np.array([np.cos(angle), np.sin(angle)])
     c = contour.extract(ring)
-    at = matching.inner_point(c, direction)
+    at = targets.inner_point(c, direction)
     assert c.points[at] == pytest.approx(np.array([139.5, 119.5]) - 60 * direction, abs=1.5)
     assert c.normals[at] @ direction > 0.99
 
@@ -401,9 +401,9 @@ def test_what_is_open_has_an_inner_side_and_what_is_full_has_none():
     cup[20:100, 20:140] = True
     cup[20:90, 40:120] = False
     c = contour.extract(cup)
-    assert c.points[matching.inner_point(c, np.array([1.0, 0.0]))] == pytest.approx([39.5, 54.5], abs=2.0)
+    assert c.points[targets.inner_point(c, np.array([1.0, 0.0]))] == pytest.approx([39.5, 54.5], abs=2.0)
     with pytest.raises(MagicError) as error:
-        matching.inner_point(c, np.array([0.0, -1.0]))  # from its bottom one comes into the open
+        targets.inner_point(c, np.array([0.0, -1.0]))  # from its bottom one comes into the open
     assert error.value.code == Code.NO_MATCH
 
 

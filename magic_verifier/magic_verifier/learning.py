@@ -31,7 +31,9 @@ from magic_core.shapes import section_view
 from magic_core.strategy import MODES, SIDES, ContactPair, Goal, Physics, Strategy, Waypoint
 from magic_matcher import contour as contours
 from magic_matcher import curvature
-from magic_matcher.matching import target_contact, target_view, to_contact
+from magic_matcher.candidates import to_contact
+from magic_matcher.matching import target_contact
+from magic_matcher.targets import target_view
 from magic_verifier import goals
 from magic_verifier.demonstration import Meeting, Replay, replay
 from magic_verifier.floating import TARGET

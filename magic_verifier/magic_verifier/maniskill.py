@@ -243,7 +243,7 @@ def circle_about(item: SceneObject, strategy: Strategy) -> Any:
     A hook has room for it however it is turned, and no side of it is in the hook before the contact.
     """
     from magic_core.rendering import canonical_view
-    from magic_matcher.matching import Target
+    from magic_matcher.targets import Target
 
     turn = item.world_from_object[:3, :3]
     down, normal = turn.T @ strategy.target_view_direction, turn.T @ strategy.target_normal
@@ -329,7 +329,7 @@ class Solver:
 
     def solve(self, given: Episode, seed: int, note: Callable[[dict[str, Any]], None]) -> MotionPlan | None:
         """The first motion that the verifier passes and that ends in time; ``note`` hears what became of each that was tried."""
-        from magic_matcher.matching import tool_of
+        from magic_matcher.tools import tool_of
         from magic_server.pipeline import Agenda
 
         given = replace(given, tool=laid(given.tool, given.table), target=laid(given.target, given.table))

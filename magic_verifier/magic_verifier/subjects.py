@@ -97,7 +97,7 @@ def met_at(meeting: Meeting, target: SceneObject, kind: str) -> Any:
     """The matcher's Target for a given place: seen along the meeting's direction, the contact frame at its point."""
     from magic_core.contact import Contact
     from magic_core.rendering import canonical_view
-    from magic_matcher.matching import Target
+    from magic_matcher.targets import Target
 
     along = transforms.unit(meeting.direction)
     normal = transforms.unit(meeting.normal - (meeting.normal @ along) * along)
