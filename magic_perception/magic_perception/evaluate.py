@@ -8,6 +8,7 @@ meshes    Ray-cast captures of scanned and modelled objects by two D435s (:mod:`
           paper's reconstruction and this one side by side the Chamfer distance, the volumetric IoU and the holes that are open.
 
 views     (``--views N``, needs no data) Surfaces of N procedural scenes by the number of views, and what has moved between them.
+cameras   (``--moved-cameras N``, needs no data) What is said of two cameras on N procedural scenes, right and off by known amounts.
 speed     (``--speed``, needs no data) Seconds by stage for two cameras over four objects, and memory over ``--frames`` scenes.
 
 Writes evaluation.json, evaluation.md and evaluation.png (the meshes part's pictures).
@@ -34,7 +35,7 @@ from magic_core.mesh import Mesh, load
 from magic_core.rendering import Raycaster
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.views import find_view, holes_of
-from magic_perception import coverage, measures, speed
+from magic_perception import coverage, measures, moved_cameras, speed
 from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
@@ -460,6 +461,7 @@ def _meshes_table(part: dict) -> list[str]:
 TABLES: dict[str, Callable[[dict], list[str]]] = {
     "osd": _osd_table,
     "views": lambda part: [coverage.markdown(part)],
+    "moved_cameras": lambda part: [moved_cameras.markdown(part)],
     "speed": lambda part: [speed.markdown(part)],
     "captures": _captures_table,
     "meshes": _meshes_table,
@@ -469,7 +471,7 @@ TABLES: dict[str, Callable[[dict], list[str]]] = {
 def main(args: list[str] | None = None) -> None:
     """Entry point; exit status 1 where no data are found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed or --views)")
+    parser.add_argument("--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed, --views or --moved-cameras)")
     parser.add_argument("--out", type=Path, default=Path("evaluation"), help="folder for the results (default ./evaluation)")
     parser.add_argument("--parts", nargs="+", choices=("osd", "captures", "meshes"), default=["osd", "captures", "meshes"])
     parser.add_argument("--poses", type=int, default=3, help="yaws of each mesh (default 3)")
@@ -480,13 +482,22 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--speed", action="store_true", help="measure speed and memory instead")
     parser.add_argument("--views", type=int, default=0, metavar="N", help="measure what several views bring instead, on N scenes")
+    parser.add_argument(
+        "--moved-cameras", type=int, default=0, metavar="N", help="measure what is said of cameras that are off instead, on N scenes"
+    )
     parser.add_argument("--frames", type=int, default=50, help="scenes of --speed (default 50; 1000 shows whether memory is flat)")
     parser.add_argument("--workers", type=int, default=1, help="threads of --speed (default 1)")
     given = parser.parse_args(args)
-    if given.data is None and not given.speed and not given.views:
-        parser.error("--data is needed, or --speed, or --views")
-    if given.frames < 1 or given.workers < 1 or given.views < 0:
-        parser.error(f"--frames {given.frames}, --workers {given.workers}, --views {given.views}: at least 1 each")
+    without_data = given.speed or given.views or given.moved_cameras
+    if given.data is None and not without_data:
+        parser.error("--data is needed, or --speed, --views or --moved-cameras")
+    if given.frames < 1 or given.workers < 1 or given.views < 0 or given.moved_cameras < 0:
+        counts = {name: getattr(given, name) for name in ("frames", "workers", "views", "moved_cameras")}
+        parser.error(f"{counts}: frames and workers at least 1, the others at least 0")
+
+    def said(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
     try:
         segmenter = make_segmenter(given.segmenter, given.weights)
         result: dict = {}
@@ -494,11 +505,11 @@ def main(args: list[str] | None = None) -> None:
         if given.speed:
             result["speed"] = speed.measure(given.frames, segmenter, given.seed, given.workers)
         if given.views:
-            result["views"] = coverage.measure(given.views, given.seed, said=lambda text: print(text, file=sys.stderr, flush=True))
+            result["views"] = coverage.measure(given.views, given.seed, said=said)
+        if given.moved_cameras:
+            result["moved_cameras"] = moved_cameras.measure(given.moved_cameras, given.seed, said=said)
         for part, folder in (
-            ()
-            if given.speed or given.views
-            else (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes"))
+            () if without_data else (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes"))
         ):
             if part not in given.parts:
                 continue

@@ -1,6 +1,8 @@
 """Cameras that disagree, the table among planes, and what is seen in part, on ray-cast scenes."""
 
+import json
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate
 from magic_core.scene import SceneObject
 from magic_core.views import find_view
+from magic_perception import evaluate, moved_cameras
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
@@ -371,3 +374,18 @@ def test_a_thing_whose_parts_nothing_joins_is_not_whole():
     assert not hangs_together(concatenate([bar, rest]), 0.006)
     near = slab([0.1, 0.02, 0.016], [0.104, 0, 0.008], (120, 60, 50))
     assert hangs_together(bar, 0.006) and hangs_together(concatenate([bar, near]), 0.006)
+
+
+def test_what_is_said_of_moved_cameras_is_measured(tmp_path, monkeypatch, capsys):
+    """The command on one scene, to its end and its files: right cameras are left alone, cameras 40 mm apart are refused."""
+    monkeypatch.setattr(moved_cameras, "measure", partial(moved_cameras.measure, shifts=(0.04,), turns=()))
+    with pytest.raises(SystemExit) as end:
+        evaluate.main(["--moved-cameras", "1", "--seed", "5", "--out", str(tmp_path)])
+    assert end.value.code == 0
+    told = json.loads((tmp_path / "evaluation.json").read_text())["moved_cameras"]["rows"]
+    right, moved = told["right"], told["40 mm"]
+    assert right["measured"] == moved["measured"] == 1
+    assert right["said"] == right["refused"] == 0 and moved["said"] == moved["refused"] == 1
+    assert right["error_mm"][0] < 10 and moved["error_mm"][0] < 10
+    assert "| 40 mm | 1 of 1 | 1 | 1 | 0 |" in (tmp_path / "evaluation.md").read_text()
+    assert "scene 1 of 1" in capsys.readouterr().err
