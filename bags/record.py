@@ -419,7 +419,7 @@ def record_demonstration(
 ) -> None:
     """The tool lying, taken up and in use: its pose and the target's over time, the target moved by physics, seen by both cameras.
 
-    bare: by a hand, all of the time and with nothing that tells the tool's pose.
+    bare: by a hand, and seen all of the time, so that the tool may be followed without its poses.
     """
     cast = Cast.of(strategy)
     moments = played(strategy, cast)
@@ -439,9 +439,8 @@ def record_demonstration(
             bag.known_objects(known, START)
         events: list[tuple[float, Callable[..., None], tuple]] = [(frame.stamp, bag.frame, (frame,)) for frame in frames]
         for moment in moments:
-            if bare is None:
-                events.append((moment.stamp, bag.pose, ("/demonstration/tool_pose", moment.world_from_tool, moment.stamp)))
-                events.append((moment.stamp, bag.pose, ("/demonstration/target_pose", moment.world_from_target, moment.stamp)))
+            events.append((moment.stamp, bag.pose, ("/demonstration/tool_pose", moment.world_from_tool, moment.stamp)))
+            events.append((moment.stamp, bag.pose, ("/demonstration/target_pose", moment.world_from_target, moment.stamp)))
             events.append((moment.stamp, bag.joints, (moment.stamp,)))
         _play(events)
     things = [
@@ -507,7 +506,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Record the bags of this folder.")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder that gets one folder for each bag")
     parser.add_argument("--seed", type=int, default=0, help="seed of objects and sensor noise, from 0 up")
-    parser.add_argument("--bare-hand", action="store_true", help="demonstrations by a hand, seen by cameras alone")
+    parser.add_argument("--bare-hand", action="store_true", help="demonstrations by a hand, seen all of the time")
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help=f"which of {', '.join(NAMES)}; all of them by default; or of {', '.join(OTHERS)}"
     )

@@ -38,7 +38,7 @@ TARGET_SETS = {"mug_tree": tuple(range(3))}
 
 @dataclass(frozen=True)
 class Options:
-    """What an evaluation is run with; see the command's ``--help``.  ``task``: the name of a strategy's folder, or its path."""
+    """What an evaluation is run with; see the command's ``--help``.  ``task`` and ``like``: the name of a strategy's folder, or its path."""
 
     task: str
     variant: str = "fg"
@@ -57,6 +57,7 @@ class Options:
     turns: int = 1
     demonstration: str = ""
     required_rate: float = 0.7
+    like: str = ""
 
 
 def tool_names(options: Options) -> list[str]:
@@ -112,6 +113,9 @@ def check(options: Options) -> None:
 @lru_cache(maxsize=8)
 def _found(options: Options) -> tuple[Strategy, Evaluation]:
     strategy = strategies.find(options.task, options.strategies or None)
+    if options.like:
+        asked = strategies.find(options.like)
+        strategy = replace(strategy, goal=asked.goal, physics=asked.physics, environment=asked.environment)
     evaluation = evaluation_of(strategy)
     return (shown_by(strategy, options.demonstration) if options.demonstration else strategy), evaluation
 

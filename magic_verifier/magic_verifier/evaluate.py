@@ -628,6 +628,12 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--top-k", type=int, default=3, help="candidates tried for a case")
     parser.add_argument("--noise", type=float, default=None, help="the goal's number of that name: sideways velocity noise in target radii")
     parser.add_argument("--strategies", default="", help="folder of strategies; by default the installed ones")
+    parser.add_argument(
+        "--like",
+        default="",
+        metavar="STRATEGY",
+        help="what is asked of the strategy, and of which things, is that of another: its goal, scene, friction, densities and sets",
+    )
     parser.add_argument("--demonstration", default="", help="tool that the strategy is demonstrated with instead, such as mug:1000")
     parser.add_argument("--no-films", action="store_true", help="draw no contact sheets")
     parser.add_argument("--out", required=True, help="folder for results.json, summary.txt and contact sheets")

@@ -22,9 +22,10 @@ from magic_core.goal import Goal
 from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
 from magic_core.shapes import make
+from magic_core.strategy import Physics
 from magic_verifier import evaluate as ev
 from magic_verifier import posing
-from magic_verifier.cases import METHODS, Options, all_cases, tool_names
+from magic_verifier.cases import METHODS, Options, all_cases, strategy_for, tool_names
 from magic_verifier.simulation import sphere_of, usable_pieces
 from magic_verifier.subjects import load_object, tool_object
 from magic_verifier.toolsets import evaluation_of
@@ -232,6 +233,22 @@ def test_a_strategy_is_evaluated_by_its_folder_and_no_task_is_known_by_name(tmp_
     assert answer["success"], answer
     source = "".join(Path(ev.__file__).with_name(name).read_text() for name in ("evaluate.py", "cases.py", "subjects.py", "toolsets.py"))
     assert not [name for name in ("hooking", "hanging", "scooping", "pushing", "hammering") if f'"{name}"' in source]
+
+
+def test_what_is_asked_of_one_strategy_can_be_asked_of_another(tmp_path):
+    """So is what is learned from a demonstration tried: it has no sets, and a goal of its own."""
+    shipped = strategies.find("scooping", STRATEGIES)
+    learned = replace(shipped, name="spooning", goal=shipped.goal.with_values({"height": 0.1}), environment={}, physics=Physics())
+    (tmp_path / "spooning").mkdir()
+    strategies.save(learned, tmp_path / "spooning")
+    options = Options(str(tmp_path / "spooning"), set="unseen", seed=2)
+    with pytest.raises(MagicError, match="set of spooning: 'unseen'"):
+        all_cases(options)
+    like = replace(options, like="scooping")
+    assert all_cases(like) == all_cases(replace(OPTIONS, set="unseen", seed=2))
+    found = strategy_for(like)
+    assert found.name == "spooning" and found.goal == shipped.goal and found.physics == shipped.physics
+    assert found.environment == shipped.environment
 
 
 @pytest.mark.parametrize(
