@@ -90,8 +90,8 @@ def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_
     valid = np.isfinite(h)
     zero = np.where(valid, h, np.float32(0))
     limit = np.maximum(np.float32(parameters.min_height), np.float32(4.0) * looked.sigma)
-    raised = (zero > limit) & inside
-    raised = cv2.morphologyEx(raised.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(bool)
+    high = (zero > limit) & inside
+    raised = cv2.morphologyEx(high.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).view(bool)
     if not parameters.use_color:
         return raised, np.zeros_like(raised)
     around = cv2.dilate(raised.view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
@@ -108,16 +108,44 @@ def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_
     share = cv2.blur(near.astype(np.float32), (9, 9), borderType=cv2.BORDER_CONSTANT)
     thin = other & (share * np.float32(81) > 8) & (total > share * np.maximum(np.float32(0.0015), looked.sigma * np.float32(1.2)))
     core = raised | thin
-    # Grow into pixels without depth that have another colour and touch what is there.
-    unseen = other & ~valid
-    result = clusters.connected(core | unseen, core)
-    result = _fill_bowls(result, looked, other, parameters)
     color, depth, focal = looked.frame.color, looked.frame.depth, looked.frame.intrinsics.fx
-    # Where depth goes on beyond a thing's edge it was not carried there.
-    firm = result & ~(jump := smear.falls_back(result, depth, focal))
-    result = smear.cleared(result, color, depth, table, shaded, inside & (distance > 9), jump, focal)
+
+    def of(core: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
+        """The mask by what is surely of things, what of it stays whatever its colour, and whether depth is not carried past edges."""
+        # Grow into pixels without depth that have another colour and touch what is there.
+        result = clusters.connected(core | (other & ~valid), core)
+        result = _fill_bowls(result, looked, other, parameters)
+        # Where depth goes on beyond a thing's edge it was not carried there.
+        firm = result & ~(jump := smear.falls_back(result, depth, focal))
+        result, sharp = smear.cleared(result, color, depth, table, shaded, inside & (distance > 9), jump, focal)
+        return result, firm, sharp
+
+    result, firm, sharp = of(core)
+    # What is high at the rim of a thing of the table's colour is its own where depth is not carried there.
+    if sharp and np.any((closed := _closed(high, inside & ~valid, other)) & ~core):
+        result, firm, _ = of(core | closed)
     result = _two_colors(result, looked, table, firm)
     return open_by_two(result), shaded < smear.LIKE
+
+
+#: A gap in depth of so many pixels is closed, in what is somewhere broader than the second.
+GAP, SLIVER = 5, 7
+
+
+def _closed(high: NDArray[np.bool_], missing: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What is high (H, W), and the gaps in its depth (``missing``), of things that have mostly the table's colour (are not of another one, ``other``).
+
+    At edges every other pixel loses its depth, and there colour does not tell that it is the thing's.  Beside a sliver, as stereo leaves at the far edge of
+    a board, nothing is closed.
+    """
+    closing = cv2.morphologyEx(high.view(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP, GAP), np.uint8)).view(bool)
+    closed = cv2.morphologyEx((high | (missing & closing)).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    broad = cv2.erode(closed, np.ones((SLIVER, SLIVER), np.uint8)) > 0
+    count, regions = cv2.connectedComponents(closed, connectivity=8)
+    size, told, inner = (np.bincount(regions[where], minlength=count) for where in (closed > 0, other, broad))
+    plain = (inner > 0) & (told < 0.5 * size)
+    plain[0] = False
+    return plain[regions] & ~other
 
 
 def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:

@@ -3,7 +3,8 @@
 The window of stereo matching carries a near surface's depth some pixels past its edge and over narrow gaps (a handle's hole); at thin bars it may
 carry the background's depth over the thing.  The colour image shows the edge.  Each connected region of a mask is judged with two
 histograms of colour, that of the table around it and that of its own inside: a pixel near the edge goes to whichever makes its neighbourhood
-likelier, and a region of the table's colour that the mask encloses is a hole.  What has the table's colour itself is left as it was.
+likelier, and a region of the table's colour that the mask encloses is a hole.  What has the table's colour itself, or nearly, is left as it was: where the
+thing's own colours run into the table's, as a wooden spoon's do with the light, there is no edge to cut along.
 """
 
 from __future__ import annotations
@@ -18,9 +19,13 @@ from magic_perception.clusters import connected
 
 #: Pixels, at a focal length of 615, by which depth reaches past an edge or falls short of it, and to which a hole may lie inside a mask's edge.
 REACH, DEEP = 9, 26
+#: Where smear is found to reach no farther than this, pixels, depth is not carried past edges.
+SHARP = 3
 #: Log of the ratio of likelihoods from which a pixel near the edge is the table's, and one without support in depth is the thing's; and that
 #: of a region's mean from which it is a hole.
 TABLE, THING, HOLE = 1.0, 1.5, 2.5
+#: And that by which a thing's own pixel is clearly not the table's, and the share of those beside a patch that are so where there is an edge of colour.
+APART, MOST = 2.5, 0.4
 #: What is the table's differs from its colour around by less than so many squared standard deviations, shadows aside.
 LIKE = 25.0
 #: A hole is hollow in depth, by so many metres, or it has the table's colour to so many squared standard deviations.
@@ -81,8 +86,8 @@ def cleared(
     possible: NDArray[np.bool_],
     jump: NDArray[np.bool_],
     focal: float,
-) -> NDArray[np.bool_]:
-    """The mask (H, W) with smear taken out and lost rims put back.
+) -> tuple[NDArray[np.bool_], bool]:
+    """The mask (H, W) with smear taken out and lost rims put back; and whether things with an edge of colour show that depth is not carried past edges.
 
     color (H, W, 3) RGB; depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W): squared distance of the colour from
     that of the table around, in the light or in a shadow, in standard deviations; possible (H, W): where the mask may grow; jump (H, W): :func:`falls_back`; focal: focal length, pixels.
@@ -109,7 +114,7 @@ def cleared(
     for cut, near, told in judged:
         result[cut][near.mine] = False
         result[cut] |= _judged(near, told, reach, most, deep)
-    return result
+    return result, reach <= SHARP < most
 
 
 @dataclass(frozen=True)
@@ -128,13 +133,16 @@ class _Near:
 @dataclass(frozen=True)
 class _Told:
     """Of one region in its window: log of how much likelier each pixel's colour is around the thing than on it; its distance from the outside, pixels;
-    for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind them; and whether past each
-    pixel's nearest outline depth goes on."""
+    for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind them, where there is an edge of
+    colour; whether past each pixel's nearest outline depth goes on; the region's own pixels that are clearly not the table's; and where there is an edge of
+    colour beside."""
 
     field: NDArray[np.float32]
     within: NDArray[np.float32]
     widths: NDArray[np.float32]
     goes_on: NDArray[np.bool_]
+    clear: NDArray[np.bool_]
+    apart: NDArray[np.bool_]
 
 
 def _told(near: _Near, most: int, deep: int) -> _Told | None:
@@ -163,9 +171,16 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
     if np.count_nonzero(sure) < 0.3 * np.count_nonzero(mine):
         return None
     told = field(sure)
-    edge = near.jump & mine & (within < 1.5) & (cv2.dilate((~mine & (told > TABLE)).view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+    # Of a region of many things each has a small part of the histogram, so that colour that is not the table's even in a shadow is clear as well.
+    clear = mine & ((told < -APART) | (near.unlike >= LIKE))
+    count, share = (
+        cv2.blur(x.astype(np.float32), (2 * most + 5,) * 2, borderType=cv2.BORDER_CONSTANT)
+        for x in (mine & ~((told > TABLE) & (near.unlike < LIKE)), clear)
+    )
+    apart = share > MOST * count
+    edge = near.jump & mine & apart & (within < 1.5) & (cv2.dilate((~mine & (told > TABLE)).view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     own = cv2.distanceTransform((~(mine & (told < -THING))).view(np.uint8), cv2.DIST_L2, 3)
-    return _Told(told, within, own[edge], goes_on)
+    return _Told(told, within, own[edge], goes_on, clear, apart)
 
 
 def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float) -> NDArray[np.bool_]:
@@ -197,7 +212,7 @@ def _width(told: list[_Told], most: int) -> int:
     widths = widths[widths <= 2 * most]
     if len(widths) < LEAST:
         return most
-    return int(np.clip(np.ceil(np.percentile(widths, 75)) + 2, 3, most))
+    return int(np.clip(np.ceil(np.percentile(widths, 75)) + 2, SHARP, most))
 
 
 def _judged(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArray[np.bool_]:
@@ -225,22 +240,24 @@ def _smeared(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDAr
             continue
         cut = (slice(max(y - 4, 0), y + h + 4), slice(max(x - 4, 0), x + w + 4))
         part = parts[cut] == i
+        ring = (cv2.dilate(part.view(np.uint8), np.ones((7, 7), np.uint8)) > 0) & near.mine[cut] & ~empty[cut]
         if (
-            float(within[cut][part].max()) < deep
+            np.count_nonzero(ring) >= LEAST
+            and float(told.clear[cut][ring].mean()) > MOST
+            and float(within[cut][part].max()) < deep
             and float(told.field[cut][part].mean()) >= HOLE
-            and (_hollow(near, part, empty[cut], cut) or float(np.median(near.unlike[cut][part])) < SAME)
+            and (_hollow(near, part, ring, cut) or float(np.median(near.unlike[cut][part])) < SAME)
             and not _sticks_out(near, parts == i, empty, 2 * most)
             and not _stands(told, part, cut, reach)
         ):
             removed[cut] |= part
     # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
     own = _around(empty & ~removed & (within > reach + 1), reach + 1)
-    return removed | connected(empty & (within <= reach) & near.jump & ~own, outside)
+    return removed | connected(empty & (within <= reach) & near.jump & told.apart & ~own, outside)
 
 
-def _hollow(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], cut: tuple[slice, slice]) -> bool:
-    """Whether depth shows a patch of the table's colour in a region hollow, or is missing there."""
-    ring = (cv2.dilate(part.view(np.uint8), np.ones((7, 7), np.uint8)) > 0) & near.mine[cut] & ~empty
+def _hollow(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: tuple[slice, slice]) -> bool:
+    """Whether depth shows a patch of the table's colour in a region hollow, within the ring of the region's own about it, or is missing there."""
     inside, rim = part & np.isfinite(near.depth[cut]), ring & np.isfinite(near.depth[cut])
     if np.count_nonzero(inside) < 0.7 * np.count_nonzero(part):
         return True

@@ -32,7 +32,7 @@ def picture(thing: np.ndarray, color: tuple[int, int, int] = THING, seed: int = 
 def cleared(mask: np.ndarray, color: np.ndarray, depth: np.ndarray, seen: np.ndarray, unlike: float = 0.0) -> np.ndarray:
     table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     everywhere = np.ones(mask.shape, bool)
-    return smear.cleared(mask, color, depth, table, np.where(seen, 100, unlike).astype(np.float32), everywhere, everywhere, 615.0)
+    return smear.cleared(mask, color, depth, table, np.where(seen, 100, unlike).astype(np.float32), everywhere, everywhere, 615.0)[0]
 
 
 @pytest.mark.parametrize("hollow", [0.0, 0.02])
@@ -133,7 +133,7 @@ def test_a_foot_of_the_tables_colour_is_no_hole_where_depth_goes_on_past_it(stan
     table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     unlike = np.where(mask & ~foot, 100, 1).astype(np.float32)
     jump = mask & ~(stands & (rows > 130) & (np.mgrid[0:200, 0:200][1] > 62) & (np.mgrid[0:200, 0:200][1] < 137))
-    found = smear.cleared(mask, picture(mask & ~foot), depth, table, unlike, np.ones(mask.shape, bool), jump, 615.0)
+    found = smear.cleared(mask, picture(mask & ~foot), depth, table, unlike, np.ones(mask.shape, bool), jump, 615.0)[0]
     assert found[60:116, 66:134].mean() > 0.98
     assert (found[122:134, 80:120].mean() > 0.95) == stands
 
@@ -148,3 +148,29 @@ def test_what_sticks_out_farther_than_smear_is_carried_is_no_smear(length: int, 
     found = cleared(head | bar, picture(head), depth, head, unlike=1.0)
     assert found[head].mean() > 0.97
     assert (found[bar].mean() > 0.9) == kept and (found[bar].mean() < 0.4) != kept
+
+
+@pytest.mark.parametrize("light, unlike, kept", [((180, 150, 118), 10.0, True), ((60, 70, 120), 100.0, False)])
+def test_a_bar_is_cut_along_an_edge_of_colour_and_not_where_its_own_runs_into_the_tables(
+    light: tuple[int, int, int], unlike: float, kept: bool
+) -> None:
+    """A third of a bar has the table's colour, the rest hardly another: that third is the bar's own.  Beside quite another colour it is smear."""
+    mask, lit = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
+    mask[93:107, 30:170] = True
+    lit[93:102, 30:170] = True
+    depth = np.where(mask, 0.6, 0.63).astype(np.float32)
+    found = cleared(mask, picture(lit, light), depth, lit & (unlike > smear.LIKE), 10.0)
+    assert found[94:101, 34:166].mean() > 0.95
+    assert (found[103:106, 34:166].mean() > 0.95) == kept
+
+
+def test_smear_is_cut_beside_a_thing_whose_colour_the_room_behind_the_table_has() -> None:
+    """The histogram of what lies around has its colour too, so that this one does not tell; that the table has not does."""
+    thing, wide = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
+    thing[90:130, 60:100] = True
+    wide[90:130, 60:107] = True
+    room = cv2.dilate(wide.astype(np.uint8), np.ones((13, 13))) == 0
+    depth = np.where(wide, 0.6, 0.63).astype(np.float32)
+    found = cleared(wide, picture(thing | room), depth, thing)
+    assert found[94:126, 64:98].mean() > 0.95
+    assert not found[94:126, 102:].any()
