@@ -2,9 +2,9 @@
 
 Two convex things on a table are on the two sides of some upright plane.  Where stereo fills the gap between them, or they touch with faces that go on in one
 plane, no seam bends inward, and low things have none that tells; but colour changes all along that plane, and either side alone is nearer to a convex body
-than both are together.  The colour of one printed thing changes as well, and so do those of a head and its handle: the chance of two things is a logistic
-function of what is measured at the plane (:data:`CRITERIA`), and what is one convex body stays one thing, whatever its colours.  ``cuts.json`` holds the
-weights, made by ``python -m magic_perception.learn_cuts`` from procedural scenes.
+than both are together, as far as that is seen: where other things hide a body it may go on.  The colour of one printed thing changes as well, and so do those
+of a head and its handle: the chance of two things is a logistic function of what is measured at the plane (:data:`CRITERIA`), and what is one convex body
+stays one thing, whatever its colours.  ``cuts.json`` holds the weights, made by ``python -m magic_perception.learn_cuts`` from procedural scenes.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_core import transforms
 from magic_perception import clusters, logistic
 from magic_perception.clustered import Clusters
 from magic_perception.looks import Looked
@@ -51,6 +52,11 @@ CELL, UNSURE = 0.004, 0.004
 #: What lies so near to the plane, m, is the side's whose colour is nearer by this factor.
 NEAR, CLEAR = 0.008, 0.6
 
+#: What other things hide is looked at in cells of this size in plan, m, so high, as shares of the height of the cluster; depth so much farther than a place, m,
+#: shows that nothing is there.
+PLACE, LEVELS, EMPTY = 0.008, (0.25, 0.5, 0.75), 0.008
+NOWHERE = np.zeros((0, 2))
+
 #: Told the criteria (C,) of a plane: the logarithm of the odds that its sides are two things.
 Judge = Callable[[NDArray[np.float64]], float]
 
@@ -70,18 +76,20 @@ class Points:
 
 @dataclass(frozen=True)
 class Seen:
-    """A cluster: some :data:`POINTS` of its points, and the area in plan that all of them cover, m2."""
+    """A cluster: some :data:`POINTS` of its points, the area in plan that all of them cover, m2, and places (H, 2) in the middle of the cells of its convex hull
+    in plan that other things hide."""
 
     points: Points
     covered: float
+    hidden: NDArray[np.float64]
 
     @classmethod
-    def of(cls, points: Points) -> Seen:
+    def of(cls, points: Points, hidden: NDArray[np.float64] = NOWHERE) -> Seen:
         """By all points of the cluster."""
         cells = np.floor(points.place / CELL).astype(np.int64)
         cells -= cells.min(axis=0)
         covered = len(np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1])) * CELL**2
-        return cls(points.of(np.arange(0, len(points.place), max(1, len(points.place) // POINTS))), covered)
+        return cls(points.of(np.arange(0, len(points.place), max(1, len(points.place) // POINTS))), covered, hidden)
 
 
 class Plane(NamedTuple):
@@ -160,18 +168,19 @@ def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
     area = max(float(cv2.contourArea(whole)), 1e-6)
     areas = [max(float(cv2.contourArea(outline)), 1e-6) for outline in outlines]
     strip = 2 * UNSURE * _chord(whole, plane)
+    hidden = _outside(seen.hidden, outlines, plane) * PLACE**2
     tops = [max(float(np.percentile(points.height[side], 95)), 1e-3) for side in sides]
     scaled = points.lab / SPREAD
     away = [np.linalg.norm(scaled - scaled[side].mean(axis=0), axis=1) for side in sides]
     return np.array([
         np.log1p(plane.change),
         min(float(np.mean(away[i][side] < away[1 - i][side])) for i, side in enumerate(sides)) - 0.5,
-        np.log(max(1 - (sum(areas) + strip) / area, 0.004) / 0.03),
-        np.log(max(1 - (areas[0] * tops[0] + areas[1] * tops[1] + strip * np.mean(tops)) / (area * max(tops)), 0.004) / 0.03),
+        np.log(max(1 - (sum(areas) + strip + hidden) / area, 0.004) / 0.03),
+        np.log(max(1 - (areas[0] * tops[0] + areas[1] * tops[1] + strip * np.mean(tops) + hidden * max(tops)) / (area * max(tops)), 0.004) / 0.03),
         np.log(min(box[0] for box in boxes) / 0.040),
         min(float(box[0] / max(box[1], box[0])) for box in boxes),
         np.log(min(counts) / len(first)),
-        seen.covered / area,
+        (seen.covered + hidden) / area,
     ])  # fmt: skip
 
 
@@ -202,6 +211,20 @@ def _hull(place: NDArray[np.float64]) -> NDArray[np.float32]:
     return cv2.convexHull(np.ascontiguousarray(place, np.float32)[:, None])
 
 
+def _outside(place: NDArray[np.float64], outlines: list[NDArray[np.float32]], plane: Plane) -> int:
+    """How many of the places (N, 2) are in no outline, nor so near to the plane that they are nobody's."""
+    place = place[np.abs(plane.distance(place)) > UNSURE]
+    return int(np.count_nonzero(~_inside(place, outlines[0]) & ~_inside(place, outlines[1])))
+
+
+def _inside(place: NDArray[np.float64], outline: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which of the places (N, 2) are inside a convex outline."""
+    ring = outline[:, 0].astype(float)
+    edge = np.roll(ring, -1, axis=0) - ring
+    side = edge[:, 0] * (place[:, None, 1] - ring[:, 1]) - edge[:, 1] * (place[:, None, 0] - ring[:, 0])
+    return np.all(side >= 0, axis=1) | np.all(side <= 0, axis=1)
+
+
 @cache
 def learned() -> Judge:
     """The judge by the weights that ship with the package."""
@@ -225,10 +248,52 @@ def points_of(looks: list[Looked], found: Clusters) -> Points:
     return Points(found.cloud[:, :2].astype(float), height.astype(float), lab.astype(float))
 
 
+def images_of(looks: list[Looked], found: Clusters, instance: NDArray[np.int64]) -> list[NDArray[np.int32]]:
+    """For each look (H, W) the instance at each pixel; -1: none; -2: what is known, or where the camera is blind."""
+    images, start = [], 0
+    for look, fixed, where in zip(looks, found.fixed, found.spots, strict=True):
+        image = np.where(fixed | ~look.open, np.int32(-2), np.int32(-1))
+        image[where] = instance[start : start + len(where[0])]
+        start += len(where[0])
+        images.append(image)
+    return images
+
+
+def hidden(
+    looks: list[Looked], images: list[NDArray[np.int32]], label: int, cloud: NDArray[np.float32], height: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Places (H, 2) within the hull in plan of an instance at which no camera sees that nothing is there, as other things are before them; cloud (N, 3), height
+    (N,): its own points."""
+    step = max(1, len(cloud) // POINTS)
+    cloud, height = cloud[::step], height[::step]
+    outline = _hull(cloud[:, :2])
+    low, high = outline[:, 0].min(axis=0), outline[:, 0].max(axis=0)
+    place = np.stack(np.meshgrid(*(np.arange(low[i] + PLACE / 2, high[i], PLACE) for i in range(2))), axis=-1).reshape(-1, 2)
+    place = place[_inside(place, outline)].astype(float)
+    ground, top = float(np.mean(cloud[:, 2] - height)), float(np.percentile(height, 95))
+    levels = ground + top * np.repeat(LEVELS, len(place))
+    empty, behind = np.zeros(len(place), bool), np.zeros(len(place), bool)
+    for look, image in zip(looks, images, strict=True):
+        k = look.frame.intrinsics
+        local = transforms.apply(
+            transforms.inverse(look.frame.world_from_camera), np.column_stack([np.tile(place, (len(LEVELS), 1)), levels])
+        )
+        z = np.maximum(local[:, 2], 1e-3)
+        u, v = np.rint(k.fx * local[:, 0] / z + k.cx), np.rint(k.fy * local[:, 1] / z + k.cy)
+        inside = (local[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
+        u, v = (np.where(inside, i, 0).astype(int) for i in (u, v))
+        there = image[v, u]
+        with np.errstate(invalid="ignore"):
+            past = (there == -1) | (look.frame.depth[v, u] > z + EMPTY)
+        empty |= (inside & past).reshape(len(LEVELS), -1).any(axis=0)
+        behind |= (inside & ~past & (there != label)).reshape(len(LEVELS), -1).any(axis=0)
+    return place[behind & ~empty]
+
+
 def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
     """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things."""
     instance = instance.copy()
-    points = points_of(looks, found)
+    points, images = points_of(looks, found), images_of(looks, found, instance)
     todo = list(range(int(instance.max(initial=-1)) + 1))
     while todo:
         label = todo.pop()
@@ -236,7 +301,7 @@ def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], ju
         if len(mine) < 2 * LEAST:
             continue
         own = points.of(mine)
-        plane = best(Seen.of(own), judge)
+        plane = best(Seen.of(own, hidden(looks, images, label, found.cloud[mine], own.height)), judge)
         if plane is None:
             continue
         first = _first(own, plane)
@@ -244,6 +309,7 @@ def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], ju
             continue
         new = int(instance.max()) + 1
         instance[mine[first]] = new
+        images = images_of(looks, found, instance)
         todo += [label, new]
     return instance
 

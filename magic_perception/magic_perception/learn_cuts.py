@@ -57,7 +57,7 @@ def clusters_of(made: Pile, parameters: Parameters, scene: int, kind: str) -> li
     looks = looked_at(made, parameters)
     found = clustered(looks, (), parameters)
     instance = uncut(looks, found, learned(), parameters)
-    points = cuts.points_of(looks, found)
+    points, images = cuts.points_of(looks, found), cuts.images_of(looks, found, instance)
     truth = np.concatenate([image[where] for image, where in zip(made.truth, found.spots, strict=True)])
     result = []
     for label in range(int(instance.max(initial=-1)) + 1):
@@ -66,7 +66,7 @@ def clusters_of(made: Pile, parameters: Parameters, scene: int, kind: str) -> li
             continue
         things = [thing for thing in np.unique(truth[mine]) if thing > 0 and np.mean(truth[mine] == thing) > TRACE]
         own = points.of(mine)
-        seen, rows, two = cuts.Seen.of(own), [], []
+        seen, rows, two = cuts.Seen.of(own, cuts.hidden(looks, images, label, found.cloud[mine], own.height)), [], []
         for plane in cuts.planes(seen.points):
             row = cuts.measured(seen, plane)
             if row is not None:
@@ -122,6 +122,7 @@ def judged(first: int, rounds: int) -> str:
     for seed in range(first, first + rounds):
         for number, (_, gap, _, _) in enumerate(neighbours.PAIRS):
             counts[f"two, {1000 * gap:.0f} mm apart", told(neighbours.pair(seed, number), segmenter)] += 1
+            counts["partly hidden", told(neighbours.behind(seed, number), segmenter)] += 1
             counts[neighbours.kind_of(number), told(neighbours.single(seed, number), segmenter)] += 1
     lines = ["| what | right | taken for one | torn | not found |", "| --- |" + " --- |" * 4]
     for what in dict.fromkeys(key[0] for key in counts):

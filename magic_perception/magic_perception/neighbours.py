@@ -1,6 +1,7 @@
 """Procedural pairs of neighbours of different colours, and single things of several colours: what is to be parted, and what is to stay one.
 
-A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), and as many single things.
+A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), as many single things, and as many that another thing
+hides in part.
 """
 
 from __future__ import annotations
@@ -49,26 +50,40 @@ def pair(seed: int, number: int) -> Pile:
     turn = random.uniform(-np.pi, np.pi)
     # Boxes side by side mostly, else in any direction; beside each other within a third of their width.
     turns = [0.0, 0.0 if random.random() < 0.7 else random.uniform(-np.pi, np.pi)]
-    meshes = []
-    for form, color, height, own in zip(forms, colors, heights, turns, strict=True):
-        if form == "box":
-            solid = trimesh.creation.box([*random.uniform(0.035, 0.10, 2), height])
-        else:
-            solid = trimesh.creation.cylinder(random.uniform(0.018, 0.045), height, sections=64)
-        solid.apply_translation([0, 0, height / 2])
-        mesh = Mesh(solid.vertices, solid.faces).painted(color)
-        if random.random() < PRINTED:
-            mesh = _printed(random, mesh, solid.extents, color)
-        meshes.append(mesh.transformed(transforms.from_rpy(0, 0, own, [0, random.uniform(-0.012, 0.012), 0])))
-    outlines = [shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull for mesh in meshes]
+    one, two = (
+        _standing(random, form, height, color).transformed(transforms.from_rpy(0, 0, own, [0, random.uniform(-0.012, 0.012), 0]))
+        for form, color, height, own in zip(forms, colors, heights, turns, strict=True)
+    )
+    far = _apart(one, two, gap)
+    place = transforms.from_rpy(0, 0, turn, [*MIDDLE, 0]) @ transforms.from_rpy(0, 0, 0, [-far / 2, 0, 0])
+    return _seen(random, [mesh.transformed(place) for mesh in (one, _along(two, far))], table)
+
+
+def _standing(random: np.random.Generator, form: str, height: float, color: tuple[int, int, int]) -> Mesh:
+    """A box or a cylinder on the table's origin, printed now and then."""
+    if form == "box":
+        solid = trimesh.creation.box([*random.uniform(0.035, 0.10, 2), height])
+    else:
+        solid = trimesh.creation.cylinder(random.uniform(0.018, 0.045), height, sections=64)
+    solid.apply_translation([0, 0, height / 2])
+    mesh = Mesh(solid.vertices, solid.faces).painted(color)
+    return _printed(random, mesh, solid.extents, color) if random.random() < PRINTED else mesh
+
+
+def _apart(one: Mesh, two: Mesh, gap: float) -> float:
+    """How far along x the second mesh is to be moved until it is so far from the first, m."""
+    outlines = [shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull for mesh in (one, two)]
     near, far = 0.0, 0.4
     for _ in range(20):
         middle = (near + far) / 2
         close = outlines[0].distance(shapely.affinity.translate(outlines[1], middle, 0.0)) <= gap
         near, far = (middle, far) if close else (near, middle)
-    meshes[1] = meshes[1].transformed(transforms.from_rpy(0, 0, 0, [far, 0, 0]))
-    place = transforms.from_rpy(0, 0, turn, [*MIDDLE, 0]) @ transforms.from_rpy(0, 0, 0, [-far / 2, 0, 0])
-    return _seen(random, [mesh.transformed(place) for mesh in meshes], table)
+    return far
+
+
+def _along(mesh: Mesh, far: float) -> Mesh:
+    """The mesh moved along x, m."""
+    return mesh.transformed(transforms.from_rpy(0, 0, 0, [far, 0, 0]))
 
 
 def kind_of(number: int) -> str:
@@ -122,10 +137,38 @@ def single(seed: int, number: int) -> Pile:
     return _seen(random, [_at(mesh, np.array(MIDDLE), 0.0)], table)
 
 
-def _seen(random: np.random.Generator, meshes: list[Mesh], table: tuple[int, int, int]) -> Pile:
-    """The scene by one of the station's cameras or both, by the sensor that smears."""
+def behind(seed: int, number: int) -> Pile:
+    """A thing of several colours, and another thing between it and a camera, which hides a part of it; both stand apart."""
+    random = np.random.default_rng([seed, number, 2914])
+    table = TABLES[int(random.integers(len(TABLES)))]
+    one = _color(random, [table])
+    two = _color(random, [table, one])
+    low, high = HEIGHTS[number % len(HEIGHTS)]
+    size = np.array([random.uniform(0.08, 0.22), random.uniform(0.06, 0.16), random.uniform(low, high)])
+    kind = ("printed", "print", "halves", "stripes")[int(random.integers(4))]
+    if kind == "printed":
+        mesh = _box(random, size)
+    elif kind == "print":
+        mesh = _printed(random, _row(size, [], [one]), size, one)
+    else:
+        cuts = np.sort(random.uniform(0.1, 0.9, 1 if kind == "halves" else int(random.integers(2, 5))))
+        mesh = _row(size, list(cuts), [(one, two)[i % 2] for i in range(len(cuts) + 1)])
+    mesh = _at(mesh.transformed(transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi))), np.array(MIDDLE), 0.0)
+    names = (("left", "right"), ("left",), ("right",))[int(random.integers(3))]
+    front = _standing(random, FORMS[int(random.integers(3))][1], random.uniform(0.04, 0.20), _color(random, [table]))
+    front = front.transformed(transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi)))
+    way = sensor.STATION[names[0]][:2, 3] - MIDDLE
+    turn = transforms.from_rpy(0, 0, float(np.arctan2(way[1], way[0])), [*MIDDLE, 0])
+    away = transforms.from_rpy(0, 0, 0, [0, random.uniform(-0.08, 0.08), 0])
+    front = front.transformed(away)
+    far = _apart(mesh.transformed(transforms.inverse(turn)), front, random.uniform(0.012, 0.06))
+    return _seen(random, [mesh, _along(front, far).transformed(turn)], table, names)
+
+
+def _seen(random: np.random.Generator, meshes: list[Mesh], table: tuple[int, int, int], names: tuple[str, ...] | None = None) -> Pile:
+    """The scene by the station's cameras of these names, or by one of them or both, by the sensor that smears."""
     caster = sensor.scene_raycaster(meshes, sensor.table_mesh(color=table))
-    names = (("left", "right"), ("left", "right"), ("left",), ("right",))[int(random.integers(4))]
+    names = names or (("left", "right"), ("left", "right"), ("left",), ("right",))[int(random.integers(4))]
     seed = int(random.integers(1 << 30))
     frames = [
         sensor.capture([], sensor.D435, sensor.STATION[name], [seed, i], model=sensor.SMEARED, camera=name, raycaster=caster)

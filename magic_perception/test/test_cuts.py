@@ -14,6 +14,7 @@ from magic_core import sensor
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh, concatenate
 from magic_perception import cuts, evaluate, learn_cuts, logistic, neighbours
+from magic_perception.clustered import clustered
 from magic_perception.parameters import Parameters
 from magic_perception.piles import Pile
 from magic_perception.segmentation import DepthSegmenter
@@ -121,6 +122,47 @@ def test_criteria_of_two_rectangles():
     assert told_["own"] == pytest.approx(0.5, abs=0.01)
     assert 0.040 * np.exp(told_["breadth"]) == pytest.approx(0.04, abs=0.002)
     assert told_["slim"] == pytest.approx(40 / 60, abs=0.05)
+
+
+def test_what_other_things_hide_is_no_evidence():
+    """A rectangle of two colours, one of whose halves is narrower: two things, unless other things hide what it lacks."""
+    seen = side_by_side(0.08, 0.04, 0.0)
+    places = np.stack(np.meshgrid(np.arange(0.504, 0.56, cuts.PLACE), np.arange(0.064, 0.14, cuts.PLACE)), axis=-1).reshape(-1, 2)
+    places = places[np.abs(places[:, 1] - 0.1) > 0.02]
+    plane = cuts.Plane(0.0, 0.5, 3.0)
+    alone, behind = (cuts.measured(cuts.Seen.of(seen, hidden), plane) for hidden in (cuts.NOWHERE, places))
+    assert not cuts.convex(alone) and cuts.convex(behind)
+    filled = list(cuts.CRITERIA).index("filled")
+    assert behind[filled] > alone[filled] + 0.1
+
+
+def test_what_is_behind_another_thing_is_hidden_unless_a_camera_sees_that_it_is_empty():
+    """Of a thing with a notch, before which a post stands, as the left camera sees it."""
+    back = concatenate([box((0.07, 0.10, 0.05), 0.465, 0.0, BLUE), box((0.07, 0.05, 0.05), 0.535, -0.025, BLUE)])
+    post = box((0.07, 0.07, 0.16), 0.62, 0.11, RED)
+    caster = sensor.scene_raycaster([back, post])
+    notch = {}
+    for names in (("left",), ("left", "right")):
+        frames = [
+            sensor.capture([], sensor.D435, sensor.STATION[name], [5, i], camera=name, raycaster=caster) for i, name in enumerate(names)
+        ]
+        looks = learn_cuts.looked_at(Pile(frames, [], [back, post]), Parameters())
+        found = clustered(looks, (), Parameters())
+        images, height = cuts.images_of(looks, found, found.instance), cuts.points_of(looks, found).height
+        for label in np.flatnonzero(np.bincount(found.instance[found.instance >= 0]) > cuts.LEAST):
+            mine = np.nonzero(found.instance == label)[0]
+            place = cuts.hidden(looks, images, int(label), found.cloud[mine], height[mine])
+            if np.median(found.cloud[mine, 0]) > 0.6:
+                assert len(place) == 0
+            else:
+                notch[names] = np.count_nonzero(np.all((place > [0.51, 0.005]) & (place < [0.56, 0.045]), axis=1))
+    assert notch["left",] > 10 and notch["left", "right"] < 4
+
+
+@pytest.mark.parametrize("number", [54, 64])
+def test_a_striped_thing_that_another_hides_in_part_is_one(number):
+    made = neighbours.behind(2001, number)
+    assert len(made.meshes) == 2 and learn_cuts.told(made, DepthSegmenter()) == "right"
 
 
 def test_points_near_the_plane_follow_their_colour():
