@@ -14,7 +14,8 @@ the tool, the hand or the target, is no nearer than it: there its colour tells i
 well unless it is seen to be behind.  What else is of the tool's colour is given up by a loss for what is far (Geman and McClure).
 Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  What they say is
 filtered as they come, and smoothed when all have been seen (:mod:`magic_perception.paths`), where they are doubted as far as they
-contradict each other.
+contradict each other.  With that path the mesh is mended, of which the first look showed only one side
+(:mod:`magic_perception.reshaped`), and the pictures are asked again.
 
 The track is lost, and refused, where too much of the model is looked through, or where what is seen leaves it as uncertain as
 :data:`UNSURE`.
@@ -36,13 +37,15 @@ from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception.paths import CLEAR, Seen, State, changed, likeliest, moved, predicted
+from magic_perception.reshaped import Aside, Picture, Reshaping
 from magic_perception.tool_colors import Said, ToolColors, lab
 
 Array = NDArray[np.float64]
 #: No hand moves a tool by so many standard deviations of what is expected of it from one moment to the next.
 JUMP = 3.0
-#: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).
-START = (0.004, 0.03, 0.01, 0.05)
+#: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).  Its place is what the mesh was made in: what
+#: pictures of the tool on the table say otherwise is what they are wrong in there.  What they say of its turn they say later as well.
+START = (0.001, 0.03, 0.01, 0.05)
 #: Standard deviation (m) of a measured point from the reconstructed surface, and of an outline; errors hold together over a patch, so
 #: that the points of a frame count as so many at most.
 NOISE, OUTLINE, WORTH = 0.004, 0.005, 60.0
@@ -57,6 +60,9 @@ STRIDE = (0.02, np.deg2rad(12.0))
 FAR = 0.06
 #: So often (s) two cameras are asked each by itself, and how little is known of the tool then beside what they see: as START.
 ALONE, LOOSE = 0.5, (0.015, 0.3, 0.1, 0.5)
+#: The tool has not moved yet while it is nearer than this (m, rad) to where it lay; so well (m, rad) is it known where it is until then; and
+#: every so many seconds afterwards a moment is asked what the tool's surface is like.
+STILL, LIES, RESHAPED = (0.005, 0.05), (0.0005, 0.003), 0.4
 #: Pictures whose stamps differ by no more (s) are of one moment.
 AT_ONCE = 0.01
 #: Measured points used of a frame, and points of the surface that stand for the model.
@@ -65,8 +71,9 @@ USED, SURFACE = 700, 900
 BEHIND, HIDES = 0.012, 0.005
 #: What is nearer to the table than this is taken for it (m).
 TABLE = 0.004
-#: How far from the outline a point that is looked through may be (pixels).
-ASTRAY = 25
+#: How far from the outline a point that is looked through may be (pixels), and from how far on it tells of the pose: nearer, depth is rounded,
+#: lost and smeared, nothing weighs against that where a hand hides the other end, and colours tell where the outline is.
+ASTRAY, SLACK = 25, 2.5
 #: What is about the tool in a picture, from half of BESIDE to AROUND pixels from its outline, is background.
 BESIDE, AROUND = 7, 20
 #: A pixel counts as this share of one that is independent of its neighbours.
@@ -129,6 +136,11 @@ class Follower:
         self.colors = ToolColors()
         self._before: dict[str, RgbdFrame] = {}
         self._rng = rng
+
+    @property
+    def surface(self) -> tuple[Array, Array]:
+        """Points (N, 3) on the surface and its normals there (N, 3), in the tool's frame."""
+        return self._points, self._normals
 
     # ------------------------------------------------------------ one frame
 
@@ -274,16 +286,22 @@ class Follower:
         return on, through, hidden
 
     def _outlined(self, frame: RgbdFrame, pose: Array, colors: Said, sought: int) -> tuple[Array, Array]:
-        """What the colours of a frame say at a pose, as :meth:`_information`: the outline is moved to where they change.
+        """What the colours of a frame say at a pose, as :meth:`_information`: the outline is moved to where they change."""
+        off, along, places, sure = self.outline(frame, pose, colors, sought)
+        jacobian = np.concatenate([along, np.cross(places - transforms.apply(pose, self.middle), along)], axis=1)
+        return (jacobian * sure[:, None]).T @ jacobian, (jacobian * sure[:, None]).T @ off
+
+    def outline(self, frame: RgbdFrame, pose: Array, colors: Said, sought: int) -> Aside:
+        """How far along its normals the drawn outline is from where the colours change.
 
         Along the normal of each place of the drawn outline the tool's profile (inside, outside, and inside again behind a slit) is shifted
         until it agrees best with the colours; its mean shift and how sharp that is make the residual and its weight (after Stoiber and
         others, "Iterative Corresponding Geometry", CVPR 2022).  What is hidden says nothing.
         """
-        matrix, vector = np.zeros((6, 6)), np.zeros(6)
+        none = Aside(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         view = self._drawn(frame, pose)
         if view is None or not view.mask.any():
-            return matrix, vector
+            return none
         seen = frame.depth[view.rows, view.columns]
         nearest = cv2.erode(np.where(view.mask, view.depth, 1e3).astype(np.float32), np.ones((2 * sought + 1,) * 2))
         said, touches = colors.tool[view.rows, view.columns], colors.touches[view.rows, view.columns]
@@ -295,7 +313,7 @@ class Follower:
         inner = view.mask & (cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3)), borderValue=0) == 0)
         rows, columns = np.nonzero(inner & (np.linalg.norm(slope, axis=-1) > 0.05) & ~hidden)
         if len(rows) < 6:
-            return matrix, vector
+            return none
         if len(rows) > PLACES:
             chosen = np.linspace(0, len(rows) - 1, PLACES).astype(int)
             rows, columns = rows[chosen], columns[chosen]
@@ -321,10 +339,8 @@ class Follower:
         points = transforms.apply(frame.world_from_camera, rays * depth[:, None])
         axis = normal @ frame.world_from_camera[:3, :2].T
         scale = depth / k.fx
-        jacobian = np.concatenate([axis, np.cross(points - transforms.apply(pose, self.middle), axis)], axis=1)
         sure = 1 / ((spread + SHARP**2) * scale**2) * np.clip(1 - spread / (sought**2 / 3), 0, 1)
-        sure *= min(1.0, LINES / len(sure))
-        return (jacobian * sure[:, None]).T @ jacobian, (jacobian * sure[:, None]).T @ (shift * scale)
+        return Aside(shift * scale, axis, points, sure * min(1.0, LINES / len(sure)))
 
     def _information(self, frame: RgbdFrame, pose: Array, measured: tuple[Array, NDArray[np.bool_]], reach: float) -> tuple[Array, Array]:
         """What a frame's depth says at a pose: (6, 6) and (6,), of a change of the pose as :func:`moved` takes it."""
@@ -358,7 +374,7 @@ class Follower:
                 goal = nearest[label[rows[:, 1], rows[:, 0]]] + [u0, v0]
                 step = goal - places[through]
                 length = np.linalg.norm(step, axis=1)
-                fits = (far < ASTRAY) & (length > 0.3)
+                fits = (far < ASTRAY) & (length > SLACK)
                 if fits.any():
                     direction = step[fits] / length[fits][:, None]
                     scale = depth[through][fits] / frame.intrinsics.fx
@@ -371,15 +387,7 @@ class Follower:
     def correct(self, frames: Sequence[RgbdFrame], state: State, before: Array, compare: bool = False) -> tuple[State, Seen | None]:
         """The state after the frames of one moment, and what they say there, ``None`` where the tool was not found in them; before (4, 4):
         where it was last; compare: what two of them say, each by itself."""
-        measured, colors = [], []
-        for frame in frames:
-            points, pixels = self._measured(frame, state.pose)
-            colors.append(self.colors.said(frame))
-            own = colors[-1].tool[pixels[:, 1], pixels[:, 0]] > 0
-            if len(points) > USED:
-                chosen = self._rng.choice(len(points), USED, replace=False)
-                points, own = points[chosen], own[chosen]
-            measured.append((points, own))
+        measured, colors = self._shown(frames, state.pose)
         best, least = None, 1.0
         # A hand that stops or turns is not where it was going: then from where the tool was, and from farther off.
         for start, reach in ((state.pose, EXPECTED), (before, REACH), (state.pose, FAR), (before, FAR)):
@@ -395,10 +403,51 @@ class Follower:
                 break
         if best is None:
             return state, None
-        said = [self._said(*seen, best.pose, CLOSE, SOUGHT[1]) for seen in zip(frames, measured, colors, strict=True)]
+        return best, self._told(frames, measured, colors, best.pose, least, compare)
+
+    def again(self, frames: Sequence[RgbdFrame], pose: Array, compare: bool = False) -> Seen | None:
+        """What the frames of one moment say about a pose (4, 4) in which the tool was found before, as :meth:`correct`."""
+        measured, colors = self._shown(frames, pose)
+        found = self._fitted(frames, measured, colors, State(pose, np.zeros(6), np.diag(np.repeat(LOOSE, 3)) ** 2), pose, EXPECTED).pose
+        on, through, _ = self.looked_at(frames, found)
+        share = through / max(on + through, 1)
+        return self._told(frames, measured, colors, found, share, compare) if on >= FEWEST and share <= THROUGH else None
+
+    def pictures(self, frames: Sequence[RgbdFrame], pose: Array) -> list[Picture]:
+        """What the frames of one moment show of the surface of the tool, about a pose (4, 4)."""
+        measured, colors = self._shown(frames, pose)
+        return [
+            Picture(points[own], frame.world_from_camera[:3, 3], self.outline(frame, pose, said, SOUGHT[1]))
+            for frame, (points, own), said in zip(frames, measured, colors, strict=True)
+        ]
+
+    def _shown(self, frames: Sequence[RgbdFrame], pose: Array) -> tuple[list[tuple[Array, NDArray[np.bool_]]], list[Said]]:
+        """Of each frame some of the measured points about a pose, and which have the tool's colour; and what its colours say."""
+        measured, colors = [], []
+        for frame in frames:
+            points, pixels = self._measured(frame, pose)
+            colors.append(self.colors.said(frame))
+            own = colors[-1].tool[pixels[:, 1], pixels[:, 0]] > 0
+            if len(points) > USED:
+                chosen = self._rng.choice(len(points), USED, replace=False)
+                points, own = points[chosen], own[chosen]
+            measured.append((points, own))
+        return measured, colors
+
+    def _told(
+        self,
+        frames: Sequence[RgbdFrame],
+        measured: list[tuple[Array, NDArray[np.bool_]]],
+        colors: list[Said],
+        pose: Array,
+        through: float,
+        compare: bool,
+    ) -> Seen:
+        """What frames say at a pose; compare: each by itself as well."""
+        said = [self._said(*seen, pose, CLOSE, SOUGHT[1]) for seen in zip(frames, measured, colors, strict=True)]
         matrix, vector = (np.sum([one[k] for one in said], axis=0) for k in range(2))
-        apart = self._compared(frames, measured, colors, best.pose) if compare and len(frames) > 1 else math.nan
-        return best, Seen(best.pose, matrix, vector, least, apart)
+        apart = self._compared(frames, measured, colors, pose) if compare and len(frames) > 1 else math.nan
+        return Seen(pose, matrix, vector, through, apart)
 
     def _compared(
         self, frames: Sequence[RgbdFrame], measured: list[tuple[Array, NDArray[np.bool_]]], colors: list[Said], pose: Array
@@ -491,14 +540,35 @@ def _plane_depth(frame: RgbdFrame, plane: Array, crop: tuple[int, int, int, int]
 
 def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame], others: Sequence[Mesh] = ()) -> Followed:
     """The tool's track through frames in the order of their stamps, of the first of which it is known that it lies at ``world_from_tool``;
-    others: what else is there then, in the world.
+    others: what else is there then, in the world.  The frames are gone through three times.
 
     Raises BAD_MOTION where it is lost, with the moment and what was seen; NO_FRAMES without two frames.
     """
     follower = Follower(mesh, world_from_tool, table, others)
-    middle = follower.middle
-    deviations = np.repeat(START, 3)
-    start = state = State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(deviations**2))
+    start = State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(np.repeat(START, 3) ** 2))
+    times, told = _found(follower, start, frames)
+    smooth = likeliest(start, times, told, follower.middle)
+    mended = Follower(_mended(mesh, follower, times, smooth, frames), world_from_tool, table, others)
+    told = _again(mended, told, smooth, frames)
+    smooth = likeliest(start, times, told, mended.middle)
+    shift = np.sqrt([np.linalg.eigvalsh(s.covariance[:3, :3])[-1] for s in smooth])
+    turn = np.sqrt([np.linalg.eigvalsh(s.covariance[3:6, 3:6])[-1] for s in smooth])
+    kept = _known(times, shift, turn)
+    times, smooth, shift, turn = times[:kept], smooth[:kept], shift[:kept], turn[:kept]
+    worst = int(np.argmax(np.maximum(shift / UNSURE[0], turn / UNSURE[1])))
+    if shift[worst] > UNSURE[0] or turn[worst] > UNSURE[1]:
+        raise MagicError(
+            Code.BAD_MOTION,
+            f"where the tool is {times[worst] - times[0]:.2f} s after the first picture",
+            f"known to {1000 * shift[worst]:.1f} mm and {np.degrees(turn[worst]):.1f} degrees (standard deviations)",
+            f"{1000 * UNSURE[0]:g} mm and {np.degrees(UNSURE[1]):g} degrees: more of it in sight, nearer cameras that are not moved, or more pictures a second",
+        )
+    return Followed(times, np.stack([s.pose for s in smooth]), shift, turn, sum(seen is not None for seen in told))
+
+
+def _found(follower: Follower, start: State, frames: Iterable[RgbdFrame]) -> tuple[Array, list[Seen | None]]:
+    """The times (T,) of the moments and what was seen in them; raises BAD_MOTION where the tool is lost, NO_FRAMES."""
+    state = start
     times: list[float] = []
     told: list[Seen | None] = []
     last, compared = math.nan, -math.inf
@@ -507,7 +577,7 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
         if not times:
             last = now
             follower.learn_colors(moment)
-        expected, _ = predicted(state, middle, now - times[-1] if times else 0.0)
+        expected, _ = predicted(state, follower.middle, now - times[-1] if times else 0.0)
         compare = now - compared >= ALONE
         compared = now if compare else compared
         state, seen = follower.correct(moment, expected, state.pose, compare)
@@ -526,20 +596,34 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
             )
     if len(times) < 2:
         raise MagicError(Code.NO_FRAMES, "pictures to follow the tool in", len(times), "two or more")
-    smooth = likeliest(start, np.array(times), told, middle)
-    shift = np.sqrt([np.linalg.eigvalsh(s.covariance[:3, :3])[-1] for s in smooth])
-    turn = np.sqrt([np.linalg.eigvalsh(s.covariance[3:6, 3:6])[-1] for s in smooth])
-    kept = _known(np.array(times), shift, turn)
-    times, smooth, shift, turn = times[:kept], smooth[:kept], shift[:kept], turn[:kept]
-    worst = int(np.argmax(np.maximum(shift / UNSURE[0], turn / UNSURE[1])))
-    if shift[worst] > UNSURE[0] or turn[worst] > UNSURE[1]:
-        raise MagicError(
-            Code.BAD_MOTION,
-            f"where the tool is {times[worst] - times[0]:.2f} s after the first picture",
-            f"known to {1000 * shift[worst]:.1f} mm and {np.degrees(turn[worst]):.1f} degrees (standard deviations)",
-            f"{1000 * UNSURE[0]:g} mm and {np.degrees(UNSURE[1]):g} degrees: more of it in sight, nearer cameras that are not moved, or more pictures a second",
-        )
-    return Followed(np.array(times), np.stack([s.pose for s in smooth]), shift, turn, sum(seen is not None for seen in told))
+    return np.array(times), told
+
+
+def _mended(mesh: Mesh, follower: Follower, times: Array, path: Sequence[State], frames: Iterable[RgbdFrame]) -> Mesh:
+    """The mesh as all pictures show it, most of all those in which it has not moved yet."""
+    lying = path[0].pose
+    moves = [bool((np.abs(changed(state.pose, lying, follower.middle)) > np.repeat(STILL, 3)).any()) for state in path]
+    first = moves.index(True) if True in moves else len(path)
+    reshaping = Reshaping(mesh, *follower.surface)
+    told = -math.inf
+    for k, (now, state, moment) in enumerate(zip(times, path, _moments(frames), strict=True)):
+        if k < first or now - told >= RESHAPED:
+            pose, known = (lying, LIES) if k < first else (state.pose, LOOSE[:2])
+            reshaping.see(follower.pictures(moment, pose), pose, follower.middle, np.diag(np.repeat(known, 3) ** -2.0))
+            told = now
+    return reshaping.mesh()
+
+
+def _again(follower: Follower, told: Sequence[Seen | None], path: Sequence[State], frames: Iterable[RgbdFrame]) -> list[Seen | None]:
+    """What was seen in the moments, asked again about the path where it was found."""
+    again: list[Seen | None] = []
+    for k, (seen, state, moment) in enumerate(zip(told, path, _moments(frames), strict=True)):
+        if k == 0:
+            follower.learn_colors(moment)
+        again.append(None if seen is None else follower.again(moment, state.pose, math.isfinite(seen.apart)))
+        if seen is not None:
+            follower.see_around(moment, state.pose)
+    return again
 
 
 def _known(times: Array, shift: Array, turn: Array) -> int:

@@ -11,7 +11,8 @@ from magic_core.errors import Code, MagicError
 from magic_core.sensor import SMEARED, STATION, capture, scene_raycaster
 from magic_core.shapes import make
 from magic_core.testing.hand import coming, hand
-from magic_perception.following import BLIND, UNSURE, Followed, Follower, _known, follow
+from magic_perception.following import BLIND, CLOSE, UNSURE, Followed, Follower, _known, follow
+from magic_perception.paths import moved
 from magic_perception.tool_colors import Said, ToolColors
 
 SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
@@ -47,15 +48,18 @@ def path(hook):
 
 def pictures(hook, times, poses, held=True, model=SMEARED, gone=np.inf, held_at=(-0.09, 0.0, 0.0), beside=()):
     grip = transforms.frame(held_at, [1.0, 0, 0], [0, 0, 1.0])
-    skin = hand(0.02)
+    skin, frames = hand(0.02), []
     for k, (t, pose) in enumerate(zip(times, poses, strict=True)):
         meshes = [hook.mesh.transformed(pose)] if t < gone else []
         meshes += beside[k : k + 1]
         if held and t > 0.15:
             meshes.append(skin.transformed(pose @ grip @ transforms.make(translation=coming(t - 0.15, 0.15))))
         caster = scene_raycaster(meshes)
-        for number, (name, station) in enumerate(STATION.items()):
-            yield capture([], SMALL, station, [5, k, number], camera=name, stamp=100.0 + t, raycaster=caster, model=model)
+        frames += [
+            capture([], SMALL, station, [5, k, number], camera=name, stamp=100.0 + t, raycaster=caster, model=model)
+            for number, (name, station) in enumerate(STATION.items())
+        ]
+    return frames
 
 
 def errors(found: Followed, hook, times, poses):
@@ -145,6 +149,17 @@ def test_colours_tell_the_tool_from_the_ground_and_from_what_comes(hook):
     of_table = np.abs(empty - last.depth) < 0.005
     assert min(of_tool.sum(), of_hand.sum()) > 100
     assert (evidence[of_tool] > 0).mean() > 0.8 and (evidence[of_hand] < 0).mean() > 0.8 and (evidence[of_table] < 0).mean() > 0.95
+
+
+def test_what_is_looked_through_tells_of_a_wrong_pose_and_not_of_the_edge_of_a_right_one(hook):
+    times, poses = path(hook)
+    follower, nothing = Follower(hook.mesh, poses[0], TABLE), (np.zeros((0, 3)), np.zeros(0, bool))
+    for k in (9, 12, 16):
+        for frame in pictures(hook, times[k : k + 1], poses[k : k + 1]):
+            information, _ = follower._information(frame, poses[k], nothing, CLOSE)
+            assert not information.any()  # the hand hides one end: what pulls at the other would shift the tool along its handle
+            information, _ = follower._information(frame, moved(poses[k], follower.middle, np.r_[0.03, 0, 0, 0, 0, 0]), nothing, CLOSE)
+            assert information.any()
 
 
 def test_a_tool_that_is_gone_is_lost_and_not_guessed_on(hook):

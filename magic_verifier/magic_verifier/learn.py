@@ -22,7 +22,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,36 +171,42 @@ def frames_of(bag: Recorded, world: str) -> list[RgbdFrame]:
     return frames
 
 
-def every_frame(bag: Recorded, world: str) -> Iterator[RgbdFrame]:
-    """Every colour picture of a bag with the depth that goes with it, of all cameras, by their stamps."""
-    from magic_bags import bag_messages
-    from magic_core import conversions
+@dataclass(frozen=True)
+class Pictures:
+    """Every colour picture of a bag with the depth that goes with it, of all cameras, by their stamps, as often as they are gone through."""
 
-    buffer, _, _ = bag.transforms()
-    cameras = _cameras(bag)
-    intrinsics = {camera: conversions.intrinsics_from_msg(bag.of(f"{camera}/{INFO}")[0]) for camera in cameras}
-    kinds = {f"{camera}/{kind}": (camera, kind) for camera in cameras for kind in (COLOR, DEPTH)}
-    waiting: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in kinds}
-    ready: list[tuple[float, int, RgbdFrame]] = []
-    for count, (topic, _, message) in enumerate(bag_messages.messages(bag.path, lambda topic, _kind: topic in kinds)):
-        camera, kind = kinds[topic]
-        stamp = conversions.time_from_msg(message.header.stamp)
-        other = f"{camera}/{DEPTH if kind == COLOR else COLOR}"
-        near = [entry for entry in waiting[other] if abs(entry[0] - stamp) <= TOGETHER]
-        if not near:
-            waiting[topic] = [*waiting[topic][-WAITING:], (stamp, message)]
-            continue
-        found = min(near, key=lambda entry: abs(entry[0] - stamp))
-        waiting[other] = [entry for entry in waiting[other] if entry[0] > found[0]]
-        color, depth = (message, found[1]) if kind == COLOR else (found[1], message)
-        at = conversions.time_from_msg(depth.header.stamp)
-        pose = buffer.lookup(world, depth.header.frame_id, at)
-        frame = RgbdFrame(conversions.color_from_msg(color), conversions.depth_from_msg(depth), intrinsics[camera], pose, camera, at)
-        heapq.heappush(ready, (at, count, frame))
-        if len(ready) > WAITING * len(cameras):
+    bag: Recorded
+    world: str
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        from magic_bags import bag_messages
+        from magic_core import conversions
+
+        buffer, _, _ = self.bag.transforms()
+        cameras = _cameras(self.bag)
+        intrinsics = {camera: conversions.intrinsics_from_msg(self.bag.of(f"{camera}/{INFO}")[0]) for camera in cameras}
+        kinds = {f"{camera}/{kind}": (camera, kind) for camera in cameras for kind in (COLOR, DEPTH)}
+        waiting: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in kinds}
+        ready: list[tuple[float, int, RgbdFrame]] = []
+        for count, (topic, _, message) in enumerate(bag_messages.messages(self.bag.path, lambda topic, _kind: topic in kinds)):
+            camera, kind = kinds[topic]
+            stamp = conversions.time_from_msg(message.header.stamp)
+            other = f"{camera}/{DEPTH if kind == COLOR else COLOR}"
+            near = [entry for entry in waiting[other] if abs(entry[0] - stamp) <= TOGETHER]
+            if not near:
+                waiting[topic] = [*waiting[topic][-WAITING:], (stamp, message)]
+                continue
+            found = min(near, key=lambda entry: abs(entry[0] - stamp))
+            waiting[other] = [entry for entry in waiting[other] if entry[0] > found[0]]
+            color, depth = (message, found[1]) if kind == COLOR else (found[1], message)
+            at = conversions.time_from_msg(depth.header.stamp)
+            pose = buffer.lookup(self.world, depth.header.frame_id, at)
+            frame = RgbdFrame(conversions.color_from_msg(color), conversions.depth_from_msg(depth), intrinsics[camera], pose, camera, at)
+            heapq.heappush(ready, (at, count, frame))
+            if len(ready) > WAITING * len(cameras):
+                yield heapq.heappop(ready)[2]
+        while ready:
             yield heapq.heappop(ready)[2]
-    while ready:
-        yield heapq.heappop(ready)[2]
 
 
 def left_first(scene: Scene, frames: list[RgbdFrame]) -> str:
@@ -225,7 +231,7 @@ def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tupl
     from magic_perception.following import follow
 
     others = [item.mesh.transformed(item.world_from_object) for item in scene.objects if item.id != tool.id]
-    found = follow(tool.mesh, tool.world_from_object, scene.table, every_frame(bag, world), others)
+    found = follow(tool.mesh, tool.world_from_object, scene.table, Pictures(bag, world), others)
     print(
         f"followed {tool.id} through {len(found.times)} moments, found in {found.seen}; known to {1000 * found.shift.max():.1f} mm and "
         f"{np.degrees(found.turn.max()):.1f} degrees or better"

@@ -31,7 +31,7 @@ from magic_matcher.features import load as load_features
 from magic_matcher.matching import Matcher
 from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
-from magic_verifier.learn import Recorded, choose, every_frame, left_first, main, track_of, write
+from magic_verifier.learn import Pictures, Recorded, choose, left_first, main, track_of, write
 from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import Proposal, verify_proposal
 
@@ -286,7 +286,9 @@ def test_every_picture_finds_its_depth_and_its_place_in_time(tmp_path):
             for topic, message in messages[:: -1 if frame.camera == "left" else 1]:
                 if index != 5 or "depth" not in topic or "info" in topic:
                     bag.write(f"/camera/{frame.camera}/{topic}", message, frame.stamp)
-    found = list(every_frame(Recorded(tmp_path / "bag"), "panda_link0"))
+    pictures = Pictures(Recorded(tmp_path / "bag"), "panda_link0")
+    found = list(pictures)
+    assert [frame.stamp for frame in pictures] == [frame.stamp for frame in found]  # as often as they are asked for
     wanted = [frame for index, frame in enumerate(frames) if index != 5]
     assert [(f.camera, round(f.stamp, 3)) for f in found] == [(f"/camera/{f.camera}", round(f.stamp, 3)) for f in wanted]
     for read, written in zip(found, wanted, strict=True):

@@ -1,0 +1,132 @@
+"""A tool's mesh, mended by the pictures in which it is used: what its first look showed wrong, or not at all, is moved along its normals.
+
+A tool that is nearer to a camera and one that is thicker look alike, so that pose and surface are sought together: the measured points
+of a moment are off by ``r = J x + B d``, with the change ``x`` (6,) of the tool's pose and how far the surface is off, ``d``, at points all
+over it.  ``x`` is taken out of each moment's normal equations (by their Schur complement) after what else is known of the pose: that the
+tool lay where it lay first, and where its outline was seen since.  What is left of all moments says what ``d`` is, beside what it is
+expected to be: a Gaussian process over the surface, as far off as reconstructed surfaces are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import open3d as o3d
+import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from magic_core import transforms
+from magic_core.mesh import Mesh
+
+Array = NDArray[np.float64]
+#: How far a reconstructed surface is off (standard deviation, m); errors hold together over so far (m), on one side of a wall.
+OFF, TOGETHER = 0.003, 0.015
+#: It is moved by at most so many deviations, and inwards by no more than this share of the thickness there.
+MOST, THINNER = 2.0, 0.4
+#: Standard deviation (m) of a measured point; the points of a picture count as so many at most; farther off (m) they are not the tool's.
+NOISE, WORTH, CLOSE = 0.004, 60.0, 0.010
+#: A surface is measured by what looks at it from no farther aside than this cosine.
+FACING = 0.3
+#: The mesh is divided into edges of at most this (m) before it is moved.
+EDGE = 0.006
+#: So many points tell of a place between them.
+NEIGHBOURS = 3
+
+
+class Aside(NamedTuple):
+    """How far (K,) m the surface seems off along (K, 3) at places (K, 3), all in the world, with weights (K,) 1/m^2."""
+
+    off: Array
+    along: Array
+    places: Array
+    weights: Array
+
+
+class Picture(NamedTuple):
+    """What one shows of the tool: measured points (M, 3) of the world and where the camera is (3,); and the outline."""
+
+    points: Array
+    eye: Array
+    outline: Aside
+
+
+class Reshaping:
+    """What pictures say of a surface: mesh, in its own frame; points (N, 3) on it with their normals (N, 3)."""
+
+    def __init__(self, mesh: Mesh, points: Array, normals: Array) -> None:
+        self._mesh = mesh
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        inward = np.concatenate([points - 1e-4 * normals, -normals], axis=1).astype(np.float32)
+        thick = self._scene.cast_rays(o3d.core.Tensor(inward))["t_hit"].numpy().astype(float)
+        self._least = -np.minimum(MOST * OFF, THINNER * np.where(np.isfinite(thick), thick, 0.0))
+        self._places = _placed(points, normals)
+        self._tree = cKDTree(self._places)
+        apart = ((self._places[:, None] - self._places[None]) ** 2).sum(axis=-1)
+        expected = OFF**2 * (np.exp(-apart / 2) + 1e-4 * np.eye(len(points)))
+        self._matrix, self._vector = np.linalg.inv(expected), np.zeros(len(points))
+
+    def see(self, pictures: Sequence[Picture], pose: Array, middle: Array, known: Array) -> None:
+        """Take what the pictures of a moment show.
+
+        pose (4, 4): where the tool is about; known (6, 6): how well, as information of a change of it, by a shift of the tool's middle (3,), in
+        its own frame, and by a turn about it.
+        """
+        known, pull = known.copy(), np.zeros(6)
+        count = len(self._vector)
+        both, alone, off = np.zeros((6, count)), np.zeros((count, count)), np.zeros(count)
+        tool_from_world = transforms.inverse(pose)
+        for picture in pictures:
+            for signed, gradient, place, weight in (self._measured(picture, pose), picture.outline):
+                jacobian = np.concatenate([gradient, np.cross(place - transforms.apply(pose, middle), gradient)], axis=1)
+                shares = self._shares(transforms.apply(tool_from_world, place), gradient @ pose[:3, :3])
+                weighted = shares.multiply(weight[:, None]).tocsr()
+                known += (jacobian * weight[:, None]).T @ jacobian
+                pull += jacobian.T @ (weight * signed)
+                both += (weighted.T @ jacobian).T
+                alone += (shares.T @ weighted).toarray()
+                off += weighted.T @ signed
+        moved = np.linalg.solve(known, np.column_stack([both, pull]))
+        self._matrix += alone - both.T @ moved[:, :-1]
+        self._vector += off - both.T @ moved[:, -1]
+
+    def mesh(self) -> Mesh:
+        """The mesh with its surface where the pictures say."""
+        off = np.clip(np.linalg.solve(self._matrix, self._vector), self._least, MOST * OFF)
+        vertices, faces = trimesh.remesh.subdivide_to_size(self._mesh.vertices, self._mesh.faces, EDGE, max_iter=20)
+        fine = trimesh.Trimesh(vertices, faces, process=True)
+        return Mesh(
+            fine.vertices + (self._shares(fine.vertices, fine.vertex_normals) @ off)[:, None] * fine.vertex_normals, np.asarray(fine.faces)
+        )
+
+    def _measured(self, picture: Picture, pose: Array) -> Aside:
+        """Of a picture's points those that are the tool's: depth that is smeared past the tool's outline is not of it."""
+        tool_from_world = transforms.inverse(pose)
+        local, source = transforms.apply(tool_from_world, picture.points), transforms.apply(tool_from_world, picture.eye)
+        rays = np.concatenate([np.broadcast_to(source, local.shape), local - source], axis=1).astype(np.float32)
+        inside = np.isfinite(self._scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy())
+        tensor = o3d.core.Tensor(local.astype(np.float32))
+        closest = self._scene.compute_closest_points(tensor)
+        foot, normal = (closest[name].numpy().astype(float) for name in ("points", "primitive_normals"))
+        signed = self._scene.compute_signed_distance(tensor).numpy().astype(float)
+        facing = ((source - foot) * normal).sum(axis=1) > FACING * np.linalg.norm(source - foot, axis=1)
+        fits = inside & facing & (np.abs(signed) < CLOSE)
+        weight = (1 / (1 + (signed[fits] / (CLOSE / 2)) ** 2)) ** 2 / NOISE**2 * min(1.0, WORTH / max(fits.sum(), 1))
+        return Aside(signed[fits], normal[fits] @ pose[:3, :3].T, transforms.apply(pose, foot[fits]), weight)
+
+    def _shares(self, places: Array, normals: Array) -> csr_matrix:
+        """(M, N): how much the points tell of places (M, 3) with their normals (M, 3)."""
+        away, near = self._tree.query(_placed(places, normals), NEIGHBOURS)
+        weight = 1 / np.maximum(away, 1e-3)
+        weight /= weight.sum(axis=1, keepdims=True)
+        rows = np.repeat(np.arange(len(places)), NEIGHBOURS)
+        return csr_matrix((weight.ravel(), (rows, near.ravel())), (len(places), len(self._vector)))
+
+
+def _placed(points: Array, normals: Array) -> Array:
+    """(N, 6): points whose errors hold together are near each other."""
+    return np.concatenate([points / TOGETHER, normals], axis=1)
