@@ -70,7 +70,8 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
 class Laid:
     """A lying thing: its height map, the outlines of its parts, and whether it is flat, then ``thickness`` metres thick; else top and bottom
     (rows, columns) of its relief over the cells of the map, m; ``hollow``: it is seen to be hollow from above, and its bottom is that of a thin thing, else
-    the table or the height below which cameras see past."""
+    the table or the height below which cameras see past; ``thin``: what is not seen to be hollow from above taken for a thin thing nevertheless, as a bowl
+    is that lies so far on its side that it would hold no water."""
 
     grid: Grid
     parts: list[Polygon]
@@ -79,6 +80,7 @@ class Laid:
     hollow: bool
     top: NDArray[np.float32]
     bottom: NDArray[np.float32]
+    thin: Laid | None = None
 
 
 def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
@@ -113,25 +115,24 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
         top = nearest(smooth.astype(np.float32), occupied)
         depression = _filled(np.where(occupied, top, 0)) - top
         hollow = bool(np.count_nonzero((depression > max(0.004, 3 * noise)) & inner) * grid.cell**2 > 1.5e-4)
-        field, foot = polygons.smooth_field(occupied, 1.8), np.zeros_like(top)
-        if not hollow:  # what is hollow does not go down to the table
-            kept, foot = _upheld(sights, grid, top, noise)
-            trimmed = polygons.smooth_field(kept, 1.8)
-            if len(_parts(trimmed, grid)) <= len(_parts(field, grid)):  # what a thing hangs together by is no smear
-                field = trimmed
+        field = polygons.smooth_field(occupied, 1.8)
     parts = _parts(field, grid)
-    if not parts:
-        raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
-    parts = [p for p in parts if p.area > 0.08 * parts[0].area]
     if flat:
-        return Laid(grid, parts, True, thickness, False, grid.top, grid.top)
+        return Laid(grid, _large(parts), True, thickness, False, grid.top, grid.top)
     spread = int(np.ceil(parameters.wall / grid.cell / 2))
     # A bowl's wall is thin; a handle is taken to be about half as thick as it is wide.
     reach = 2 * int(0.012 / grid.cell) + 1
     width = 2 * grid.cell * cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     thick = np.where(width < 0.03, np.clip(0.5 * width, parameters.wall, 0.012), parameters.wall).astype(np.float32)
     bottom = cv2.erode(top, np.ones((2 * spread + 1, 2 * spread + 1), np.uint8)) - cv2.GaussianBlur(thick, (0, 0), 3.0)
-    return Laid(grid, parts, False, thickness, hollow, top, np.clip(bottom if hollow else foot, 0, top - 0.001))
+    thin = Laid(grid, _large(parts), False, thickness, hollow, top, np.clip(bottom, 0, top - 0.001))
+    if hollow:  # it does not go down to the table
+        return thin
+    kept, foot = _upheld(sights, grid, top, noise)
+    trimmed = _parts(polygons.smooth_field(kept, 1.8), grid)
+    if len(trimmed) <= len(parts):  # what a thing hangs together by is no smear
+        parts = trimmed
+    return Laid(grid, _large(parts), False, thickness, False, top, np.clip(foot, 0, top - 0.001), thin)
 
 
 #: What is smaller, m^2, is no part of a thing.
@@ -189,6 +190,13 @@ def _closed(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
 def _parts(field: NDArray[np.float32], grid: Grid) -> list[Polygon]:
     """The outlines of what a field over the map holds, the largest first."""
     return [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > LEAST]
+
+
+def _large(parts: list[Polygon]) -> list[Polygon]:
+    """Those of a thing's parts that are no crumbs beside the first; raises ``RECONSTRUCTION_FAILED`` where there is none."""
+    if not parts:
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
+    return [part for part in parts if part.area > 0.08 * parts[0].area]
 
 
 def build_lying(laid: Laid) -> Reconstruction:

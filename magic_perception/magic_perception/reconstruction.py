@@ -98,7 +98,7 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         laid = lay(sights, noise, parameters)
     except MagicError:
         return _freest([], sights, noise)
-    scoop = build_scoop(laid, sights, noise, parameters) if laid.hollow else None
+    scoop = build_scoop(laid.thin or laid, sights, noise, parameters)
     for score, solid in _agreeing(scoop, sights, 0.0):
         if score > _WELL:
             return solid
