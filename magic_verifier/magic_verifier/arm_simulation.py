@@ -56,6 +56,10 @@ HEAVIER, MOST_ITERATIONS = 10.0, 4.0
 LIGHTER, MOST_CLOSING = 0.07, 16.0
 #: An arm that has let go and come to the end of its motion is left to stand still, unsolved, after so many seconds.
 ASLEEP = 0.15
+#: So is one that holds its tool at the end, and the tool with it, where the pads bear no more than this share of what they hold and it has moved by
+#: no more than so many metres since it was looked at last: what is then done to the target (0.1 m/s to a ball of 0.1 kg, 0.3 m from the
+#: pads, are a fifth of what these hold) moves neither.
+BORNE, STILL = 0.5, 0.0001
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class ArmRun:
     the plan has it: real pads have turned it as they do, which those about its reconstruction would do once more.
     ``lag``: seconds by which the arm follows its command late; ``begin``: the moment of the trajectory at which a run
     with an empty hand begins.  ``rests``: the tool was seen to lie where it is, and does so until something touches it, whatever its shape
-    and its masses are taken to be.
+    and its masses are taken to be.  :attr:`stands_still`: the tool may be taken to stay where it is when the motion is over and it is held still.
     """
 
     variant = "arm"
@@ -133,7 +137,7 @@ class ArmRun:
         self._widths: list[float] = []  # between the closing fingers, step by step
         self._quiet = 0.0
         self._press = self.options.closing_force
-        self._closed = self._open_again = self._asleep = False
+        self._closed = self._open_again = self._asleep = self.stands_still = False
         self._after = round(ASLEEP * frequency)
         self._every = max(1, round(WATCH_EVERY * frequency))
         self._grip: Grip | None = None
@@ -141,6 +145,7 @@ class ArmRun:
         self._friction = (self.options.finger_friction + setup.physics.friction) / 2  # of a pair, as the engine has it
         self._from_reference: Any = None  # tcp from tool, when the grip was made
         self._let_go_at: NDArray[np.float64] | None = None
+        self._load, self._was = 0.0, np.full(3, np.inf)  # of the grip, and where the tool was, when they were looked at last
         sliding, turning = ("tracking_error_slide", limits.tracking_slide, "m"), ("tracking_error", limits.tracking, "rad")
         self._tracking = [sliding if joint.sliding else turning for joint in robot.arm]
         self._torque = [0.0] * len(robot.names)
@@ -253,10 +258,21 @@ class ArmRun:
             self._wake()
         if not waiting:
             self._index += 1
-        if self._let_go_at is not None and self._index == len(self._q) + self._lag + self._after:
+        over = self._index - (len(self._q) + self._lag + self._after)
+        if self._let_go_at is not None and over == 0:
             self._asleep = self._arm.sleeps()
         if self.world.steps % self._every == 0:
             self._watch(self._positions[row])
+            if self.stands_still and over >= 0 and self._held_still() and self._arm.sleeps():
+                self.world.hold(TOOL)
+                self._asleep = True
+
+    def _held_still(self) -> bool:
+        """Whether the pads hold the tool with ease, where it was when this was asked last."""
+        before, self._was = self._was, self.world.position(TOOL)
+        if self._grip is None or self._open_again or self._load > BORNE:
+            return False
+        return bool(math.dist(before, self._was) <= STILL)
 
     def _gripper(self) -> bool:
         """Open and close on time; whether the arm has to wait for the fingers."""
@@ -395,7 +411,8 @@ class ArmRun:
         if self._patch is None or self._open_again:
             return
         if self._grip is not None:
-            self._metrics["grip_load"] = max(self._metrics["grip_load"], self._grip.load())
+            self._load = self._grip.load()
+            self._metrics["grip_load"] = max(self._metrics["grip_load"], self._load)
         drift = self._from_reference * self.world.component(TOOL).entity_pose.inv() * self._arm.tcp_pose
         slip = math.hypot(*drift.p.tolist())
         turn = 2 * math.acos(min(abs(float(drift.q[0])), 1.0))

@@ -198,6 +198,12 @@ class Watch:
         settle = moment.args["settle"]
         return self._motion_end() + (settle if self.nudge is None else min(settle, SOON))
 
+    def leaves_alone(self, name: str) -> bool:
+        """Whether nothing pushes a body, lets it come to rest or asks what it touches, so that it may be held where it is."""
+        moments = [node.after for node in self.tree.nodes() if node.after is not None]
+        asked = [node.args for node in self.tree.nodes() if "whom" in node.args]
+        return all(args.get("what") != name for args in (*asked, *(moment.args for moment in moments)))
+
     def until(self) -> float:
         """The moment of the motion at which the run may end: in the scene as given all of the motion, else when all was asked."""
         return max(self._end, self._motion_end()) if self.nudge is None else self._end

@@ -99,7 +99,7 @@ class Task:
     ``eyes``: how well tool and target are known, and by how much these widths are to be multiplied; ``start``: the moment of the
     motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``overlap``: how deep the tool that is led goes into
     things as it was planned, m, where that is known; ``longer``: how many times as long their
-    steps are; ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
+    steps are; ``offset``: the contact offset of their worlds, m (``None``: that of the scene as given); ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
     """
 
     strategy: Strategy
@@ -115,6 +115,7 @@ class Task:
     held: Any = None
     overlap: float = np.inf
     longer: float = 1.0
+    offset: float | None = None
     shares: tuple[NDArray[np.float64], ...] | None = None
 
     def drawn(self, index: int) -> Draw | None:
@@ -124,7 +125,8 @@ class Task:
     def under(self, drawn: Draw) -> Setup:
         """The scene of a drawn rollout."""
         setup = uncertainty.applied(drawn, self.setup, self.shares)
-        settings = replace(setup.settings, frequency=setup.settings.frequency / self.longer)
+        offset = setup.settings.contact_offset if self.offset is None else self.offset
+        settings = replace(setup.settings, frequency=setup.settings.frequency / self.longer, contact_offset=offset)
         if self.plan.variant == "arm":
             # The engine solves a step in as many parts as there are iterations.  Pads hardly give: at longer parts the load on a grip
             # comes out half as large again, and tools slip that do not.
@@ -218,7 +220,9 @@ class _Rollout:
         nudge = None if drawn is None else drawn.nudge
         goal = goals.goal_test(task.strategy, run, np.random.default_rng([task.seed, self._index, 1]), nudge)
         self.recorder = _Recorder(run) if self._record else None
-        if task.plan.variant == "fg":
+        if task.plan.variant == "arm":
+            run.stands_still = goal.leaves_alone(TOOL)
+        else:
             measured = self._record or drawn is None
             self._overlaps = _refuse_intrusions(task.strategy, run, self._limits, self._stop, measured, task.overlap)
             if drawn is None and self._begin is not None:
@@ -458,7 +462,7 @@ def _take_hold(task: Task, drawn: Draw, limits: Limits, stop: Stop) -> tuple[flo
 
     motion = task.plan.arm_motion
     assert motion is not None
-    setup = replace(task, longer=1.0).under(drawn)
+    setup = replace(task, longer=1.0, offset=None).under(drawn)
     setup = replace(setup, tool=standing(setup.tool, task.setup.tool, drawn.tool_from_held, setup.table))
     begin, end = max(motion.grasp_time - BEFORE_GRASP, 0.0), min(motion.grasp_time + AFTER_GRASP, task.start)
     run = ArmRun(setup, task.plan, _drawn_options(task, drawn), limits, task.robot, None, drawn.lag, begin, rests=True)

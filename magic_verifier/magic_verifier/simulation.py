@@ -448,6 +448,10 @@ class World:
         """Where a kinematic body shall be after the next step (a sapien.Pose)."""
         self._bodies[name].kinematic_target = pose
 
+    def hold(self, name: str) -> None:
+        """Keep a free body where it is: make it kinematic."""
+        self._bodies[name].kinematic = True
+
     def let_go(self, name: str) -> None:
         """Make a kinematic body free, at rest."""
         component = self._bodies[name]

@@ -37,7 +37,7 @@ from magic_verifier.floating import CONTACT_PHASES, Setup, make_setup, nears, ph
 from magic_verifier.goals import Judgement
 from magic_verifier.rates import Z95, decided, deviations, level, passes, wilson
 from magic_verifier.rollout import Limits, Outcome, Recording, Stop, Task, from_held, rollout
-from magic_verifier.simulation import LEAST_FREQUENCY, Settings
+from magic_verifier.simulation import DYNAMIC, LEAST_FREQUENCY, Settings
 from magic_verifier.uncertainty import Uncertainty
 
 #: Solver settings of the variants: a grip needs more iterations than a floating tool.
@@ -49,6 +49,9 @@ ROLLOUTS = 24
 LEAD, NEAR = 0.1, 0.03
 #: A drawn rollout takes steps so many times as long as the scene as given: the longest for which the tool is slow enough (:func:`_longer`).
 LONGER = {"fg": (4.0, 2.0), "arm": (2.0,)}
+#: In a drawn rollout of the arm with a free target contacts are solved ahead of a touch as far as the tool comes in a step at its fastest, but no less than this
+#: (m), as with the floating gripper: every piece of a bowl that its ball is near to costs, touched or not.
+LEAST_OFFSET = 0.001
 #: A parameter is named as the cause of failures if as clean a separation by any of the parameters had a chance of less than this.
 BY_CHANCE = 0.05
 
@@ -182,6 +185,7 @@ def make_task(proposal: Proposal) -> Task:
     start = _start(strategy, setup, plan)
     options = proposal.arm_options
     hard = options is not None and options.past is not None  # what contacts alone hold hangs on how long a step is
+    longer = 1.0 if hard else _longer(setup, plan, start)
     return Task(
         strategy,
         setup,
@@ -193,7 +197,8 @@ def make_task(proposal: Proposal) -> Task:
         options,
         robot,
         start,
-        longer=1.0 if hard else _longer(setup, plan, start),
+        longer=longer,
+        offset=settings.contact_offset if hard or setup.target_kind != DYNAMIC else _offset(setup, plan, start, longer),
         shares=uncertainty.shares(proposal.tool, eyes[0][1], setup.tool.hulls),
     )
 
@@ -224,6 +229,12 @@ def _longer(setup: Setup, plan: MotionPlan, start: float) -> float:
         if frequency / longer >= LEAST_FREQUENCY and fastest <= reach * frequency / longer:
             return longer
     return 1.0
+
+
+def _offset(setup: Setup, plan: MotionPlan, start: float, longer: float) -> float:
+    """The contact offset (m) of drawn rollouts: half of how far the tool comes in one of their steps, between :data:`LEAST_OFFSET` and that of the scene as given."""
+    given = setup.settings.contact_offset
+    return max(min(given, LEAST_OFFSET), min(given, speed(plan.tool_motion, setup.tool, start) * longer / setup.settings.frequency / 2))
 
 
 def rollouts(

@@ -15,7 +15,7 @@ from magic_verifier.articulation import ArmOptions
 from magic_verifier.floating import make_setup
 from magic_verifier.grip import LEAST, Grip, Patch, patch_of
 from magic_verifier.rollout import Limits
-from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, usable_pieces
+from magic_verifier.simulation import DYNAMIC, KINEMATIC, Settings, Touch, World, to_pose, usable_pieces
 from magic_verifier.subjects import tool_object
 from magic_verifier.verification import DEFAULTS
 
@@ -222,6 +222,28 @@ def test_fingers_press_harder_on_what_sticks_to_the_table():
         run.advance()
     assert run.held() is not None and run.held().width == pytest.approx(0.04, abs=0.001)
     assert np.linalg.norm((run.world.pose("tool") - pose)[:3, 3]) == pytest.approx(0.008, abs=0.002)
+
+
+@pytest.mark.parametrize(("mass", "may", "stays"), [(0.05, True, True), (0.05, False, False), (7.0, True, False)])
+def test_when_the_motion_is_over_a_tool_that_is_held_with_ease_is_left_where_it_is(mass, may, stays):
+    """A block whose stand is taken away; one of 7 kg asks for more than half of what the pads hold."""
+    run, _ = closing_on(((-0.03, 0.03), (-0.012, 0.012), (-0.02, 0.03)), Physics(0.5, mass / (0.06 * 0.024 * 0.05), 600.0))
+    run.stands_still = may
+    while run.time < 0.4:
+        run.advance()
+    run.world.component("stand").entity_pose = to_pose(transforms.make(translation=[5.0, 0.0, 1.0]))
+    while run.time < 0.79:
+        run.advance()
+    assert not run.world.component("tool").kinematic, "the motion goes on"
+    while run.time < 1.2:
+        run.advance()
+    assert run.world.component("tool").kinematic is stays
+    if stays:
+        before = run.world.pose("tool"), run.joints()
+        while run.time < 1.4:
+            run.advance()
+        assert np.array_equal(run.world.pose("tool"), before[0]) and np.array_equal(run.joints(), before[1])
+        assert np.linalg.norm(run.world.velocity("tool")) == 0
 
 
 @pytest.mark.parametrize("mass", [0.009, 0.018])

@@ -14,7 +14,7 @@ from magic_core.errors import Code, MagicError
 from magic_verifier import rates, uncertainty, verification
 from magic_verifier.floating import TABLE, Body, FloatingRun, lifted_onto_table, make_setup
 from magic_verifier.floating import speed as fastest
-from magic_verifier.goals import Judgement
+from magic_verifier.goals import Judgement, goal_test
 from magic_verifier.rates import decided, fewest, passes, wilson
 from magic_verifier.rollout import Limits, Task, rollout, standing
 from magic_verifier.simulation import DYNAMIC, Probe, World, usable_pieces
@@ -49,6 +49,13 @@ def test_the_same_seed_gives_the_same_verdict_whoever_computes_it():
     assert verdict_of(scene, seed=4, repetitions=6).runs[1:] != alone.runs[1:]
 
 
+def test_a_tool_may_stand_still_where_the_goal_leaves_it_alone():
+    for scene, alone in ((scenes.scooping(), True), (scenes.hooking("L"), True), (scenes.hanging(), False)):
+        strategy, tool, target, *obstacles, plan = scene
+        run = FloatingRun(make_setup(tool, target, tuple(obstacles), scenes.TABLE, strategy.physics, DEFAULTS["fg"]), plan)
+        assert goal_test(strategy, run, RNG(0)).leaves_alone("tool") is alone
+
+
 def test_a_motion_that_fails_as_given_is_not_rolled_out():
     verdict = verdict_of(scenes.hooking("bar"))
     assert not verdict.success and len(verdict.runs) == 1
@@ -72,6 +79,12 @@ def test_steps_are_longer_where_the_tool_is_slow():
         task = verification.make_task(Proposal(strategy, tool, target, (), scenes.TABLE, plan))
         assert task.longer == longer
         assert task.under(task.drawn(1)).settings.frequency == pytest.approx(240 / longer)
+    for speed, offset in ((0.1, 0.001), (0.4, 0.4 / 240)):  # with those of the arm
+        strategy, tool, target, _ = scenes.hooking("L")
+        poses = [(transforms.make(translation=[-0.1 - 0.28 * k, 0, 0]), "goal", 0.28 / speed) for k in range(2)]
+        task = verification.make_task(Proposal(strategy, tool, target, (), scenes.TABLE, scenes.plan(poses), settings=DEFAULTS["arm"]))
+        assert task.under(task.drawn(1)).settings.contact_offset == pytest.approx(offset)
+        assert task.setup.settings.contact_offset == 0.002, "the scene as given"
     # About the middle of the box a corner at 0.1 m goes by 0.1 m for each radian, in steps by their chords.
     turn = [transforms.from_rotvec([0, 0, angle]) for angle in (0.0, 1.0, 1.5)]
     plan = scenes.plan([(turn[0], "goal", 1.0), (turn[1], "goal", 2.0), (turn[2], "goal", 0.5)])
