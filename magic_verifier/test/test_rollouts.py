@@ -82,9 +82,10 @@ def test_steps_are_longer_where_the_tool_is_slow():
     for speed, offset in ((0.1, 0.001), (0.4, 0.4 / 240)):  # with those of the arm
         strategy, tool, target, _ = scenes.hooking("L")
         poses = [(transforms.make(translation=[-0.1 - 0.28 * k, 0, 0]), "goal", 0.28 / speed) for k in range(2)]
-        task = verification.make_task(Proposal(strategy, tool, target, (), scenes.TABLE, scenes.plan(poses), settings=DEFAULTS["arm"]))
-        assert task.under(task.drawn(1)).settings.contact_offset == pytest.approx(offset)
-        assert task.setup.settings.contact_offset == 0.002, "the scene as given"
+        for thing, found in ((scenes.scooping()[2], offset), (target, 0.002)):  # a ball, and a cylinder
+            task = verification.make_task(Proposal(strategy, tool, thing, (), scenes.TABLE, scenes.plan(poses), settings=DEFAULTS["arm"]))
+            assert task.under(task.drawn(1)).settings.contact_offset == pytest.approx(found)
+            assert task.setup.settings.contact_offset == 0.002, "the scene as given"
     # About the middle of the box a corner at 0.1 m goes by 0.1 m for each radian, in steps by their chords.
     turn = [transforms.from_rotvec([0, 0, angle]) for angle in (0.0, 1.0, 1.5)]
     plan = scenes.plan([(turn[0], "goal", 1.0), (turn[1], "goal", 2.0), (turn[2], "goal", 0.5)])
