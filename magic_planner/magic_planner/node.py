@@ -11,6 +11,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from magic_core import conversions as convert
+from magic_core import masses
 from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import check_solid
@@ -141,6 +142,7 @@ class PlannerNode(Node):
         tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))
         for item, what in ((tool, "tool"), (target, "target")):
             check_solid(item.mesh, f"the {what} {item.id}")
+        strategy = masses.told(strategy, tool, target, goal.tool_mass, goal.target_mass)
         obstacles = tuple(convert.object_from_msg(o, pictures=False) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids) or "" in ids:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -66,6 +67,21 @@ def test_a_bad_goal_is_answered_with_its_code(graph, changes, code):
     result = ask(graph, goal(**changes))
     assert result.code == code, result.message
     assert result.message
+
+
+def test_a_tool_is_as_heavy_as_the_goal_says(graph):
+    """What the pads hold of the hook as steel is another share than of it as wood."""
+    used = []
+    for mass in (0.0, 0.1, 2.0):
+        result = ask(graph, goal(tool_mass=mass))
+        assert result.code == Code.OK, result.message
+        share, grams = re.search(r"grip: (\d+) % of what pads pressed with 60 N hold of (\d+) g", result.message).groups()
+        assert mass == 0 or float(grams) == 1000 * mass
+        used.append(int(share))
+    assert used[0] <= used[1] < 20 < used[2]
+    wrong = ask(graph, goal(tool_mass=100.0))  # grams
+    assert wrong.code == Code.BAD_REQUEST and "kg/m^3" in wrong.message
+    assert ask(graph, goal(target_mass=-1.0)).code == Code.BAD_REQUEST
 
 
 def test_empty_messages_are_answered_too(graph):

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from magic_core import conversions as convert
+from magic_core import masses
 from magic_core import strategy as strategies
 from magic_core.content import digest
 from magic_core.errors import Code, MagicError
@@ -37,7 +38,7 @@ def mark_of(goal: VerifyMotion.Goal, proposal: Proposal) -> bytes:
     """The same for goals whose verdicts are the same."""
     # What obstacles look like is in the film alone.
     simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in proposal.obstacles)
-    plan = proposal.plan, goal.repetitions, goal.seed, goal.tried
+    plan = proposal.plan, goal.repetitions, goal.seed, goal.tried, goal.tool_mass, goal.target_mass
     return digest((goal.strategy, proposal.tool, proposal.target, simulated, proposal.table, *plan))
 
 
@@ -139,6 +140,7 @@ class VerifierNode(Node):
         tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))
         for item, what in ((tool, "tool"), (target, "target")):
             check_solid(item.mesh, f"the {what} {item.id}")
+        strategy = masses.told(strategy, tool, target, goal.tool_mass, goal.target_mass)
         obstacles = tuple(convert.object_from_msg(o, pictures=False) for o in goal.obstacles)
         ids = [tool.id, target.id, *(o.id for o in obstacles)]
         if len(set(ids)) != len(ids):

@@ -65,6 +65,18 @@ def test_each_phase_is_told_once_and_not_every_moment_of_it(graph, monkeypatch):
     assert set(many) == set(few) and len(many) > len(few)
 
 
+def test_tool_and_target_are_as_heavy_as_the_goal_says(graph):
+    simulated = len(SIMULATED)
+    given = ask(graph, goal_message("pulling", repetitions=1))
+    again = ask(graph, goal_message("pulling", repetitions=1, want_film=True))
+    assert len(SIMULATED) == simulated + 1 and again.metric_values == given.metric_values
+    heavy = ask(graph, goal_message("pulling", repetitions=1, want_film=True, target_mass=1.2))
+    assert len(SIMULATED) == simulated + 2  # another verdict, not the one that is kept
+    assert heavy.metric_values != given.metric_values
+    wrong = ask(graph, goal_message("pulling", tool_mass=float("nan")))
+    assert wrong.code == Code.BAD_REQUEST and "tool_mass" in wrong.message
+
+
 def test_a_tool_by_another_name_is_refused(graph):
     goal = goal_message()
     goal.plan.tool_trajectory.joint_names = ["spoon"]

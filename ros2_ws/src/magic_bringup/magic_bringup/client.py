@@ -117,6 +117,8 @@ def run(client: Client, given: argparse.Namespace) -> int:
         variant=given.variant,
         tool_id=given.tool,
         target_id=given.target,
+        tool_mass=given.tool_mass,
+        target_mass=given.target_mass,
         seed=given.seed,
         timeout=given.timeout,
         want_pictures=given.out is not None,
@@ -292,6 +294,8 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--variant", default="arm", choices=VARIANTS, help="fg: a floating gripper; arm: the robot (default)")
     one.add_argument("--tool", default="", help="the tool: an id, or a name such as 'the red mug' (default: the matcher chooses)")
     one.add_argument("--target", default="", help="the target: an id or a name (default: the matcher chooses)")
+    one.add_argument("--tool-mass", type=float, default=0.0, metavar="KG", help="what the tool weighs (default: by the strategy's density)")
+    one.add_argument("--target-mass", type=float, default=0.0, metavar="KG", help="what the target weighs (likewise)")
     one.add_argument("--seed", type=int, default=0, help="seed of all random choices (default 0)")
     one.add_argument("--timeout", type=float, default=0.0, help="s for everything (default: the server's)")
     one.add_argument("--out", type=Path, help="folder for report.html, summary.json and pictures: the simulation, the heat map")

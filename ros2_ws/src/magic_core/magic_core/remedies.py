@@ -188,7 +188,7 @@ REMEDIES: dict[Code, Remedy] = {
     ),
     Code.GRASP_SLIPPED: Remedy(
         "In simulation the tool slid in the gripper.",
-        "A grasp nearer to the contact; check grip_force and finger_friction against the real gripper.",
+        "A grasp nearer to the contact; check grip_force and finger_friction against the real gripper, and tool_mass against a scale.",
     ),
     Code.BAD_SCENE: Remedy(
         "The scene given to the verifier is not usable.", "An error of who sends it: finite poses, a table plane with a unit normal."

@@ -62,7 +62,8 @@ GRASP_ONLY = frozenset({Code.GRASP_SLIPPED})
 
 @dataclass(frozen=True)
 class Request:
-    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`, :mod:`magic_core.open_words`) or empty: the matcher chooses.  timeout in seconds for everything."""
+    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`, :mod:`magic_core.open_words`) or empty: the matcher chooses.
+    timeout in seconds for everything.  tool_mass, target_mass: kg, 0 where nobody knows."""
 
     strategy: str
     variant: str
@@ -72,6 +73,8 @@ class Request:
     seed: int = 0
     timeout: float = 120.0
     allow_unverified: bool = False
+    tool_mass: float = 0.0
+    target_mass: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -280,6 +283,12 @@ def check(request: Request) -> None:
         raise MagicError(Code.UNKNOWN_VARIANT, "variant", request.variant, VARIANTS)
     if not 0 < request.timeout < float("inf"):
         raise MagicError(Code.BAD_REQUEST, "timeout", request.timeout, "seconds above 0")
+    for name in ("tool_mass", "target_mass"):
+        mass = getattr(request, name)
+        if not 0 <= mass < float("inf"):
+            raise MagicError(Code.BAD_REQUEST, name, mass, "kg above 0, or 0 where it is not known")
+    if request.tool_mass and not request.tool_id:
+        raise MagicError(Code.BAD_REQUEST, "tool_mass without tool_id", request.tool_mass, "a tool_id: which tool weighs so much")
     check_different(request)
 
 

@@ -16,11 +16,12 @@ from geometry_msgs.msg import Point, Quaternion, Vector3
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, JointState
 
-from magic_core import conversions, naming, transforms
+from magic_core import conversions, masses, naming, transforms
 from magic_core.conversions import without_pictures as light
 from magic_core.errors import Code, MagicError
 from magic_core.open_words import OpenWords
 from magic_core.robot import Description
+from magic_core.strategy import Strategy
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import ContactCandidate, MotionPlan, SceneObject, SceneObjectArray
 from magic_interfaces.srv import MatchContact
@@ -403,6 +404,8 @@ class Stages:
             candidate=trial.candidate,
             reflection=trial.reflection,
             attempt=trial.attempt,
+            tool_mass=request.tool_mass,
+            target_mass=request.target_mass,
             seed=request.seed,
             timeout=timeout,
         )
@@ -447,6 +450,8 @@ class Stages:
             candidate=trial.candidate,
             plan=plan,
             repetitions=server.settings.repetitions,
+            tool_mass=request.tool_mass,
+            target_mass=request.target_mass,
             seed=request.seed,
             tried=self.tried,
             timeout=timeout,
@@ -473,6 +478,10 @@ class Stages:
             self._run,
             mark_of(plan),
         )
+
+    def weight(self, request: pipeline.Request, trial: pipeline.Trial, strategy: Strategy) -> str:
+        """What the tool of a trial was taken to weigh: no camera sees it, and a verdict rests on it."""
+        return masses.sentence(strategy, conversions.object_from_msg(self._tool_of(trial), pictures=False), request.tool_mass)
 
     def film(self, outcome_code: Code) -> Image | None:
         """The film strip of the last simulation: the verifier draws it from what it recorded when it gets the same goal again.

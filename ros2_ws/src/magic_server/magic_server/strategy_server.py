@@ -515,6 +515,8 @@ class StrategyServer(LifecycleNode):
                 self._carry_out(loop, result, tried[:-1])
                 outcome, stages = loop.jobs[-1].outcome, loop.jobs[-1].stages
             break
+        if result.verified and outcome.plan.variant == MotionPlan.ARM:
+            result.notes = [*result.notes, stages.weight(asked.request, outcome.reports[-1].trial, strategy)]
         self._show(stages, outcome)
         if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()
@@ -604,6 +606,8 @@ class StrategyServer(LifecycleNode):
             seed=goal.seed,
             timeout=goal.timeout or self.settings.timeout,
             allow_unverified=goal.allow_unverified,
+            tool_mass=goal.tool_mass,
+            target_mass=goal.target_mass,
         )
 
     def _notifier(self, handle: Any) -> Callable[[pipeline.Progress], None]:

@@ -178,6 +178,9 @@ def test_what_cannot_be_simulated():
         (Request("s", "fg", timeout=-1.0), Code.BAD_REQUEST),
         (Request("s", "fg", timeout=float("nan")), Code.BAD_REQUEST),
         (Request("s", "fg", tool_id="a", target_id="a"), Code.BAD_REQUEST),
+        (Request("s", "fg", tool_id="a", tool_mass=-0.1), Code.BAD_REQUEST),
+        (Request("s", "fg", target_mass=float("nan")), Code.BAD_REQUEST),
+        (Request("s", "fg", tool_mass=0.4), Code.BAD_REQUEST),  # of which tool?
     ],
 )
 def test_bad_requests(request_, code):

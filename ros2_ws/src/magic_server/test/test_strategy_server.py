@@ -122,7 +122,8 @@ def test_what_stands_published_says_what_it_rests_on(bench):
     result = bench.result(handle.get_result_async()).result
     assert (result.success_rate, result.rate_low, result.rate_high, result.rollouts) == (1.0, 0.86, 1.0, 1)
     assert (result.candidates[-1].rate_low, result.candidates[-1].rollouts) == (0.86, 1)
-    assert result.notes == [ARM_UNKNOWN]  # nobody tells joint_states here
+    assert result.notes[0] == ARM_UNKNOWN  # nobody tells joint_states here
+    assert "the tool is taken to weigh" in result.notes[1] and "tool_mass" in result.notes[1]
     assert ARM_UNKNOWN in result.message
     bench.wait(lambda: bench.valid["arm"] and bench.messages["state"] and bench.messages["state"][-1].valid)
     state, trajectory = bench.messages["state"][-1], bench.valid["arm"]
