@@ -122,7 +122,8 @@ def colour_shares(colors: NDArray[np.uint8]) -> dict[str, float]:
     grey = chroma < np.maximum(0.12, 0.2 * value)
     words[grey] = "grey"
     words[grey & (value > 0.72)] = "white"
-    words[value < 0.2] = "black"
+    # What is dark by a pigment, or in the shade, keeps its hue; noise and warm light give black things less of one.
+    words[(value < 0.2) & ((chroma < 0.06) | (chroma < 0.5 * value))] = "black"
     return {word: float(np.mean(words == word)) for word in COLOURS if (words == word).any()}
 
 

@@ -75,6 +75,19 @@ def test_colour_words(rgb, word):
 
 
 @pytest.mark.parametrize(
+    "rgb, word",
+    [((220, 30, 30), "red"), ((30, 60, 210), "blue"), ((30, 180, 60), "green"), ((128, 128, 128), "grey"), ((30, 27, 24), "black")],
+)
+def test_a_colour_keeps_its_name_in_the_shade(rgb, word):
+    """And in a camera's noise; what has little hue becomes black."""
+    rng = np.random.default_rng(3)
+    for light in (1.0, 0.5, 0.25, 0.12):
+        seen = np.clip(light * np.array(rgb) + rng.normal(0, 2, (500, 3)), 0, 255).astype(np.uint8)
+        dark = word if word not in ("grey", "black") or light * max(rgb) > 60 else "black"
+        assert naming.colour_shares(seen).get(dark, 0.0) > 0.9, (light, naming.colour_shares(seen))
+
+
+@pytest.mark.parametrize(
     "name, found",
     [
         ("the red mug", "object_1"),
