@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -45,7 +46,12 @@ def program(module: str, function: str = "main") -> Callable[[], object]:
         viewerless.prepare()
         main = getattr(importlib.import_module(module), function)
         signal.signal(signal.SIGINT, before)
-        return main()
+        try:
+            return main()
+        except BrokenPipeError:
+            # Who read what is said has gone, as ``head`` does: no fault, and nothing more to say, at Python's end either.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 128 + signal.SIGPIPE
 
     begin.__doc__ = f"Begin ``{module}.{function}``."
     return begin

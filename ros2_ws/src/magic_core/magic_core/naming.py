@@ -119,11 +119,11 @@ def colour_shares(colors: NDArray[np.uint8]) -> dict[str, float]:
         lower = upper
     # Dark orange is what is called brown.
     words[np.isin(words, ("orange",)) & (value < 0.6)] = "brown"
-    grey = chroma < np.maximum(0.12, 0.2 * value)
+    # What is dark by a pigment, or in the shade, keeps its hue; noise and warm light give grey and black things less of one.
+    grey = chroma < np.maximum(np.clip(0.5 * value, 0.06, 0.12), 0.2 * value)
     words[grey] = "grey"
     words[grey & (value > 0.72)] = "white"
-    # What is dark by a pigment, or in the shade, keeps its hue; noise and warm light give black things less of one.
-    words[(value < 0.2) & ((chroma < 0.06) | (chroma < 0.5 * value))] = "black"
+    words[grey & (value < 0.2)] = "black"
     return {word: float(np.mean(words == word)) for word in COLOURS if (words == word).any()}
 
 

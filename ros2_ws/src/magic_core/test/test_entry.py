@@ -105,3 +105,13 @@ def test_the_version_is_told_without_the_imports(capsys, monkeypatch):
     assert program("magic_core.no_such_module")() == 0
     name, number = capsys.readouterr().out.split()
     assert name == "magic_core" and number == version() and number[0].isdigit()
+
+
+def test_a_reader_that_has_gone_leaves_no_traceback(tmp_path):
+    """As ``program | head`` does."""
+    text = "def main():\n for number in range(100000):\n  print(number)\n"
+    with started(tmp_path, text, PYTHONUNBUFFERED=None) as process:
+        assert process.stdout.readline() == "0\n"
+        process.stdout.close()
+        assert process.wait(20) == 128 + signal.SIGPIPE
+        assert process.stderr.read() == ""
