@@ -113,6 +113,13 @@ def _algorithm(node: Node) -> Parameters:
         region_high=tuple(high),
         method=p("method", "completed", "reconstruction", choices=METHODS),
         use_color=p("use_color", True, "refine masks by the colour difference to the table"),
+        arm_offset=p(
+            "arm_offset",
+            0.015,
+            "cameras that see the arm farther than this from where its joints put it are refused, m; 0: none are",
+            low=0.0,
+            high=1.0,
+        ),
         split=p(
             "split",
             True,

@@ -40,6 +40,8 @@ LEAST, FEW = 100, 20
 MARGIN = 0.15
 #: Behind others a thing may go on by this, m, and is told whole; and by the second where some camera has the thing itself before it.
 BEHIND, AROUND = 0.015, 0.03
+#: A camera that certainly sees the arm farther than this from where its joints put it, m, is told to.
+ARM_TOLD = 0.005
 #: Between parts of one solid that are farther from each other, m, is one that nobody saw.
 GAP = 0.006
 #: Two things are likely parts of one that a seam has parted where they touch (m), and, within so much of that place (m), have one height (m) and one chromaticity.
@@ -92,8 +94,10 @@ def perceive(
 
     What the robot holds (``RgbdFrame.held``) is an object of its own.
 
+    Cameras are measured against the arm where frames tell how they saw it (``RgbdFrame.arm``).
+
     Raises ``NO_FRAMES`` without frames, ``NO_DEPTH`` where no frame has :data:`LEAST` pixels with depth, ``NO_TABLE``,
-    ``CAMERAS_DISAGREE`` where the cameras' poses contradict each other by more than may be corrected.
+    ``CAMERAS_DISAGREE`` where the cameras' poses contradict each other by more than may be corrected, ``ROBOT_ELSEWHERE`` where one is as far off the arm.
     An empty table is a scene without objects.
     """
     report = report if report is not None else Report()
@@ -133,6 +137,7 @@ def perceive(
         apart = _apart(worst, views)
         if views.corrects and worst is not None and worst.certain and worst.motion.any():
             views = labelled(_brought_together(views, worst))
+        report.notes += _about_the_arm(views, used, parameters.arm_offset)
         report.notes += _about_glass(views)
 
     with report.stage("meshes"):
@@ -263,6 +268,33 @@ def _about_poses(pairs: list[cameras.Disagreement], views: _Views) -> list[str]:
             notes.append(f"cameras disagree: {pair}" + ("; brought together half way" if views.corrects else ""))
         elif pair.offset > cameras.MOST_OFFSET:
             notes.append(f"cameras may disagree: {pair}; more things in common view would tell")
+    return notes
+
+
+def _about_the_arm(views: _Views, frames: list[RgbdFrame], limit: float) -> list[str]:
+    """What there is to say of where the cameras see the arm; frames: as they came, since looks have their tables put on one another.
+
+    Raises ``ROBOT_ELSEWHERE`` where one certainly sees it farther than ``limit``, m, from where its joints put it: a tool would be as far off the fingers.
+    """
+    notes = []
+    for frame, seen in zip(frames[: views.now], views.looks[: views.now], strict=True):
+        if frame.arm is None:
+            continue
+        # Where what was seen of it lies with the camera's table on the others'.
+        moved = seen.frame.world_from_camera @ transforms.inverse(frame.world_from_camera)
+        offset = frame.arm.centre + frame.arm.offset - transforms.apply(moved, frame.arm.centre[None])[0]
+        length = float(np.linalg.norm(offset))
+        sure = length - 2 * frame.arm.error
+        x, y, z = (1000 * offset).round(1)
+        told = (
+            f"{frame.camera} sees the arm {1000 * length:.1f} mm from where its joints put it, to be moved by ({x:g}, {y:g}, {z:g}) mm "
+            f"(standard error {1000 * frame.arm.error:.1f} mm)"
+        )
+        if limit and sure > limit:
+            allowed = f"up to {1000 * limit:.0f} mm; calibrate the camera against the arm again"
+            raise MagicError(Code.ROBOT_ELSEWHERE, "calibration of camera and arm", told, allowed)
+        if sure > ARM_TOLD:
+            notes.append(told)
     return notes
 
 

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
-from magic_core.camera import NEARLY, SURELY, RgbdFrame
+from magic_core.camera import NEARLY, SURELY, ArmSeen, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.joint_history import JointHistory
 from magic_core.robot import Description
 from magic_core.scene import SceneObject
 from magic_core.self_filter import Body, Margins, SelfFilter, shown
+from magic_perception.arm_seen import ArmInPicture
 
 #: Joint states that ended so long before a picture, s, say nothing of it: nobody sends them any more.
 SILENT = 2.0
@@ -22,6 +23,8 @@ REACH = 1.5
 #: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds: a picture taken 0.2 s after it stopped is one of an arm that
 #: stands, and the tool in its hand is looked at in it.
 MOVES, MOMENT = 0.002, 0.15
+#: How an arm at rest is seen is measured again after so long, s.
+AGAIN = 5.0
 #: What a thing in the hand may be off where it is said to be, m: the closing fingers turn it.
 IN_HAND = 0.01
 #: What is drawn of it is it, but for the pixels at its edge, and noise.
@@ -46,11 +49,16 @@ class RobotInView:
     """An arm before cameras.
 
     age: so many seconds a joint state may be from a picture.  slack: so many seconds the stamps of picture and joints may differ by,
-    and so the arm may be off where it moves.
+    and so the arm may be off where it moves.  measured: whether frames are told how far they see the arm from where its joints put it.
     """
 
-    def __init__(self, robot: Description, margins: Margins | None = None, age: float = 0.2, slack: float = 0.02) -> None:
+    def __init__(
+        self, robot: Description, margins: Margins | None = None, age: float = 0.2, slack: float = 0.02, measured: bool = True
+    ) -> None:
         self.robot, self.age, self.slack = robot, age, slack
+        self._picture = ArmInPicture(robot) if measured else None
+        #: How each camera, by its name, saw the arm last, with the stamp and what it hangs on.
+        self._seen: dict[str, tuple[float, bytes, ArmSeen | None]] = {}
         self.history = JointHistory()
         self.filter = SelfFilter(robot, margins)
         self.held: tuple[Held, ...] = ()
@@ -103,7 +111,8 @@ class RobotInView:
                 round(cut.through, 2),
                 "less than a half: joint states, TF, calibration and description of the robot that is there; or self_filter: false where there is none",
             )
-        frame = frame.blinded(cut.robot) if cut.robot.any() else frame
+        arm = self._arm(frame, states[0], world_from_base) if cut.robot.any() else None
+        frame = replace(frame.blinded(cut.robot), arm=arm) if cut.robot.any() else frame
         wide = replace(self.filter.margins, space=max(self.filter.margins.space, IN_HAND))
         base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
         poses = [self.robot.poses(dict(state)) for state in states] if self.held else []
@@ -115,6 +124,20 @@ class RobotInView:
                 pixels[frame.blind] = 0
             frame = replace(frame, held=pixels if frame.held is None else np.maximum(frame.held, pixels))
         return frame
+
+    def _arm(self, frame: RgbdFrame, state: dict[str, float], world_from_base: NDArray[np.float64] | None) -> ArmSeen | None:
+        """How a frame sees the arm, where it rests and its hand is empty; measured once in a while."""
+        if self._picture is None or self.held or self.moves(frame.stamp):
+            return None
+        places = [frame.world_from_camera, np.eye(4) if world_from_base is None else world_from_base]
+        key = np.concatenate(
+            [*(place.round(4).ravel() for place in places), np.round([state[name] for name in sorted(state)], 3)]
+        ).tobytes()
+        stamp, known, arm = self._seen.get(frame.camera, (-np.inf, b"", None))
+        if known != key or not 0 <= frame.stamp - stamp < AGAIN:
+            arm = self._picture.measure(frame, state, world_from_base)
+            self._seen[frame.camera] = frame.stamp, key, arm
+        return arm
 
     def moves(self, stamp: float) -> bool:
         """Whether a joint of the arm has moved in the last moment before a stamp; false where that is not known."""

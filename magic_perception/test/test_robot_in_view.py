@@ -189,6 +189,59 @@ def test_where_the_joints_are_not_known_is_told(panda):
     assert absent.value.code == Code.ROBOT_NOT_THERE
 
 
+def off(frames, *by):
+    """The frames of cameras that are said to stand elsewhere, all by the same."""
+    return [replace(frame, world_from_camera=transforms.make(translation=by) @ frame.world_from_camera) for frame in frames]
+
+
+@pytest.mark.parametrize("joints", [OVER_THE_TABLE, np.array([0.3, -0.6, 0.1, -2.2, 0.2, 1.7, 0.9, 0.02, 0.02])])
+def test_cameras_are_measured_against_the_arm(panda, joints):
+    """Two cameras that agree are off the arm: what is seen of it says by how much, and a scene that would be grasped beside is refused."""
+    robot, pictures = panda
+    frames = seen([*things(), *pictures.at(joints)])
+    for right in (told(robot, joints).cut(frame) for frame in frames):
+        assert np.linalg.norm(right.arm.offset) < 0.004 and right.arm.error < 0.006
+    report = Report()
+    perceive([told(robot, joints).cut(frame) for frame in frames], (), REGION, None, report)
+    assert not [note for note in report.notes if "sees the arm" in note]
+
+    by = np.array([0.012, -0.009, 0.0])
+    near = [told(robot, joints).cut(frame) for frame in off(frames, *by)]
+    for frame in near:
+        np.testing.assert_allclose(frame.arm.offset, -by, atol=0.004)
+    perceive(near, (), REGION, None, report)
+    assert any("sees the arm" in note for note in report.notes)
+
+    far = [told(robot, joints).cut(frame) for frame in off(frames, 0.0, 0.03, 0.0)]
+    with pytest.raises(MagicError) as error:
+        perceive(far, (), REGION)
+    assert error.value.code is Code.ROBOT_ELSEWHERE and "15 mm" in error.value.message
+    perceive(far, (), replace(REGION, arm_offset=0.0))
+
+
+def test_a_table_that_is_put_right_counts_in_where_the_arm_is_seen(panda):
+    """Cameras 6 mm too high see table and arm too high; with the table where it is, the arm is too."""
+    robot, pictures = panda
+    report = Report()
+    frames = off(seen([*things(), *pictures.at(OVER_THE_TABLE)]), 0.0, 0.0, 0.006)
+    cut = [told(robot, OVER_THE_TABLE).cut(frame) for frame in frames]
+    assert all(frame.arm.offset[2] < -0.003 for frame in cut)
+    perceive(cut, (), REGION, None, report)
+    assert not [note for note in report.notes if "sees the arm" in note]
+
+
+def test_an_arm_that_moves_or_holds_is_not_measured(panda):
+    robot, pictures = panda
+    frame = seen(pictures.at(OVER_THE_TABLE))[0]
+    moving = told(robot, OVER_THE_TABLE)
+    before = robot.arm_positions(OVER_THE_TABLE + 0.02)
+    moving.history.take(list(before), list(before.values()), 9.9)
+    assert moving.cut(frame).arm is None
+    holding = told(robot, OVER_THE_TABLE)
+    holding.held = (Held.of(hook_at(robot)[0], robot.config.move_group),)
+    assert holding.cut(frame).arm is None
+
+
 def test_joint_states_on_their_way_are_waited_for(panda):
     view = told(panda[0], OVER_THE_TABLE, at=10.0)
     assert view.waits(10.1) and not view.waits(10.0) and not view.waits(12.0)

@@ -51,6 +51,16 @@ NEARLY, SURELY = 1, 2
 
 
 @dataclass(frozen=True)
+class ArmSeen:
+    """How a picture sees the arm against where its joints put it: ``offset`` (3,), m, in the world, carries what is seen of it about ``centre`` (3,)
+    to where it should be; error: the standard error of each of its components, m."""
+
+    centre: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    error: float
+
+
+@dataclass(frozen=True)
 class RgbdFrame:
     """One colour image with depth registered to it.
 
@@ -59,6 +69,7 @@ class RgbdFrame:
     blind (H, W) bool: something that is no part of the scene (the robot) stands before
     it there, so that the pixel tells nothing, neither of things nor of free space.
     held (H, W) uint8: :data:`SURELY` where what the robot holds is seen, :data:`NEARLY` where it may be, else 0.
+    arm: how the arm was seen before it was cut out, where that was measured.
     """
 
     color: NDArray[np.uint8]
@@ -69,6 +80,7 @@ class RgbdFrame:
     stamp: float = 0.0
     blind: NDArray[np.bool_] | None = None
     held: NDArray[np.uint8] | None = None
+    arm: ArmSeen | None = None
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)

@@ -37,6 +37,7 @@ class Code(IntEnum):
     ROBOT_NOT_THERE = 117
     SOMETHING_HANGS = 118
     DEPTH_UNIT = 119
+    ROBOT_ELSEWHERE = 120
 
     # Matching
     UNKNOWN_STRATEGY = 200

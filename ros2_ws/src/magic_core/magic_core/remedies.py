@@ -88,6 +88,10 @@ REMEDIES: dict[Code, Remedy] = {
         "Depth is no table-top's in the unit that it is read in.",
         "Set the driver's unit, or the parameter depth_unit (mm, 0.25mm, m, ...).",
     ),
+    Code.ROBOT_ELSEWHERE: Remedy(
+        "A camera sees the arm at another place than joint states and TF put it, by more than `arm_offset`.",
+        "Calibrate the camera against the arm again (calibrate_cameras --on-hand); check robot.base_frame, and that the URDF is the arm's that is there.",
+    ),
     Code.UNKNOWN_STRATEGY: Remedy("No strategy of that name, and no such folder.", "`ros2 run magic_bringup magic strategies` lists them."),
     Code.UNKNOWN_OBJECT: Remedy(
         "No object of that id, or none to choose from.",
