@@ -656,6 +656,7 @@ class Perception(Node):
             message = f"{where}{error.message}; an arm in the pictures is not cut out (parameter self_filter: false where there is none)"
             return pc.status(name, DiagnosticStatus.WARN, f"[{int(error.code)} {error.code.name}] {message}", error.code, {})
         values = {f"share of the picture of {camera}": f"{share:.3f}" for camera, share in cut.items()}
+        values |= {f"{camera} sees the arm off by": f"{1000 * off:.1f} mm" for camera, off in robot.offsets().items()}
         return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
 
     def camera_status(self, camera: str, now: float) -> DiagnosticStatus:

@@ -139,6 +139,10 @@ class RobotInView:
             self._seen[frame.camera] = frame.stamp, key, arm
         return arm
 
+    def offsets(self) -> dict[str, float]:
+        """How far, m, each camera saw the arm from where its joints put it, by the pose that it came with, where that was measured last."""
+        return {camera: float(np.linalg.norm(arm.offset)) for camera, (_, _, arm) in dict(self._seen).items() if arm is not None}
+
     def moves(self, stamp: float) -> bool:
         """Whether a joint of the arm has moved in the last moment before a stamp; false where that is not known."""
         try:

@@ -199,8 +199,10 @@ def test_cameras_are_measured_against_the_arm(panda, joints):
     """Two cameras that agree are off the arm: what is seen of it says by how much, and a scene that would be grasped beside is refused."""
     robot, pictures = panda
     frames = seen([*things(), *pictures.at(joints)])
-    for right in (told(robot, joints).cut(frame) for frame in frames):
+    view = told(robot, joints)
+    for right in (view.cut(frame) for frame in frames):
         assert np.linalg.norm(right.arm.offset) < 0.004 and right.arm.error < 0.006
+    assert set(view.offsets()) == set(CAMERAS) and max(view.offsets().values()) < 0.004
     report = Report()
     perceive([told(robot, joints).cut(frame) for frame in frames], (), REGION, None, report)
     assert not [note for note in report.notes if "sees the arm" in note]
