@@ -116,7 +116,7 @@ def _algorithm(node: Node) -> Parameters:
         arm_offset=p(
             "arm_offset",
             0.015,
-            "cameras that see the arm farther than this from where its joints put it are refused, m; 0: none are",
+            "cameras that see the arm farther than this from where its joints put it are refused, and by less what they see is moved, m; 0: neither",
             low=0.0,
             high=1.0,
         ),

@@ -32,7 +32,7 @@ class Parameters:
     resolution: cell of the occupancy grids that outlines come from.
     wall: assumed wall thickness of things that are seen to be hollow from above.
     use_color: refine masks by the colour difference to the table.
-    arm_offset: cameras that see the arm farther than this from where its joints put it are refused; 0: none are.
+    arm_offset: cameras that see the arm farther than this from where its joints put it are refused, and by less what they see is moved; 0: neither.
     split: part touching objects where what is measured at a concave seam, or at an upright plane between colours, says that they are two
     (:mod:`magic_perception.seams`, :mod:`magic_perception.cuts`).
     max_objects: the largest ones are kept.  workers: threads for cameras and objects; most of the

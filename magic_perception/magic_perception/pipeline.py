@@ -40,7 +40,7 @@ LEAST, FEW = 100, 20
 MARGIN = 0.15
 #: Behind others a thing may go on by this, m, and is told whole; and by the second where some camera has the thing itself before it.
 BEHIND, AROUND = 0.015, 0.03
-#: A camera that certainly sees the arm farther than this from where its joints put it, m, is told to.
+#: A camera that certainly sees the arm farther than this from where its joints put it, m, is told to, and what is seen is moved.
 ARM_TOLD = 0.005
 #: Between parts of one solid that are farther from each other, m, is one that nobody saw.
 GAP = 0.006
@@ -107,10 +107,20 @@ def perceive(
     seeing = _seeing(frames, report.notes)
     now = sum(seeing)
     used = [*(frame for frame, sees in zip(frames, seeing, strict=True) if sees), *(frame.free for frame in earlier)]
-    with report.stage("table"):
-        table, own = find_table(used, parameters, report.notes)
+
+    def looked(notes: list[str]) -> tuple[list[Plane], NDArray[np.float64], list[Looked]]:
+        table, own = find_table(used, parameters, notes)
         world_from_table = _table_frame(table, parameters)
-        looks = each(lambda pair: look(*pair, world_from_table, parameters), list(zip(used, own, strict=True)), parameters.workers)
+        pairs = list(zip(used, own, strict=True))
+        return own, world_from_table, each(lambda pair: look(*pair, world_from_table, parameters), pairs, parameters.workers)
+
+    with report.stage("table"):
+        own, world_from_table, looks = looked(about_table := [])
+        shift, about_arm = _to_the_arm(_off_the_arm(looks[:now], used[:now]), parameters.arm_offset)
+        if shift.any():
+            used = [_shifted(frame, shift) for frame in used]
+            own, world_from_table, looks = looked(about_table := [])
+        report.notes += [*about_table, *about_arm]
 
     with report.stage("masks"):
         fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
@@ -137,7 +147,6 @@ def perceive(
         apart = _apart(worst, views)
         if views.corrects and worst is not None and worst.certain and worst.motion.any():
             views = labelled(_brought_together(views, worst))
-        report.notes += _about_the_arm(views, used, parameters.arm_offset)
         report.notes += _about_glass(views)
 
     with report.stage("meshes"):
@@ -271,31 +280,61 @@ def _about_poses(pairs: list[cameras.Disagreement], views: _Views) -> list[str]:
     return notes
 
 
-def _about_the_arm(views: _Views, frames: list[RgbdFrame], limit: float) -> list[str]:
-    """What there is to say of where the cameras see the arm; frames: as they came, since looks have their tables put on one another.
+@dataclass(frozen=True)
+class _OffTheArm:
+    """That a camera sees the arm elsewhere: ``offset`` (3,), m, in the world, carries what it sees of it to where the joints put it; error: standard error, m."""
 
-    Raises ``ROBOT_ELSEWHERE`` where one certainly sees it farther than ``limit``, m, from where its joints put it: a tool would be as far off the fingers.
-    """
-    notes = []
-    for frame, seen in zip(frames[: views.now], views.looks[: views.now], strict=True):
-        if frame.arm is None:
-            continue
-        # Where what was seen of it lies with the camera's table on the others'.
-        moved = seen.frame.world_from_camera @ transforms.inverse(frame.world_from_camera)
-        offset = frame.arm.centre + frame.arm.offset - transforms.apply(moved, frame.arm.centre[None])[0]
-        length = float(np.linalg.norm(offset))
-        sure = length - 2 * frame.arm.error
-        x, y, z = (1000 * offset).round(1)
-        told = (
-            f"{frame.camera} sees the arm {1000 * length:.1f} mm from where its joints put it, to be moved by ({x:g}, {y:g}, {z:g}) mm "
-            f"(standard error {1000 * frame.arm.error:.1f} mm)"
+    camera: str
+    offset: NDArray[np.float64]
+    error: float
+
+    @property
+    def sure(self) -> float:
+        """How much of it is more than chance, m."""
+        return float(np.linalg.norm(self.offset)) - 2 * self.error
+
+    def __str__(self) -> str:
+        x, y, z = (1000 * self.offset).round(1)
+        return (
+            f"{self.camera} sees the arm {1000 * np.linalg.norm(self.offset):.1f} mm from where its joints put it, to be moved by ({x:g}, {y:g}, {z:g}) mm "
+            f"(standard error {1000 * self.error:.1f} mm)"
         )
-        if limit and sure > limit:
-            allowed = f"up to {1000 * limit:.0f} mm; calibrate the camera against the arm again"
-            raise MagicError(Code.ROBOT_ELSEWHERE, "calibration of camera and arm", told, allowed)
-        if sure > ARM_TOLD:
-            notes.append(told)
-    return notes
+
+
+def _off_the_arm(looks: Sequence[Looked], frames: Sequence[RgbdFrame]) -> list[_OffTheArm]:
+    """How far each camera that tells sees the arm from where its joints put it, with its table on the others'; frames: as they came."""
+    found = []
+    for seen, frame in zip(looks, frames, strict=True):
+        if frame.arm is not None:
+            moved = seen.frame.world_from_camera @ transforms.inverse(frame.world_from_camera)
+            offset = frame.arm.centre + frame.arm.offset - transforms.apply(moved, frame.arm.centre[None])[0]
+            found.append(_OffTheArm(frame.camera, offset, frame.arm.error))
+    return found
+
+
+def _to_the_arm(off: Sequence[_OffTheArm], limit: float) -> tuple[NDArray[np.float64], list[str]]:
+    """By what (3,) all that is seen is moved along the table so that the arm finds it, and what there is to say; tables tell the height.
+
+    Zero where no camera is certainly off.
+
+    Raises ``ROBOT_ELSEWHERE`` where one certainly is by more than ``limit``, m.
+    """
+    worst = max(off, key=lambda one: one.sure, default=None)
+    if worst is None or not limit or worst.sure <= ARM_TOLD:
+        return np.zeros(3), []
+    if worst.sure > limit:
+        allowed = f"up to {1000 * limit:.0f} mm; calibrate the camera against the arm again"
+        raise MagicError(Code.ROBOT_ELSEWHERE, "calibration of camera and arm", str(worst), allowed)
+    shift = np.average([one.offset for one in off], axis=0, weights=[one.error**-2 for one in off]) * (1.0, 1.0, 0.0)
+    return shift, [f"{worst}; what the cameras see is moved by ({1000 * shift[0]:.1f}, {1000 * shift[1]:.1f}) mm along the table"]
+
+
+def _shifted(frame: RgbdFrame, shift: NDArray[np.float64]) -> RgbdFrame:
+    """A frame from a camera that stands elsewhere, by ``shift`` (3,), m."""
+    arm = frame.arm
+    if arm is not None:
+        arm = replace(arm, centre=arm.centre + shift, offset=arm.offset - shift)
+    return replace(frame, world_from_camera=transforms.make(translation=shift) @ frame.world_from_camera, arm=arm)
 
 
 def _apart(worst: cameras.Disagreement | None, views: _Views) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import deque
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from magic_core.joint_history import JointHistory
 from magic_core.robot import Description
 from magic_core.scene import SceneObject
 from magic_core.self_filter import Body, Margins, SelfFilter, shown
-from magic_perception.arm_seen import ArmInPicture
+from magic_perception.arm_seen import FLOOR, ArmInPicture
 
 #: Joint states that ended so long before a picture, s, say nothing of it: nobody sends them any more.
 SILENT = 2.0
@@ -23,8 +24,8 @@ REACH = 1.5
 #: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds: a picture taken 0.2 s after it stopped is one of an arm that
 #: stands, and the tool in its hand is looked at in it.
 MOVES, MOMENT = 0.002, 0.15
-#: How an arm at rest is seen is measured again after so long, s.
-AGAIN = 5.0
+#: How an arm at rest is seen is measured again after so long, s; so many times are remembered.
+AGAIN, SIGHTINGS = 5.0, 8
 #: What a thing in the hand may be off where it is said to be, m: the closing fingers turn it.
 IN_HAND = 0.01
 #: What is drawn of it is it, but for the pixels at its edge, and noise.
@@ -45,6 +46,26 @@ class Held:
         return cls(Body(item.mesh), link, item.world_from_object)
 
 
+@dataclass
+class _Sightings:
+    """How one camera saw the arm from one place: the last times, when and at which joint positions it was looked at last."""
+
+    place: bytes
+    stamp: float = -np.inf
+    joints: bytes = b""
+    arms: deque[ArmSeen] = field(default_factory=lambda: deque(maxlen=SIGHTINGS))
+
+    @property
+    def mean(self) -> ArmSeen | None:
+        """All of them together; ``None`` where there are none."""
+        arms = list(self.arms)
+        if not arms:
+            return None
+        weights = np.array([arm.error**-2 for arm in arms])
+        centre, offset = (np.average([getattr(arm, name) for arm in arms], axis=0, weights=weights) for name in ("centre", "offset"))
+        return ArmSeen(centre, offset, max(float(weights.sum() ** -0.5), FLOOR))
+
+
 class RobotInView:
     """An arm before cameras.
 
@@ -57,8 +78,7 @@ class RobotInView:
     ) -> None:
         self.robot, self.age, self.slack = robot, age, slack
         self._picture = ArmInPicture(robot) if measured else None
-        #: How each camera, by its name, saw the arm last, with the stamp and what it hangs on.
-        self._seen: dict[str, tuple[float, bytes, ArmSeen | None]] = {}
+        self._seen: dict[str, _Sightings] = {}
         self.history = JointHistory()
         self.filter = SelfFilter(robot, margins)
         self.held: tuple[Held, ...] = ()
@@ -111,8 +131,7 @@ class RobotInView:
                 round(cut.through, 2),
                 "less than a half: joint states, TF, calibration and description of the robot that is there; or self_filter: false where there is none",
             )
-        arm = self._arm(frame, states[0], world_from_base) if cut.robot.any() else None
-        frame = replace(frame.blinded(cut.robot), arm=arm) if cut.robot.any() else frame
+        frame = replace(frame.blinded(cut.robot) if cut.robot.any() else frame, arm=self._arm(frame, states[0], world_from_base))
         wide = replace(self.filter.margins, space=max(self.filter.margins.space, IN_HAND))
         base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
         poses = [self.robot.poses(dict(state)) for state in states] if self.held else []
@@ -126,22 +145,26 @@ class RobotInView:
         return frame
 
     def _arm(self, frame: RgbdFrame, state: dict[str, float], world_from_base: NDArray[np.float64] | None) -> ArmSeen | None:
-        """How a frame sees the arm, where it rests and its hand is empty; measured once in a while."""
-        if self._picture is None or self.held or self.moves(frame.stamp):
+        """How a frame's camera sees the arm from where it stands: measured once in a while where the arm rests with an empty hand, and kept else, so
+        that a scene stays where it is when the arm begins to move."""
+        if self._picture is None:
             return None
-        places = [frame.world_from_camera, np.eye(4) if world_from_base is None else world_from_base]
-        key = np.concatenate(
-            [*(place.round(4).ravel() for place in places), np.round([state[name] for name in sorted(state)], 3)]
-        ).tobytes()
-        stamp, known, arm = self._seen.get(frame.camera, (-np.inf, b"", None))
-        if known != key or not 0 <= frame.stamp - stamp < AGAIN:
+        base = np.eye(4) if world_from_base is None else world_from_base
+        place = np.concatenate([frame.world_from_camera.round(4).ravel(), base.round(4).ravel()]).tobytes()
+        seen = self._seen.get(frame.camera)
+        if seen is None or seen.place != place:
+            seen = self._seen[frame.camera] = _Sightings(place)
+        joints = np.round([state[name] for name in sorted(state)], 3).tobytes()
+        due = joints != seen.joints or not 0 <= frame.stamp - seen.stamp < AGAIN
+        if due and not self.held and not self.moves(frame.stamp):
+            seen.stamp, seen.joints = frame.stamp, joints
             arm = self._picture.measure(frame, state, world_from_base)
-            self._seen[frame.camera] = frame.stamp, key, arm
-        return arm
+            seen.arms += [] if arm is None else [arm]
+        return seen.mean
 
     def offsets(self) -> dict[str, float]:
         """How far, m, each camera saw the arm from where its joints put it, by the pose that it came with, where that was measured last."""
-        return {camera: float(np.linalg.norm(arm.offset)) for camera, (_, _, arm) in dict(self._seen).items() if arm is not None}
+        return {camera: float(np.linalg.norm(arm.offset)) for camera, seen in dict(self._seen).items() if (arm := seen.mean) is not None}
 
     def moves(self, stamp: float) -> bool:
         """Whether a joint of the arm has moved in the last moment before a stamp; false where that is not known."""

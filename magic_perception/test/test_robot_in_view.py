@@ -211,8 +211,12 @@ def test_cameras_are_measured_against_the_arm(panda, joints):
     near = [told(robot, joints).cut(frame) for frame in off(frames, *by)]
     for frame in near:
         np.testing.assert_allclose(frame.arm.offset, -by, atol=0.004)
-    perceive(near, (), REGION, None, report)
-    assert any("sees the arm" in note for note in report.notes)
+    there = perceive([told(robot, joints).cut(frame) for frame in frames], (), REGION)
+    moved = perceive(near, (), REGION, None, report)
+    assert any("sees the arm" in note and "is moved" in note for note in report.notes)
+    assert np.abs(middles(moved) - middles(there)).max() < 0.004
+    left = perceive(near, (), replace(REGION, arm_offset=0.0))
+    assert np.abs(middles(left) - middles(there)).max() > 0.009
 
     far = [told(robot, joints).cut(frame) for frame in off(frames, 0.0, 0.03, 0.0)]
     with pytest.raises(MagicError) as error:
@@ -239,6 +243,13 @@ def test_an_arm_that_moves_or_holds_is_not_measured(panda):
     before = robot.arm_positions(OVER_THE_TABLE + 0.02)
     moving.history.take(list(before), list(before.values()), 9.9)
     assert moving.cut(frame).arm is None
+    # What was measured before still holds, as long as the camera stands where it stood.
+    resting = told(robot, OVER_THE_TABLE)
+    known = resting.cut(frame).arm
+    resting.history.take(list(before), list(before.values()), 10.1)
+    later = replace(frame, stamp=10.1)
+    assert resting.moves(10.1) and np.array_equal(resting.cut(later).arm.offset, known.offset)
+    assert resting.cut(off([later], 0.01, 0.0, 0.0)[0]).arm is None
     holding = told(robot, OVER_THE_TABLE)
     holding.held = (Held.of(hook_at(robot)[0], robot.config.move_group),)
     assert holding.cut(frame).arm is None
