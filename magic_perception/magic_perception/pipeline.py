@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -315,13 +316,16 @@ def _off_the_arm(looks: Sequence[Looked], frames: Sequence[RgbdFrame]) -> list[_
 def _to_the_arm(off: Sequence[_OffTheArm], limit: float) -> tuple[NDArray[np.float64], list[str]]:
     """By what (3,) all that is seen is moved along the table so that the arm finds it, and what there is to say; tables tell the height.
 
-    Zero where no camera is certainly off.
+    Zero where no camera is certainly off, and where two contradict each other: what one took for the arm was something else.
 
     Raises ``ROBOT_ELSEWHERE`` where one certainly is by more than ``limit``, m.
     """
     worst = max(off, key=lambda one: one.sure, default=None)
     if worst is None or not limit or worst.sure <= ARM_TOLD:
         return np.zeros(3), []
+    parted = [float(np.linalg.norm(a.offset - b.offset)) - 2 * float(np.hypot(a.error, b.error)) for a, b in itertools.combinations(off, 2)]
+    if any(apart > ARM_TOLD for apart in parted):
+        return np.zeros(3), [f"where the cameras see the arm does not agree and is not made use of: {'; '.join(map(str, off))}"]
     if worst.sure > limit:
         allowed = f"up to {1000 * limit:.0f} mm; calibrate the camera against the arm again"
         raise MagicError(Code.ROBOT_ELSEWHERE, "calibration of camera and arm", str(worst), allowed)

@@ -387,5 +387,7 @@ def test_what_is_said_of_moved_cameras_is_measured(tmp_path, monkeypatch, capsys
     assert right["measured"] == moved["measured"] == 1
     assert right["said"] == right["refused"] == 0 and moved["said"] == moved["refused"] == 1
     assert right["error_mm"][0] < 10 and moved["error_mm"][0] < 10
+    arm = json.loads((tmp_path / "evaluation.json").read_text())["moved_cameras"]["arm"]
+    assert arm["0"]["measured"] == arm["40"]["measured"] == 2 and max(arm["0"]["error_mm"]) < 4 and max(arm["40"]["error_mm"]) < 8
     assert "| 40 mm | 1 of 1 | 1 | 1 | 0 |" in (tmp_path / "evaluation.md").read_text()
     assert "scene 1 of 1" in capsys.readouterr().err

@@ -225,6 +225,17 @@ def test_cameras_are_measured_against_the_arm(panda, joints):
     perceive(far, (), replace(REGION, arm_offset=0.0))
 
 
+def test_cameras_that_see_the_arm_at_two_places_are_not_believed(panda):
+    """One of them, of cameras that agree on the table, took something else for it."""
+    robot, pictures = panda
+    left, right = (told(robot, OVER_THE_TABLE).cut(frame) for frame in seen([*things(), *pictures.at(OVER_THE_TABLE)]))
+    wrong = replace(right, arm=replace(right.arm, offset=right.arm.offset + (0.0, 0.03, 0.0)))
+    report = Report()
+    scene = perceive([left, wrong], (), REGION, None, report)
+    assert any("does not agree" in note for note in report.notes)
+    assert np.abs(middles(scene) - middles(perceive([left, right], (), REGION))).max() < 0.001
+
+
 def test_a_table_that_is_put_right_counts_in_where_the_arm_is_seen(panda):
     """Cameras 6 mm too high see table and arm too high; with the table where it is, the arm is too."""
     robot, pictures = panda
