@@ -70,14 +70,12 @@ class RobotInView:
     """An arm before cameras.
 
     age: so many seconds a joint state may be from a picture.  slack: so many seconds the stamps of picture and joints may differ by,
-    and so the arm may be off where it moves.  measured: whether frames are told how far they see the arm from where its joints put it.
+    and so the arm may be off where it moves.
     """
 
-    def __init__(
-        self, robot: Description, margins: Margins | None = None, age: float = 0.2, slack: float = 0.02, measured: bool = True
-    ) -> None:
+    def __init__(self, robot: Description, margins: Margins | None = None, age: float = 0.2, slack: float = 0.02) -> None:
         self.robot, self.age, self.slack = robot, age, slack
-        self._picture = ArmInPicture(robot) if measured else None
+        self._picture = ArmInPicture(robot)
         self._seen: dict[str, _Sightings] = {}
         self.history = JointHistory()
         self.filter = SelfFilter(robot, margins)
@@ -147,8 +145,6 @@ class RobotInView:
     def _arm(self, frame: RgbdFrame, state: dict[str, float], world_from_base: NDArray[np.float64] | None) -> ArmSeen | None:
         """How a frame's camera sees the arm from where it stands: measured once in a while where the arm rests with an empty hand, and kept else, so
         that a scene stays where it is when the arm begins to move."""
-        if self._picture is None:
-            return None
         base = np.eye(4) if world_from_base is None else world_from_base
         place = np.concatenate([frame.world_from_camera.round(4).ravel(), base.round(4).ravel()]).tobytes()
         seen = self._seen.get(frame.camera)
