@@ -40,7 +40,7 @@ class Ungripped(Description):
 
     def gripper_joints(self) -> tuple[Joint, ...]:
         """The moving joints beyond the arm's last one."""
-        hand = set(self._beyond(self.arm[-1].child))
+        hand = set(self.beyond(self.arm[-1].child))
         return tuple(joint for joint in self.joints.values() if joint.moves and joint.parent in hand)
 
     def vertices(self, link: str) -> NDArray[np.float64]:
@@ -66,7 +66,7 @@ class Ungripped(Description):
 
     def beyond(self, link: str) -> list[str]:
         """A link and all those that it carries."""
-        return self._beyond(link)
+        return self.beyond(link)
 
     def above(self, link: str) -> Joint | None:
         """The joint that a link hangs on."""

@@ -98,6 +98,7 @@ class Code(IntEnum):
     GOAL_MISSED = 512
     GOAL_UNSEEN = 513
     ARM_NOT_AT_REST = 514
+    TOOL_WEIGHT = 515
     INTERNAL = 599
 
 

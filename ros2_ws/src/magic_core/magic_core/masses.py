@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from magic_core.errors import Code, MagicError
@@ -22,9 +23,26 @@ LEAST, MOST = 2.0, 25_000.0
 
 def volume(item: SceneObject) -> float:
     """m^3 that an object's convex pieces hold together, as they are simulated; of the hull of its mesh where it has none."""
+    return sum(hull.volume for hull in _hulls(item))
+
+
+def centre(item: SceneObject) -> NDArray[np.float64]:
+    """(3,): the middle of what these hold, m in the object's frame."""
+    parts = []
+    for hull in _hulls(item):
+        # Tetrahedra over the faces from a point inside.
+        inside = hull.points[hull.vertices].mean(axis=0)
+        corners = hull.points[hull.simplices] - inside
+        volumes = np.abs(np.linalg.det(corners)) / 6
+        parts.append((volumes.sum(), inside + volumes @ corners.sum(axis=1) / 4 / volumes.sum()))
+    weights, middles = zip(*parts, strict=True)
+    return np.average(middles, axis=0, weights=weights)
+
+
+def _hulls(item: SceneObject) -> list[ConvexHull]:
     pieces = [piece.vertices for piece in item.pieces if len(piece.vertices)] or [item.mesh.vertices]
     try:
-        return float(sum(ConvexHull(np.asarray(points, dtype=float)).volume for points in pieces))
+        return [ConvexHull(np.asarray(points, dtype=float)) for points in pieces]
     except (QhullError, ValueError) as error:
         raise MagicError(Code.BAD_MESH, f"shape of {item.id}", "flat or empty", "a solid that can weigh something") from error
 
@@ -68,12 +86,16 @@ def _density(name: str, item: SceneObject, mass: float) -> float | None:
     return density
 
 
+def taken(strategy: Strategy, tool: SceneObject, tool_mass: float) -> float:
+    """kg that the tool is taken to weigh; ``tool_mass``: what was told, 0 where nothing was."""
+    return tool_mass if tool_mass > 0 else strategy.physics.tool_density * volume(tool)
+
+
 def sentence(strategy: Strategy, tool: SceneObject, tool_mass: float) -> str:
     """What the tool is taken to weigh, and by whose word."""
     if tool_mass > 0:
         return f"the tool weighs {1000 * tool_mass:.0f} g, as was told"
-    density = strategy.physics.tool_density
     return (
-        f"the tool is taken to weigh {1000 * density * volume(tool):.0f} g, by the strategy's {density:g} kg/m^3; "
+        f"the tool is taken to weigh {1000 * taken(strategy, tool, 0.0):.0f} g, by the strategy's {strategy.physics.tool_density:g} kg/m^3; "
         "where it is heavier, weigh it and give tool_mass"
     )

@@ -16,13 +16,18 @@ from magic_core.robot import PANDA_HOME, RobotConfig
 @dataclass(frozen=True)
 class Preset:
     """config: with no files but for the Panda; trajectory_action, gripper_action: what the maker's driver calls them;
-    files: where URDF and SRDF are from."""
+    files: where URDF and SRDF are from.  torque_error: to which a joint repeats the torque that its driver tells as effort, Nm, where
+    that is measured behind the gear; 0: it is not, and tells no weight."""
 
     config: RobotConfig
     trajectory_action: str
     gripper_action: str
     files: str
+    torque_error: float = 0.0
 
+
+#: Nm; this project's choice.  Both arms measure torques behind the gear, and their drivers tell these, gravity included, as effort (tau_J).
+FRANKA_TORQUE = 0.2
 
 PRESETS = {
     "panda": Preset(
@@ -30,6 +35,7 @@ PRESETS = {
         "panda_arm_controller/follow_joint_trajectory",
         "panda_gripper/gripper_action",
         "those of the Python package example-robot-data, which is installed with this project, where none are named",
+        FRANKA_TORQUE,
     ),
     "fr3": Preset(
         RobotConfig(
@@ -42,6 +48,7 @@ PRESETS = {
         "fr3_arm_controller/follow_joint_trajectory",
         "franka_gripper/gripper_action",
         "URDF: xacro of franka_description, robots/fr3/fr3.urdf.xacro with hand:=true; SRDF: xacro of franka_fr3_moveit_config",
+        FRANKA_TORQUE,
     ),
     "ur5e": Preset(
         RobotConfig(

@@ -140,7 +140,7 @@ class Description:
     a turn more is the same to the hand, and takes a planner round in circles.  fingers: two sliding joints beyond the last of these,
     closed (2,) and opened (2,) their positions in metres.  finger_links: what moves with the fingers; foot: what never moves.
     base: the root link; base_frame: what its frame is called outside the URDF, the frame of everything that is planned and
-    verified.  root: the URDF's own element.  moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
+    verified.  root: the URDF's own element.  masses: of each link that has one, kg, and its centre (3,), m in the link's frame.  moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
     may touch.
     """
 
@@ -159,6 +159,10 @@ class Description:
         except (ValueError, TypeError, AttributeError) as error:
             raise MagicError(Code.BAD_REQUEST, f"joints of {self.urdf}", str(error), "joints with parent, child and numbers") from error
         self._links = {link.get("name", ""): link for link in self.root.findall("link")}
+        try:
+            self.masses = {name: found for name, link in self._links.items() if (found := _mass(link)) is not None}
+        except ValueError as error:
+            raise MagicError(Code.BAD_REQUEST, f"masses of {self.urdf}", str(error), "numbers") from error
         self._above = {joint.child: joint for joint in self.joints.values()}
         for joint in self.joints.values():
             for link in {joint.parent, joint.child} - set(self._links):
@@ -168,7 +172,7 @@ class Description:
             self._below[joint.parent].append(joint)
         roots = [link for link in self._links if link not in self._above]
         self.base = roots[0] if roots else ""
-        if len(roots) != 1 or len(self._above) != len(self.joints) or len(self._beyond(self.base)) != len(self._links):
+        if len(roots) != 1 or len(self._above) != len(self.joints) or len(self.beyond(self.base)) != len(self._links):
             raise MagicError(Code.BAD_REQUEST, f"links of {self.urdf}", f"roots {roots}", "one tree with one root")
         self.base_frame = config.base_frame.lstrip("/") or self.base
         if self.base_frame != self.base and self.base_frame in self._links:
@@ -187,12 +191,12 @@ class Description:
         self.arm = tuple(_within_a_turn(joint, float(home)) for joint, home in zip(self.arm, config.home, strict=True))
         self.fingers = self._fingers()
         self.moving = frozenset((*self.names, *(joint.name for joint in self.fingers)))
-        self.foot = frozenset(self._beyond(self.base, self.moving))
+        self.foot = frozenset(self.beyond(self.base, self.moving))
         # Grippers count from closed: the limit further from zero is where they are open.
         far = [abs(joint.upper) >= abs(joint.lower) for joint in self.fingers]
         self.closed = np.array([joint.lower if up else joint.upper for joint, up in zip(self.fingers, far, strict=True)])
         self.opened = np.array([joint.upper if up else joint.lower for joint, up in zip(self.fingers, far, strict=True)])
-        self.finger_links = frozenset(link for joint in self.fingers for link in self._beyond(joint.child))
+        self.finger_links = frozenset(link for joint in self.fingers for link in self.beyond(joint.child))
         self.disabled = frozenset(
             frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in _parsed(self.srdf, "SRDF").findall("disable_collisions")
         )
@@ -227,7 +231,7 @@ class Description:
             raise MagicError(Code.BAD_REQUEST, "tip link (move_group)", self.config.move_group, "a link that at least one joint moves")
         return moving
 
-    def _beyond(self, link: str, until: Collection[str] = ()) -> list[str]:
+    def beyond(self, link: str, until: Collection[str] = ()) -> list[str]:
         """A link and those beyond it, nearer ones first, but not those beyond the joints ``until``."""
         found = [link]
         for name in found:
@@ -235,7 +239,7 @@ class Description:
         return found
 
     def _fingers(self) -> tuple[Joint, ...]:
-        hand = self._beyond(self.arm[-1].child, {joint.name for joint in self.joints.values() if joint.moves})
+        hand = self.beyond(self.arm[-1].child, {joint.name for joint in self.joints.values() if joint.moves})
         fingers = tuple(joint for joint in self.joints.values() if joint.moves and joint.parent in hand)
         if len(fingers) != 2 or not all(joint.sliding for joint in fingers):
             raise MagicError(
@@ -262,7 +266,7 @@ class Description:
     def poses(self, positions: Mapping[str, float]) -> dict[str, NDArray[np.float64]]:
         """base_from_link (4, 4) of each link for joint positions by name; joints not named are at zero."""
         poses = {self.base: np.eye(4)}
-        for link in self._beyond(self.base):
+        for link in self.beyond(self.base):
             for joint in self._below[link]:
                 poses[joint.child] = poses[link] @ joint.parent_from_joint @ joint.motion(float(positions.get(joint.name, 0.0)))
         return poses
@@ -394,7 +398,7 @@ class Description:
     @property
     def bodies(self) -> tuple[frozenset[str], ...]:
         """The links sorted into what moves as one."""
-        return (self.foot, *(frozenset(self._beyond(joint.child, self.moving)) for joint in (*self.arm, *self.fingers)))
+        return (self.foot, *(frozenset(self.beyond(joint.child, self.moving)) for joint in (*self.arm, *self.fingers)))
 
     def tree(self, folder: Path | None = None) -> ET.Element:
         """The URDF as a collision library or a physics engine needs it.
@@ -447,6 +451,15 @@ def _origin(element: ET.Element | None) -> NDArray[np.float64]:
     if element is None:
         return np.eye(4)
     return transforms.from_rpy(*_numbers(element.get("rpy"), "0 0 0"), translation=_numbers(element.get("xyz"), "0 0 0"))
+
+
+def _mass(link: ET.Element) -> tuple[float, NDArray[np.float64]] | None:
+    """Mass, kg, and its centre (3,), m, of a link; ``None`` where it has none."""
+    inertial = link.find("inertial")
+    mass = None if inertial is None else inertial.find("mass")
+    if inertial is None or mass is None:
+        return None
+    return float(mass.get("value", "0")), _origin(inertial.find("origin"))[:3, 3]
 
 
 def _narrowed(joint: Joint, published: JointLimits, index: int) -> Joint:

@@ -27,6 +27,8 @@ STEPS = round(TICK * SETTINGS.frequency)
 EFFORT = 60.0
 #: The fingers' speed is that of the last so many seconds.
 TREMBLE = 0.05
+#: What the arm's sensors tell of its torques is off by so much, Nm (standard deviation), and no more the same after so many seconds.
+TORQUE_ERROR, TORQUE_MEMORY = 0.15, 2.0
 #: How far before the hand what blocks it is put, m, from middle to middle.
 AHEAD = 0.16
 
@@ -52,6 +54,8 @@ class Lab:
         self.robot = robot
         self.world = LabWorld(self.scene.things, robot, scene.table_friction, scene.pad_friction)
         self._rng = np.random.default_rng([scene.seed, 15])
+        self._sensors = np.random.default_rng([scene.seed, 16])
+        self._off = TORQUE_ERROR * self._sensors.standard_normal(len(robot.names))
         self._waiting = list(events)
         self.happened: list[Event] = []
         self.put: dict[str, Array] = {}
@@ -69,6 +73,10 @@ class Lab:
     def time(self) -> float:
         """Seconds since the reset."""
         return self._ticks * TICK
+
+    def torques(self) -> Array:
+        """(J,): what the arm's sensors tell of its joints' torques (forces), Nm (N)."""
+        return self.world.efforts() + self._off
 
     # ------------------------------------------------------------ goals
 
@@ -109,6 +117,8 @@ class Lab:
             self.world.step(*self.arm.update(self.time + step * TICK / STEPS, q[:count], qd[:count]))
             self.joints = self.world.joints()
         self._ticks += 1
+        kept = math.exp(-TICK / TORQUE_MEMORY)
+        self._off = kept * self._off + math.sqrt(1 - kept**2) * TORQUE_ERROR * self._sensors.standard_normal(len(self._off))
         finger = float(self.joints[0][-1])
         self._fingers = [*self._fingers[-round(TREMBLE / TICK) :], finger]
         # A stiff contact makes them tremble.

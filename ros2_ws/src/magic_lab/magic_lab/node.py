@@ -253,7 +253,7 @@ class LabNode(Node):
         q, qd = lab.joints
         positions = self.robot.arm_positions(q)
         if not lab.silent.joints:
-            efforts = [*lab.world.efforts().tolist(), 0.0, 0.0]
+            efforts = [*lab.torques().tolist(), 0.0, 0.0]
             self._joints_out.publish(
                 JointState(header=cv.header("", stamp), name=list(positions), position=q.tolist(), velocity=qd.tolist(), effort=efforts)
             )

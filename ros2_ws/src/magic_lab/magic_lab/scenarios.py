@@ -44,6 +44,8 @@ HAND, BLOCK, TARGET = "hand", "block", "target"
 #: Between which factors of the densities that the strategy assumes the true ones are drawn; friction coefficients of things, of the table and of the
 #: finger pads.
 FACTOR = 2.0
+#: How many times as heavy as the strategies' wood and plastics a thing of steel is.
+STEEL = 13.0
 FRICTION, TABLE_FRICTION, PAD_FRICTION = (0.2, 0.5), (0.25, 0.5), (0.9, 1.5)
 
 
@@ -69,7 +71,7 @@ class Scenario:
     """A strategy on some things.
 
     cases: a tool (or several) and a target each, names as :mod:`magic_verifier.cases` has them.  chosen: tool and target are to be
-    chosen, not told.  pads: what the pads' friction is multiplied by.
+    chosen, not told.  pads: what the pads' friction is multiplied by, heavier: what the tool's density is.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Scenario:
     chosen: bool = False
     events: tuple[Event, ...] = ()
     pads: float = 1.0
+    heavier: float = 1.0
 
 
 def _cases(target: str, *tools: str) -> tuple[Case, ...]:
@@ -109,6 +112,7 @@ SCENARIOS = {
         Scenario(
             "slipping", "hooking", HOOKS[:1], "the tool slips in the fingers when it has been taken up", events=(Event("slip", 2, 0.5),)
         ),
+        Scenario("heavy", "hooking", HOOKS, "the tools of hooking, of steel, which the strategy does not know", heavier=STEEL),
     )
 }
 
@@ -162,7 +166,8 @@ def draw(scenario: Scenario, case: Case, seed: int, strategies: str = "") -> Sce
         return Thing(item, kind, density * float(FACTOR ** rng.uniform(-1, 1)), float(rng.uniform(*FRICTION)))
 
     fixed = physics.target_is_fixed
-    things = [*map(thing, layout.tools), thing(layout.target, STATIC if fixed else DYNAMIC, physics.target_density)]
+    tools = [thing(item, density=scenario.heavier * physics.tool_density) for item in layout.tools]
+    things = [*tools, thing(layout.target, STATIC if fixed else DYNAMIC, physics.target_density)]
     things += [thing(item, STATIC) for item in layout.fixtures]
     known = (*layout.fixtures, *((layout.target,) if fixed else ()))
     return Scene(

@@ -11,6 +11,7 @@ from magic_lab.cameras import Bodies, Camera
 from magic_lab.controllers import Error, Point
 from magic_lab.laboratory import Lab
 from magic_lab.scenarios import EVENTS, FACTOR, SCENARIOS, TARGET, Event, case_of, draw, hand_pose, scenario_of
+from magic_server.weighing import Reading, weighed
 from magic_verifier.simulation import DYNAMIC
 
 
@@ -55,6 +56,27 @@ def test_the_arm_holds_its_ready_pose_and_things_stay_where_they_are():
     assert np.abs(it.joints[0][:7] - HOME).max() < 0.005
     for name, pose in it.world.poses().items():
         assert np.linalg.norm((pose - before[name])[:3, 3]) < 0.001, name
+
+
+def test_the_arm_weighs_what_it_takes_up():
+    it = lab()
+    arm = robot()
+    for q in (ABOVE, lowered(0.07)):
+        move(it, q)
+
+    def reading():
+        go(it, lambda end=it.time + 0.3: it.time >= end)
+        told = []
+        go(it, lambda end=it.time + 0.3: told.append(it.torques()) or it.time >= end)
+        return Reading(arm.arm_positions(it.joints[0]), np.mean(told, axis=0))
+
+    empty = reading()
+    go(it, it.grip(0.015, 40.0).done.is_set)
+    move(it, ABOVE)
+    tip_from_tool = transforms.inverse(it.world.tcp()) @ it.world.pose("tool_1")
+    found = weighed(arm, 0.2, empty, reading(), tip_from_tool[:3, 3])
+    true = it.world.engine.component("tool_1").mass
+    assert abs(found.mass - true) < 2 * found.error and found.error < 0.08
 
 
 def test_fingers_take_up_what_is_between_them_and_let_go(gripped):

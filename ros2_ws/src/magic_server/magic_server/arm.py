@@ -71,6 +71,9 @@ class Guard(Protocol):
     def look(self, point: int) -> None:
         """The arm stands at this point with the tool in its hand."""
 
+    def closing(self) -> None:
+        """The arm stands, its hand empty, and the fingers are about to close on the tool."""
+
     def closed(self) -> None:
         """The fingers have closed on the tool."""
 
@@ -133,7 +136,9 @@ class Arm:
                 guard.look(action.point)
             else:
                 tell(f"{where}: the fingers {'close on the tool' if action.close else 'open'}")
-                if not action.close:
+                if action.close:
+                    guard.closing()
+                else:
                     guard.opened()
                 self._fingers(action, token, look)
                 if action.close:

@@ -7,7 +7,8 @@ The states, each left by a step that was looked at or by a failure with a code::
      |   |   |                                              `--missed--> next candidate
      |   |   |--a thing has moved--> stopped, at rest --> perceived and planned anew, or with the tool in the hand from there
      |   |   `--pictures are too old--> the same, once newer ones have come; the end (STALE_DATA) where the tool has been let go
-     |   `--the tool is off in the hand--> planned anew from its pose as it is, or given up (TOOL_SLIPPED)
+     |   |--the tool is off in the hand--> planned anew from its pose as it is, or given up (TOOL_SLIPPED)
+     |   `--the tool weighs something else than was taken--> planned anew with what it weighs, or given up (TOOL_WEIGHT)
      `--the grasp failed--> next grasp or candidate
 
 Whatever is planned anew is verified anew, and moves only by its own verdict: each beginning of the arm asks
@@ -29,14 +30,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from magic_core import conversions, transforms
+from magic_core import conversions, masses, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description
 from magic_core.robot_pictures import link_mesh
 from magic_core.scene import UNSEEN
 from magic_core.strategy import Strategy
 from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
-from magic_server import execution, in_hand, pipeline, scene_change, seen_goal
+from magic_server import execution, in_hand, pipeline, scene_change, seen_goal, weighing
 from magic_server.after_task import After, points_of, thing
 from magic_server.arm import Arm
 from magic_server.held import Carried, Held, HeldStages
@@ -47,9 +48,12 @@ from magic_server.scene_change import Changed
 from magic_server.settings import LoopSettings
 from magic_server.stages import Server, Stages, hull_of
 from magic_server.watch import Bounds, SceneWatch, Unwatched
+from magic_server.weighing import Reading
 
 #: A picture shows what was there so many seconds before its stamp, too: several are averaged.
 SETTLED = 0.3
+#: An arm that has stopped swings for so long, s, and its torques are then read for so long, s.
+CALM, WEIGHING = 0.2, 0.3
 #: An arm is at rest where no joint has moved by more than so many rad in so many seconds.
 STILL, STILL_FOR = 0.003, 0.1
 #: A simulation is given so many times the wall's time.
@@ -79,11 +83,11 @@ class Robot(Server, Protocol):
 
 
 class Off(Exception):
-    """The tool is off in the hand: ``held`` as it is."""
+    """The tool in the hand is not what the motion was verified with: ``held`` as it is, and by which ``error``."""
 
-    def __init__(self, held: Held, deviation: in_hand.Deviation) -> None:
-        super().__init__(str(deviation))
-        self.held, self.deviation = held, deviation
+    def __init__(self, held: Held, error: MagicError) -> None:
+        super().__init__(error.message)
+        self.held, self.error = held, error
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,7 @@ class ClosedLoop:
     """Carries one goal out, looks, and goes on from what there is; :meth:`execute` raises what it ends with, unless that is success.
 
     first: what is carried out first.  Afterwards ``jobs`` holds what was carried out, the last one last, ``tried`` all outcomes of planning, ``executed`` whether
-    the last was carried out to its end, and ``notes`` what is to be told.
+    the last was carried out to its end, ``notes`` what is to be told, and ``weight`` what the tool was found to weigh, if it was.
     """
 
     def __init__(
@@ -143,10 +147,13 @@ class ClosedLoop:
         self._goal, self._calls = goal, calls
         self.jobs, self.tried = [first], [first.outcome]
         self.notes: list[str] = []
+        self.weight = ""
         self.executed = False
         self._in_hand: Held | None = None
         self._carried: Carried | None = None
         self._touched = self._may_touch = False
+        self._empty: Reading | None = None  # the arm before the fingers closed
+        self._masses: dict[str, float] = {}  # kg of tools that weigh something else than was taken, by their ids
         self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
         self._simulated = bool(server.get_parameter("use_sim_time").value)
         self._bounds = Bounds(settings.executions, settings.replans, time.monotonic() + settings.seconds)
@@ -175,7 +182,7 @@ class ClosedLoop:
             try:
                 return self._carry_out(job)
             except Off as off:
-                error = MagicError(Code.TOOL_SLIPPED, f"the tool is off in the hand by {off.deviation}")
+                error = off.error
                 self._follow(error, lambda error: self._bounds.elsewhere(error, error.code, time.monotonic()))
                 following = self._corrected(job, off.held)
             except (Changed, Unwatched) as stop:
@@ -295,6 +302,20 @@ class ClosedLoop:
                 Code.STALE_DATA, "joint_states are silent while the arm moves, for s", round(silent, 2), f"at most {allowed:g}"
             )
 
+    def closing(self) -> None:
+        """Read what the arm bears with its empty hand, to weigh what it takes up."""
+        settings, since = self._settings, self._now() + CALM
+        self._empty = None
+        if settings.look and settings.torque_error > 0 and np.isfinite(self._reading(-math.inf).torques).all():
+            self._wait(lambda: False, CALM + WEIGHING)
+            self._empty = self._reading(since)
+
+    def _reading(self, since: float) -> Reading:
+        """The arm as it stands, with what its joints have borne from a stamp on."""
+        joints = self._server.joints
+        positions = {name: joint.position for name, joint in joints.all().items()}
+        return Reading(positions, joints.efforts(self._server.robot.names, since))
+
     def closed(self) -> None:
         """The fingers have closed on the tool."""
         job = self.jobs[-1]
@@ -310,13 +331,45 @@ class ClosedLoop:
         self._held = None
 
     def look(self, point: int) -> None:
-        """Look at the tool in the hand; raises :class:`Off`, GRASP_FAILED where it lies where it lay, TOOL_SLIPPED."""
-        held, settings = self._held, self._settings
+        """Look at the tool in the hand, and weigh it; raises :class:`Off`, GRASP_FAILED where it lies where it lay, TOOL_SLIPPED."""
+        held = self._held
         assert held is not None
         scene = self._fresh()
         if scene is None:
             self._unseen("no picture came")
-            return
+            off = None
+        else:
+            off = self._off(held, scene)
+        weight = self._weighed(held)
+        if off is not None:
+            raise off if weight is None else Off(off.held, MagicError(off.error.code, f"{off.error.message}; {weight.message}"))
+        if weight is not None:
+            raise Off(held, weight)
+
+    def _weighed(self, held: Held) -> MagicError | None:
+        """What speaks against going on by the tool's weight: that it is not what the motion was verified with."""
+        if self._empty is None:
+            return None
+        name = self.jobs[-1].outcome.tool_id
+        tool = conversions.object_from_msg(held.tool, pictures=False)
+        centre = transforms.apply(transforms.inverse(held.tool_from_tcp), masses.centre(tool)[None])[0]
+        try:
+            robot, error = self._server.robot, self._settings.torque_error
+            weight = weighing.weighed(robot, error, self._empty, self._reading(self._now() - WEIGHING), centre)
+        except MagicError as failure:
+            self.notes.append(f"the tool was not weighed: {failure.message}")
+            return None
+        taken = masses.taken(self._goal.strategy, tool, self._masses.get(name, self._goal.request.tool_mass))
+        self.weight = f"the tool weighs {weight} by the arm's torques"
+        self._say(f"{self.weight}; {1000 * taken:.0f} g were taken")
+        if not self._goal.strategy.simulatable or not weight.differs(taken):
+            return None
+        self._masses[name] = max(weight.mass, weight.error)
+        return MagicError(Code.TOOL_WEIGHT, f"{self.weight}, where {1000 * taken:.0f} g were taken")
+
+    def _off(self, held: Held, scene: SceneObjectArray) -> Off | None:
+        """How the tool is off in the hand by what is seen, where that asks for another plan; raises GRASP_FAILED, TOOL_SLIPPED."""
+        settings = self._settings
         hand = self._server.hand(conversions.time_from_msg(scene.header.stamp))
         expected = held.pose(hand)
         job = self.jobs[-1]
@@ -329,17 +382,17 @@ class ClosedLoop:
                 self._held = self._carried = None
                 raise MagicError(Code.GRASP_FAILED, f"{job.outcome.tool_id} was not taken along: it lies where it lay, seen as", lying.id)
             self._unseen("the hand hides it, or too little of it is seen")
-            return
+            return None
         off = in_hand.Deviation.of(held.mesh, expected, found.world_from_tool)
         if off.within(settings.tool_shift, settings.tool_turn):
             self._say(f"the tool is in the hand as planned, off by {off}")
-            return
+            return None
         if not off.within(settings.slip_shift, settings.slip_turn):
             limit = f"at most {1000 * settings.slip_shift:g} mm and {np.degrees(settings.slip_turn):.0f} degrees"
             raise MagicError(Code.TOOL_SLIPPED, "the tool has slipped in the hand by", str(off), limit)
         self._held = Held(held.tool, transforms.inverse(found.world_from_tool) @ hand, True)
         self._carried = Carried(self._held)
-        raise Off(self._held, off)
+        return Off(self._held, MagicError(Code.TOOL_SLIPPED, f"the tool is off in the hand by {off}"))
 
     @property
     def _closing(self) -> int:
@@ -414,10 +467,12 @@ class ClosedLoop:
 
     # ------------------------------------------------------------ planning again
 
-    def _left(self) -> pipeline.Request:
-        """The request with the time that is left of the whole."""
+    def _left(self, tool_id: str = "") -> pipeline.Request:
+        """The request with the time that is left of the whole; of the tool that is named, if one is, with what it was found to weigh."""
         left = max(1.0, min(self._goal.request.timeout, self._bounds.end - time.monotonic()))
-        return replace(self._goal.request, timeout=left)
+        request = replace(self._goal.request, timeout=left)
+        tool_id = tool_id or request.tool_id
+        return replace(request, tool_mass=self._masses.get(tool_id, request.tool_mass))
 
     def _corrected(self, job: Job, held: Held) -> Job:
         """The rest of the motion, planned anew from the tool's pose as it is: the same contact first."""
@@ -426,7 +481,7 @@ class ClosedLoop:
         others = [r for r in self._goal.strategy.reflections if r != trial.reflection]
         worse = {id(c): index for index, c in enumerate(job.stages.matches.candidates)}
         outcome = self._calls.plan(
-            replace(self._left(), tool_id=job.outcome.tool_id, target_id=job.outcome.target_id),
+            replace(self._left(job.outcome.tool_id), tool_id=job.outcome.tool_id, target_id=job.outcome.target_id),
             stages,
             [trial.reflection, *others],
             # What was better than this one has failed already.
@@ -436,7 +491,8 @@ class ClosedLoop:
 
     def _anew(self) -> Job:
         """A motion from the state as it is: everything looked at and planned again."""
-        held, request, last = self._held, self._left(), self.jobs[-1].outcome
+        held, last = self._held, self.jobs[-1].outcome
+        request = self._left() if held is None else self._left(last.tool_id)
         needs = self._goal.strategy.simulatable
         since = self._now() + SETTLED
         if held is None:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from magic_core import robot
 from magic_core.errors import Code, MagicError
@@ -16,6 +20,8 @@ from magic_core.joint_history import JointHistory
 STANDSTILL = 0.05
 #: How far beyond its limit a joint may be heard to stand, rad or m: as much as the planner takes.
 RANGE = 1e-3
+#: Efforts are kept for so many seconds.
+KEPT = 1.0
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,8 @@ class Joint:
 
 
 class JointStates:
-    """The newest state of every joint, put together from messages that may each tell of some joints only; ``history`` has those before.
+    """The newest state of every joint, put together from messages that may each tell of some joints only; ``history`` has those before,
+    and the efforts of the last second are kept.
 
     Arm and gripper often come from two drivers on the same topic.
     """
@@ -38,15 +45,28 @@ class JointStates:
     def __init__(self) -> None:
         self.history = JointHistory()
         self._joints: dict[str, Joint] = {}
+        self._efforts: deque[tuple[float, dict[str, float]]] = deque()
         self._lock = threading.Lock()
 
-    def take(self, names: Sequence[str], positions: Sequence[float], velocities: Sequence[float], stamp: float, came: float) -> None:
+    def take(
+        self,
+        names: Sequence[str],
+        positions: Sequence[float],
+        velocities: Sequence[float],
+        stamp: float,
+        came: float,
+        efforts: Sequence[float] = (),
+    ) -> None:
         """Take one message in; one whose positions do not go with its names says nothing."""
         if len(positions) != len(names):
             return
         told = velocities if len(velocities) == len(names) else [math.nan] * len(names)
         with self._lock:
             self._joints.update((n, Joint(float(p), float(v), stamp, came)) for n, p, v in zip(names, positions, told))
+            if len(efforts) == len(names):
+                self._efforts.append((stamp, dict(zip(names, map(float, efforts)))))
+            while self._efforts and self._efforts[0][0] < stamp - KEPT:
+                self._efforts.popleft()
         with suppress(MagicError):  # what has no stamp was at no moment
             self.history.take(names, positions, stamp)
 
@@ -54,6 +74,13 @@ class JointStates:
         """Every joint that was heard of, by name."""
         with self._lock:
             return dict(self._joints)
+
+    def efforts(self, names: Sequence[str], since: float) -> NDArray[np.float64]:
+        """(J,): the mean effort of each joint in the states from a stamp on, Nm (N); not a number where none tells it."""
+        with self._lock:
+            told = [efforts for stamp, efforts in self._efforts if stamp >= since]
+        found = [[efforts[name] for efforts in told if name in efforts] for name in names]
+        return np.array([np.mean(values) if values else math.nan for values in found])
 
 
 def check_range(arm: Iterable[robot.Joint], joints: Mapping[str, Joint]) -> None:

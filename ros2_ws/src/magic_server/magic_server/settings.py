@@ -59,7 +59,8 @@ class LoopSettings:
     after that many nothing is begun again.  look_time: s that a picture of what has just happened is waited for; rest_time: s that
     the arm is given to come to rest when it is stopped.  tool_shift (m), tool_turn (rad): a tool that is off by no more in the hand is
     carried on as planned; slip_shift, slip_turn: one that is off by more is given up.  watch_tolerance: m that a thing may move while
-    the arm moves.  accuracy: m to which the middle of a thing is known that is seen twice.
+    the arm moves.  accuracy: m to which the middle of a thing is known that is seen twice.  torque_error: to which a joint repeats its
+    torque, Nm (N): with it the tool is weighed where it is looked at; 0: it is not.
     """
 
     look: bool = True
@@ -76,6 +77,7 @@ class LoopSettings:
     slip_turn: float = 0.5
     watch_tolerance: float = 0.03
     accuracy: float = 0.005
+    torque_error: float = 0.0
 
 
 def read(node: Node, preset: str = "") -> Settings:
@@ -189,8 +191,9 @@ def read_arm(node: Node, presence: float, finger: str) -> ArmSettings:
     )
 
 
-def read_loop(node: Node) -> LoopSettings:
-    """Declare the parameters of the closed loop and read them; raises BAD_REQUEST where a tool is given up sooner than corrected."""
+def read_loop(node: Node, preset: str = "") -> LoopSettings:
+    """Declare the parameters of the closed loop and read them, of the arm of a preset (empty: of none); raises BAD_REQUEST where a tool is
+    given up sooner than corrected."""
 
     def of(name: str, parameter_name: str, text: str, low: float | None = None, high: float | None = None) -> Any:
         return parameter(node, f"loop.{parameter_name}", getattr(LoopSettings, name), text, low=low, high=high, read_only=True)
@@ -210,6 +213,15 @@ def read_loop(node: Node) -> LoopSettings:
         slip_turn=of("slip_turn", "slip_turn", "rad beyond which a tool that is off in the hand is given up", 0.0, 3.2),
         watch_tolerance=of("watch_tolerance", "watch_tolerance", "m that a thing may move while the arm moves", 0.0, 0.5),
         accuracy=of("accuracy", "accuracy", "m to which the middle of a thing is known that is seen before and after the task", 0.0, 0.1),
+        torque_error=parameter(
+            node,
+            "loop.torque_error",
+            PRESETS[preset].torque_error if preset else 0.0,
+            "Nm to which each joint repeats the effort that joint_states tell of it: with it the tool is weighed in the hand; 0: it is not",
+            low=0.0,
+            high=20.0,
+            read_only=True,
+        ),
     )
     for small, large in (("tool_shift", "slip_shift"), ("tool_turn", "slip_turn")):
         if getattr(found, small) > getattr(found, large):

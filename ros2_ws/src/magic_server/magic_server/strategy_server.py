@@ -116,7 +116,7 @@ class StrategyServer(LifecycleNode):
         settings = self.settings = parameters.read(self, robot["preset"])
         self.robot = Description(RobotConfig(**robot))
         arm = parameters.read_arm(self, settings.presence, self.robot.fingers[0].name)
-        self._loop = parameters.read_loop(self)
+        self._loop = parameters.read_loop(self, robot["preset"] or ("" if robot["urdf"] else "panda"))
         if settings.execute and settings.recorded:
             raise MagicError(
                 Code.BAD_REQUEST, "parameters execute and recorded", "both true", "one of them: no arm is moved by a recording"
@@ -249,7 +249,7 @@ class StrategyServer(LifecycleNode):
 
     def _on_joints(self, message: JointState) -> None:
         stamp = conversions.time_from_msg(message.header.stamp)
-        self.joints.take(message.name, message.position, message.velocity, stamp, time.monotonic())
+        self.joints.take(message.name, message.position, message.velocity, stamp, time.monotonic(), message.effort)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for found in message.status:
@@ -476,6 +476,7 @@ class StrategyServer(LifecycleNode):
         goal = handle.request
         self.publication.take_back("a new run has begun")
         strategy = strategies.known(goal.strategy, self.settings.strategies or None)
+        weight = ""
         asked = _Asked(goal, strategy, self._request(goal), token, self._notifier(handle))
         looks = LOOKS if self._arm is not None and asked.request.variant == MotionPlan.ARM else 0
         stages = self._stages(asked, closer=LOOK_TIME if looks else 0.0)
@@ -513,10 +514,10 @@ class StrategyServer(LifecycleNode):
             if self._arm is not None and (published or (waived and not outcome.verified)) and outcome.plan.variant == MotionPlan.ARM:
                 loop = self._closed_loop(asked, self._arm, Job(outcome, stages, claim), waived)
                 self._carry_out(loop, result, tried[:-1])
-                outcome, stages = loop.jobs[-1].outcome, loop.jobs[-1].stages
+                outcome, stages, weight = loop.jobs[-1].outcome, loop.jobs[-1].stages, loop.weight
             break
         if result.verified and outcome.plan.variant == MotionPlan.ARM:
-            result.notes = [*result.notes, stages.weight(asked.request, outcome.reports[-1].trial, strategy)]
+            result.notes = [*result.notes, weight or stages.weight(asked.request, outcome.reports[-1].trial, strategy)]
         self._show(stages, outcome)
         if goal.want_pictures:
             result.film = stages.film(outcome.code) or Image()

@@ -10,14 +10,15 @@ import pytest
 import trimesh
 from test_execution import ACTIONS, folder  # noqa: F401  a fixture
 
-from magic_core import conversions, shapes, transforms
+from magic_core import conversions, masses, shapes, transforms
 from magic_core.errors import Code
 from magic_core.mesh import from_trimesh
 from magic_core.robot import Description
 from magic_core.scene import Scene, SceneObject
+from magic_core.strategy import find
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.srv import MatchContact
-from magic_server import seen_goal, strategy_server
+from magic_server import seen_goal, strategy_server, weighing
 from magic_server.stages import Stages
 from magic_server.testing import fakes
 from magic_server.testing.bench import Bench
@@ -77,7 +78,7 @@ def bench(shared, monkeypatch):
     shared.feedback.clear()
     arm.log.clear()
     arm.positions, arm.opening, arm.velocity, arm.tells = [0.0] * 7, 0.08, 0.0, True
-    arm.thickness = 0.03
+    arm.thickness, arm.bears = 0.03, None
     arm.on_move = lambda trajectory, canceled: (0, "")
     shared.server._loop = shared.usual
     shared.table = Table(arm)
@@ -218,6 +219,60 @@ def test_what_fails_by_one_look_is_tried_by_another_and_has_to_show_more(bench, 
     # Motions count, not their rollouts.
     assert [goal.tried for goal in asked(bench, "verify_motion")] == list(range(7)) and result.simulations == 6 * 9 + 1
     assert result.notes[0].startswith("NO_CANDIDATE_SUCCEEDED") and moves(bench) == 3
+
+
+def bears(mass):
+    """An arm that carries so many kg at the tip once its fingers have closed."""
+
+    def torques(positions, closed):
+        at = ROBOT.arm_positions(np.append(positions, [0.04, 0.04]))
+        return weighing.own_torques(ROBOT, at) + closed * mass * weighing.load_torques(ROBOT, at, np.zeros(3))
+
+    return torques
+
+
+def weight(bench):
+    """kg that the tool is taken to weigh, by the strategy's density."""
+    item = next(o for o in bench.server.scene.objects if o.id == "object_1")
+    return masses.taken(find("fake", bench.server.settings.strategies), conversions.object_from_msg(item), 0.0)
+
+
+def test_a_tool_that_weighs_what_it_was_taken_to_is_carried_on(bench):
+    bench.arm.bears = bears(weight(bench))
+    result = run(bench)
+    assert len(asked(bench, "plan_motion")) == 1 and moves(bench) == 3
+    assert len(result.notes) == 1 and "g) by the arm's torques" in result.notes[0]
+
+
+@pytest.mark.parametrize("slipped", [False, True])
+def test_a_heavier_tool_is_verified_anew_with_what_it_weighs(bench, slipped):
+    bench.arm.bears = bears(1.1)
+    bench.table.off = off(0.015 * slipped)
+    result = run(bench)
+    first, second = asked(bench, "plan_motion")
+    assert first.tool_mass == 0.0 and second.tool_mass == pytest.approx(1.1, rel=0.15) and second.tool.hanging
+    judged = asked(bench, "verify_motion")
+    assert [goal.tool_mass for goal in judged] == [0.0, second.tool_mass]
+    assert moves(bench) == 4  # to the tool, the lift, from there up again, the task
+    assert ("TOOL_SLIPPED" if slipped else "TOOL_WEIGHT") in result.notes[0] and "g were taken" in result.notes[0]
+    assert result.notes[-1].startswith("the tool weighs ") and "motions begun: 2" in result.message
+
+
+def test_what_passes_with_no_such_weight_is_not_carried_on(bench):
+    bench.arm.bears, passes = bears(1.1), bench.fakes.verify
+    bench.fakes.on_verify = lambda goal, canceled: (
+        VerifyMotion.Result(code=int(Code.GRASP_SLIPPED), message="it slips") if goal.tool_mass > 0.5 else passes(goal, canceled)
+    )
+    result = run(bench, Code.TOOL_WEIGHT, executed=False)
+    assert "by the arm's torques, where" in result.message and "GRASP_SLIPPED" in result.message
+    assert moves(bench) == 2  # to the tool and the lift
+
+
+def test_torques_that_are_none_of_this_arm_weigh_nothing(bench):
+    bench.arm.bears = lambda positions, closed: [0.1] * 7  # a driver that takes the weight of the links off
+    result = run(bench)
+    assert len(asked(bench, "plan_motion")) == 1
+    assert "the tool was not weighed: kg that the arm seems to hold" in result.notes[0] and "taken to weigh" in result.notes[1]
 
 
 def test_a_motion_planned_anew_has_its_own_verdict_or_does_not_begin(bench):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -248,7 +248,8 @@ class FakeArm(Node):
     between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code, error_string).
     ``asked`` is set by the first trajectory, which is accepted once ``admits`` is set; ``moving`` by the first accepted one.
     ``positions`` of the joints, rad, and ``velocity``, rad/s, are told at 50 Hz while ``tells`` is set, ``late`` seconds late,
-    with ``apart`` in two messages.  With ``squeezes`` the fingers close as far as they can, whatever they are told.
+    with ``apart`` in two messages.  With ``squeezes`` the fingers close as far as they can, whatever they are told.  ``bears(positions, closed)``
+    gives the joints' torques, Nm, where they are told.
     """
 
     def __init__(self, name: str = "fake_arm", thickness: float = 0.03, **kwargs: Any) -> None:
@@ -261,6 +262,7 @@ class FakeArm(Node):
         self.tells, self.squeezes = True, False
         self.late = self.velocity = 0.0
         self.apart = False
+        self.bears: Callable[[Sequence[float], bool], Sequence[float]] | None = None
         #: Where the joints are is told in the order in which they were there.
         self._telling = threading.Lock()
         self.moving, self.admits = threading.Event(), threading.Event()
@@ -294,6 +296,9 @@ class FakeArm(Node):
         stamp = self.get_clock().now().nanoseconds - int(1e9 * self.late)
         for names, positions in parts:
             message = JointState(name=names, position=positions, velocity=[self.velocity] * len(names))
+            if self.bears is not None:
+                told = dict(zip(JOINTS, self.bears(arm, self.opening < 0.05)))
+                message.effort = [float(told.get(name, 0.0)) for name in names]
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
             self._states.publish(message)
 
