@@ -44,8 +44,8 @@ HAND, BLOCK, TARGET = "hand", "block", "target"
 #: Between which factors of the densities that the strategy assumes the true ones are drawn; friction coefficients of things, of the table and of the
 #: finger pads.
 FACTOR = 2.0
-#: How many times as heavy as the strategies' wood and plastics a thing of steel is.
-STEEL = 13.0
+#: How many times as heavy as the strategies' wood and plastics a thing is that is partly of metal, and one of steel.
+METAL = (2.0, 13.0)
 FRICTION, TABLE_FRICTION, PAD_FRICTION = (0.2, 0.5), (0.25, 0.5), (0.9, 1.5)
 
 
@@ -71,7 +71,8 @@ class Scenario:
     """A strategy on some things.
 
     cases: a tool (or several) and a target each, names as :mod:`magic_verifier.cases` has them.  chosen: tool and target are to be
-    chosen, not told.  pads: what the pads' friction is multiplied by, heavier: what the tool's density is.
+    chosen, not told.  pads: what the pads' friction is multiplied by.  heavier: between which factors that is drawn by which the tool's
+    density is multiplied.
     """
 
     name: str
@@ -81,7 +82,7 @@ class Scenario:
     chosen: bool = False
     events: tuple[Event, ...] = ()
     pads: float = 1.0
-    heavier: float = 1.0
+    heavier: tuple[float, float] = (1.0, 1.0)
 
 
 def _cases(target: str, *tools: str) -> tuple[Case, ...]:
@@ -112,7 +113,7 @@ SCENARIOS = {
         Scenario(
             "slipping", "hooking", HOOKS[:1], "the tool slips in the fingers when it has been taken up", events=(Event("slip", 2, 0.5),)
         ),
-        Scenario("heavy", "hooking", HOOKS, "the tools of hooking, of steel, which the strategy does not know", heavier=STEEL),
+        Scenario("heavy", "hooking", HOOKS, "the tools of hooking, of metal, which the strategy does not know", heavier=METAL),
     )
 }
 
@@ -166,7 +167,9 @@ def draw(scenario: Scenario, case: Case, seed: int, strategies: str = "") -> Sce
         return Thing(item, kind, density * float(FACTOR ** rng.uniform(-1, 1)), float(rng.uniform(*FRICTION)))
 
     fixed = physics.target_is_fixed
-    tools = [thing(item, density=scenario.heavier * physics.tool_density) for item in layout.tools]
+    metal = np.random.default_rng([*placing.seed_of(case.name, seed), 17])
+    heavier = [float(np.exp(metal.uniform(*np.log(scenario.heavier)))) for _ in layout.tools]
+    tools = [thing(item, density=factor * physics.tool_density) for item, factor in zip(layout.tools, heavier, strict=True)]
     things = [*tools, thing(layout.target, STATIC if fixed else DYNAMIC, physics.target_density)]
     things += [thing(item, STATIC) for item in layout.fixtures]
     known = (*layout.fixtures, *((layout.target,) if fixed else ()))

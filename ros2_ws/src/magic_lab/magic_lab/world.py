@@ -80,6 +80,7 @@ class LabWorld:
         self._held = ""
         self._reference = np.eye(4)
         self._force = 0.0  # N with which the fingers close; 0: they do not
+        self._pressed = 0.0  # N with which they have closed on what they hold
         self._widths: list[float] = []
         home = np.asarray(robot.config.home, dtype=float)
         self.arm.place(home)
@@ -195,18 +196,19 @@ class LabWorld:
                 continue
             body = self.engine.component(name)
             self._grip = self.arm.grips(body, patch, friction, self._force)
-            self._held, self._force = name, 0.0
+            self._held, self._force, self._pressed = name, 0.0, self._force
             self._reference = transforms.inverse(from_pose(body.entity_pose)) @ self.tcp()
             self.arm.rest_fingers()
             return True
         return False
 
     def _watch(self, grip: Grip) -> None:
-        """Let the pads creep where the load is above what friction holds, and lose what has left them."""
+        """Let the pads creep where the load is above what friction holds, and lose what has left them: they go on closing then."""
         grip.load()
         drift = self._reference @ transforms.inverse(self.tcp()) @ self.pose(self._held)
         if np.linalg.norm(drift[:3, 3]) > LOST or transforms.rotation_angle(drift, np.eye(4)) > LOST_TURN:
             self.release()
+            self.close(self._pressed)
 
     def check(self) -> None:
         """Raise SIMULATION_EXPLODED where a free thing is nowhere, too far or too fast."""

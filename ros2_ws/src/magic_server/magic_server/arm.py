@@ -74,8 +74,8 @@ class Guard(Protocol):
     def closing(self) -> None:
         """The arm stands, its hand empty, and the fingers are about to close on the tool."""
 
-    def closed(self) -> None:
-        """The fingers have closed on the tool."""
+    def closed(self, opening: float) -> None:
+        """The fingers have closed on the tool, and are so many metres apart."""
 
     def opened(self) -> None:
         """The fingers are about to open."""
@@ -140,9 +140,9 @@ class Arm:
                     guard.closing()
                 else:
                     guard.opened()
-                self._fingers(action, token, look)
+                found = self._fingers(action, token, look)
                 if action.close:
-                    guard.closed()
+                    guard.closed(found)
 
     def _move(self, trajectory: JointTrajectory, times: list[float], move: execution.Move, token: Token) -> None:
         speed = self.settings.speed
@@ -169,7 +169,8 @@ class Arm:
         if response.status != GoalStatus.STATUS_SUCCEEDED or result.error_code != FollowJointTrajectory.Result.SUCCESSFUL:
             raise execution.controller_error(result.error_code, response.status, result.error_string)
 
-    def _fingers(self, fingers: execution.Fingers, token: Token, looked: bool) -> None:
+    def _fingers(self, fingers: execution.Fingers, token: Token, looked: bool) -> float:
+        """Open or close; metres between the fingers afterwards."""
         settings = self.settings
         opening = max(0.0, fingers.opening - settings.squeeze) if fingers.close else fingers.opening
         goal = gripper.goal(self._command, settings.gripper_joint, opening * settings.finger_scale, settings.effort)
@@ -185,3 +186,4 @@ class Arm:
             raise MagicError(
                 Code.EXECUTION_FAILED, f"the gripper did not open: mm between the fingers {1000 * found:.1f}, status {response.status}"
             )
+        return float(found)

@@ -54,6 +54,10 @@ from magic_server.weighing import Reading
 SETTLED = 0.3
 #: An arm that has stopped swings for so long, s, and its torques are then read for so long, s.
 CALM, WEIGHING = 0.2, 0.3
+#: A tool whose lowest point is nearer to the table than this, m, may rest on it in part: it turned in the fingers.
+CLEAR = 0.02
+#: Fingers that are nearer to each other than this share of what they had between them have lost it.
+LOST = 0.5
 #: An arm is at rest where no joint has moved by more than so many rad in so many seconds.
 STILL, STILL_FOR = 0.003, 0.1
 #: A simulation is given so many times the wall's time.
@@ -152,6 +156,7 @@ class ClosedLoop:
         self._in_hand: Held | None = None
         self._carried: Carried | None = None
         self._touched = self._may_touch = False
+        self._width = math.nan  # m between the fingers when they had closed
         self._empty: Reading | None = None  # the arm before the fingers closed
         self._masses: dict[str, float] = {}  # kg of tools that weigh something else than was taken, by their ids
         self._spent: list[tuple[str, NDArray[np.float64], NDArray[np.float64], int]] = []
@@ -206,6 +211,8 @@ class ClosedLoop:
     def _follow(self, error: MagicError, count: Callable[[MagicError], None]) -> None:
         """See that the arm stands and that there is another try."""
         self._at_rest(error)
+        if self._has_lost():
+            self._held = self._carried = None
         count(error)
         self._say(f"{error.code.name}: {error.message}; planning again from the state as it is")
         self.notes.append(f"{error.code.name}: {error.message}")
@@ -224,7 +231,8 @@ class ClosedLoop:
     # ------------------------------------------------------------ what the arm asks (magic_server.arm.Guard)
 
     def ask(self, point: int) -> None:
-        """Ask the rule whether the arm may begin to move from a point of its trajectory."""
+        """Ask the rule whether the arm may begin to move from a point of its trajectory; raises GRASP_FAILED where the tool has fallen out of the hand."""
+        self._refuse_lost()
         self._touched = self._touched or self._may_touch
         job = self.jobs[-1]
         outcome = job.outcome
@@ -306,7 +314,8 @@ class ClosedLoop:
         """Read what the arm bears with its empty hand, to weigh what it takes up."""
         settings, since = self._settings, self._now() + CALM
         self._empty = None
-        if settings.look and settings.torque_error > 0 and np.isfinite(self._reading(-math.inf).torques).all():
+        told = self._reading(-math.inf).torques  # of a stand-in for an arm all zero
+        if settings.look and settings.torque_error > 0 and np.isfinite(told).all() and told.any():
             self._wait(lambda: False, CALM + WEIGHING)
             self._empty = self._reading(since)
 
@@ -316,12 +325,31 @@ class ClosedLoop:
         positions = {name: joint.position for name, joint in joints.all().items()}
         return Reading(positions, joints.efforts(self._server.robot.names, since))
 
-    def closed(self) -> None:
-        """The fingers have closed on the tool."""
+    def closed(self, opening: float) -> None:
+        """The fingers have closed on the tool, and are so many metres apart."""
         job = self.jobs[-1]
         tool = next(o for o in job.stages.scene.objects if o.id == job.outcome.tool_id)
         self._held = Held(tool, conversions.pose_from_msg(job.outcome.plan.tool_from_tcp))
         self._carried = Carried(self._held, self._now(), self._server.hand())
+        self._width = opening
+
+    def _between(self) -> float:
+        """Metres between the fingers; not a number where nobody tells."""
+        robot, joints = self._server.robot, self._server.joints.all()
+        told = [joints[joint.name].position if joint.name in joints else math.nan for joint in robot.fingers]
+        return float(np.abs(np.array(told) - robot.closed).sum())
+
+    def _has_lost(self) -> bool:
+        """Whether the fingers have gone together where the tool was."""
+        return self._held is not None and self._between() < LOST * self._width
+
+    def _refuse_lost(self) -> None:
+        if self._has_lost():
+            self._held = self._carried = None
+            between = f"{1000 * self._between():.1f} mm between the fingers"
+            raise MagicError(
+                Code.GRASP_FAILED, "the tool has fallen out of the hand", between, f"about {1000 * self._width:.1f} mm, as it was taken"
+            )
 
     def opened(self) -> None:
         """The fingers are about to open: what was in the hand is where it was let go."""
@@ -331,7 +359,8 @@ class ClosedLoop:
         self._held = None
 
     def look(self, point: int) -> None:
-        """Look at the tool in the hand, and weigh it; raises :class:`Off`, GRASP_FAILED where it lies where it lay, TOOL_SLIPPED."""
+        """Look at the tool in the hand, and weigh it; raises :class:`Off`, GRASP_FAILED where it lies where it lay or has fallen out, TOOL_SLIPPED."""
+        self._refuse_lost()
         held = self._held
         assert held is not None
         scene = self._fresh()
@@ -339,19 +368,26 @@ class ClosedLoop:
             self._unseen("no picture came")
             off = None
         else:
-            off = self._off(held, scene)
-        weight = self._weighed(held)
+            try:
+                off = self._off(held, scene)
+            except MagicError as error:
+                if error.code == Code.TOOL_SLIPPED:  # a weight may be why
+                    self._weighed(held, rests=True)
+                raise
+        weight = self._weighed(held if off is None else off.held)
         if off is not None:
             raise off if weight is None else Off(off.held, MagicError(off.error.code, f"{off.error.message}; {weight.message}"))
         if weight is not None:
             raise Off(held, weight)
 
-    def _weighed(self, held: Held) -> MagicError | None:
-        """What speaks against going on by the tool's weight: that it is not what the motion was verified with."""
+    def _weighed(self, held: Held, rests: bool = False) -> MagicError | None:
+        """What speaks against going on by the tool's weight: that it is not what the motion was verified with.
+
+        Of a tool that ``rests`` on something, or may, it is known what it weighs at least: that is told, and is not enough to plan with.
+        """
         if self._empty is None:
             return None
-        name = self.jobs[-1].outcome.tool_id
-        tool = conversions.object_from_msg(held.tool, pictures=False)
+        name, tool = self.jobs[-1].outcome.tool_id, conversions.object_from_msg(held.tool, pictures=False)
         centre = transforms.apply(transforms.inverse(held.tool_from_tcp), masses.centre(tool)[None])[0]
         try:
             robot, error = self._server.robot, self._settings.torque_error
@@ -359,13 +395,27 @@ class ClosedLoop:
         except MagicError as failure:
             self.notes.append(f"the tool was not weighed: {failure.message}")
             return None
-        taken = masses.taken(self._goal.strategy, tool, self._masses.get(name, self._goal.request.tool_mass))
+        grams = 1000 * (taken := masses.taken(self._goal.strategy, tool, self._masses.get(name, self._goal.request.tool_mass)))
+        if rests or self._above_table(held) < CLEAR:
+            if weight.least > weighing.DRAWN * taken:
+                least = 1000 * weight.least
+                self.notes.append(
+                    f"the tool weighs {least:.0f} g at least by the arm's torques, where {grams:.0f} g were taken: weigh it, and give tool_mass"
+                )
+            else:
+                self.notes.append("the tool was not weighed: a part of it may rest on the table")
+            return None
         self.weight = f"the tool weighs {weight} by the arm's torques"
-        self._say(f"{self.weight}; {1000 * taken:.0f} g were taken")
+        self._say(f"{self.weight}; {grams:.0f} g were taken")
         if not self._goal.strategy.simulatable or not weight.differs(taken):
             return None
-        self._masses[name] = max(weight.mass, weight.error)
-        return MagicError(Code.TOOL_WEIGHT, f"{self.weight}, where {1000 * taken:.0f} g were taken")
+        self._masses[name] = weight.mass
+        return MagicError(Code.TOOL_WEIGHT, f"{self.weight}, where {grams:.0f} g were taken")
+
+    def _above_table(self, held: Held) -> float:
+        """How far the lowest point of the tool in the hand is above the table, m."""
+        table = conversions.plane_from_msg(self.jobs[-1].stages.scene.table)
+        return float((transforms.apply(held.pose(self._server.hand()), held.mesh.vertices) @ table[:3] + table[3]).min())
 
     def _off(self, held: Held, scene: SceneObjectArray) -> Off | None:
         """How the tool is off in the hand by what is seen, where that asks for another plan; raises GRASP_FAILED, TOOL_SLIPPED."""

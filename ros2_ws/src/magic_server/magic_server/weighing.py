@@ -44,9 +44,14 @@ class Weight:
     mass: float
     error: float
 
+    @property
+    def least(self) -> float:
+        """What it weighs at least, by two standard errors."""
+        return self.mass - 2 * self.error
+
     def differs(self, taken: float) -> bool:
-        """Whether it certainly is beyond what rollouts draw about a mass that was taken, kg."""
-        return self.mass - 2 * self.error > DRAWN * taken or self.mass + 2 * self.error < taken / DRAWN
+        """Whether there is something that certainly is beyond what rollouts draw about a mass that was taken, kg."""
+        return self.least > DRAWN * taken or (self.least > 0 and self.mass + 2 * self.error < taken / DRAWN)
 
     def __str__(self) -> str:
         return f"{1000 * self.mass:.0f} g (within {2000 * self.error:.0f} g)"

@@ -286,9 +286,30 @@ def test_a_motion_planned_anew_has_its_own_verdict_or_does_not_begin(bench):
     assert moves(bench) == 2  # to the tool and the lift
 
 
+@pytest.mark.parametrize("when", ["before the look", "on the way"])
+def test_a_tool_that_has_fallen_out_of_the_hand_is_looked_for_where_it_lies(bench, when):
+    begun = 2 if when == "before the look" else 3
+
+    def move(trajectory, canceled):
+        if moves(bench) == begun:  # the lift, or the task
+            bench.table.stays, bench.arm.opening = True, 0.0
+        if moves(bench) == begun + 1:
+            bench.table.stays = False
+        return 0, ""
+
+    bench.arm.on_move = move
+    bench.server._loop = replace(bench.usual, judge=when != "before the look", executions=2)
+    result, _ = bench.run(variant="arm", tool_id="object_1")
+    first, second = asked(bench, "plan_motion")[:2]
+    assert not first.tool.hanging and not second.tool.hanging  # nobody plans with a tool that is gone
+    assert when == "on the way" or ("the tool has fallen out of the hand" in result.notes[0] and result.code == Code.OK)
+
+
 def test_a_tool_that_has_slipped_too_far_is_given_up(bench):
     bench.table.off = off(0.036)
+    bench.arm.bears = bears(1.1)
     result = run(bench, Code.TOOL_SLIPPED, executed=False)
+    assert "g at least by the arm's torques, where 133 g were taken: weigh it" in result.notes[0]
     assert "the tool has slipped in the hand by" in result.message and "at most 30 mm" in result.message
     assert moves(bench) == 2 and len(asked(bench, "plan_motion")) == 1
 

@@ -31,7 +31,7 @@ def loop_of(told):
 def test_the_tool_is_told_from_closing_to_opening():
     told = []
     loop, tool = loop_of(told)
-    loop.closed()
+    loop.closed(0.03)
     (held,) = told
     assert held.tool is tool
     np.testing.assert_allclose(held.tool_from_tcp, TOOL_FROM_TCP, atol=1e-12)

@@ -80,6 +80,7 @@ def test_the_error_that_is_told_is_the_error_there_is():
 def test_what_is_certainly_heavier_or_lighter_than_any_rollout_drew_differs():
     assert Weight(0.5, 0.05).differs(0.25) and Weight(0.5, 0.05).differs(0.9)
     assert not Weight(0.5, 0.05).differs(0.4) and not Weight(0.5, 0.1).differs(0.25) and not Weight(0.06, 0.05).differs(0.06)
+    assert not Weight(-0.16, 0.09).differs(0.05)  # what is lighter than can be weighed
     assert str(Weight(0.512, 0.04)) == "512 g (within 80 g)"
 
 
