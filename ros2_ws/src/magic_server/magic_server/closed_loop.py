@@ -40,7 +40,7 @@ from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
 from magic_server import execution, in_hand, pipeline, scene_change, seen_goal, weighing
 from magic_server.after_task import After, points_of, thing
 from magic_server.arm import Arm
-from magic_server.held import Carried, Held, HeldStages
+from magic_server.held import Carried, Held, HeldStages, rest_of
 from magic_server.joints import STANDSTILL
 from magic_server.permission import Claim, Limits, Look, NotYet, Purpose, World, permit
 from magic_server.remote import Token
@@ -156,6 +156,7 @@ class ClosedLoop:
         self._in_hand: Held | None = None
         self._carried: Carried | None = None
         self._touched = self._may_touch = False
+        self._point = 0  # of the trajectory, where the tool was looked at last
         self._width = math.nan  # m between the fingers when they had closed
         self._empty: Reading | None = None  # the arm before the fingers closed
         self._masses: dict[str, float] = {}  # kg of tools that weigh something else than was taken, by their ids
@@ -221,7 +222,9 @@ class ClosedLoop:
         self._held, self._touched, self._may_touch = job.held, False, False
         self._carried = None if job.held is None else Carried(job.held)
         self.executed = False
-        self._arm.execute(job.outcome.plan, self._goal.token, self._say, self, job.held is not None, self._settings.look)
+        # What goes on where the tool has just been looked at may stand next where it has met the target.
+        looks = self._settings.look and not (isinstance(job.stages, HeldStages) and job.stages.goes_on(job.outcome.plan))
+        self._arm.execute(job.outcome.plan, self._goal.token, self._say, self, job.held is not None, looks)
         self.executed = True
         return self._judge(job) if self._settings.judge else ""
 
@@ -361,7 +364,7 @@ class ClosedLoop:
     def look(self, point: int) -> None:
         """Look at the tool in the hand, and weigh it; raises :class:`Off`, GRASP_FAILED where it lies where it lay or has fallen out, TOOL_SLIPPED."""
         self._refuse_lost()
-        held = self._held
+        held, self._point = self._held, point
         assert held is not None
         scene = self._fresh()
         if scene is None:
@@ -525,9 +528,21 @@ class ClosedLoop:
         return replace(request, tool_mass=self._masses.get(tool_id, request.tool_mass))
 
     def _corrected(self, job: Job, held: Held) -> Job:
-        """The rest of the motion, planned anew from the tool's pose as it is: the same contact first."""
+        """The rest of the motion, planned anew with the tool as it is, the same contact first; where no plan is found, as it was planned before.  Each has its
+        own verdict with the tool as it is."""
         trial = job.outcome.reports[-1].trial
-        stages = self._stages_in_hand(held, job.stages)
+        rest = rest_of(job.outcome.plan, self._point, held.tool_from_tcp, self._server.robot)
+        stages = HeldStages(
+            self._server,
+            self._goal.token,
+            self._goal.run,
+            self._goal.strategy.simulatable,
+            held,
+            self.jobs[-1].claim.scene.objects,
+            -math.inf,
+            job.stages,
+            (trial, rest),
+        )
         others = [r for r in self._goal.strategy.reflections if r != trial.reflection]
         worse = {id(c): index for index, c in enumerate(job.stages.matches.candidates)}
         outcome = self._calls.plan(
@@ -553,18 +568,6 @@ class ClosedLoop:
             stages = HeldStages(self._server, self._goal.token, self._goal.run, needs, held, known, since)
         outcome = self._calls.plan(request, stages, self._goal.strategy.reflections, self._made)
         return Job(outcome, stages, self._claim(outcome, stages), held)
-
-    def _stages_in_hand(self, held: Held, before: Stages) -> HeldStages:
-        return HeldStages(
-            self._server,
-            self._goal.token,
-            self._goal.run,
-            self._goal.strategy.simulatable,
-            held,
-            self.jobs[-1].claim.scene.objects,
-            -math.inf,
-            before,
-        )
 
     def _claim(self, outcome: pipeline.Outcome, stages: Stages) -> Claim:
         return self._calls.claim(outcome, stages) if outcome.code == Code.OK else self.jobs[-1].claim

@@ -16,7 +16,9 @@ from sensor_msgs.msg import PointCloud2
 from magic_core import conversions, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_interfaces.msg import SceneObject, SceneObjectArray
+from magic_core.motion import Phase, ToolMotion
+from magic_core.robot import Description
+from magic_interfaces.msg import MotionPlan, SceneObject, SceneObjectArray
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, scene_change
 from magic_server.in_hand import Shape
@@ -92,11 +94,36 @@ class Carried:
         return self.held.hull(hand(stamp))
 
 
+def rest_of(plan: MotionPlan, point: int, tool_from_tcp: NDArray[np.float64], robot: Description) -> MotionPlan:
+    """What is left of an arm's motion from a point of its trajectory on, where it stands, with the tool in the hand as it is: tool_from_tcp (4, 4)."""
+    arm, begin = plan.arm_trajectory, conversions.time_from_msg(plan.arm_trajectory.points[point].time_from_start)
+    rest = MotionPlan(variant=plan.variant, grasp_width=plan.grasp_width, grasp_time=0.0, release_time=plan.release_time - begin)
+    rest.tool_from_tcp = conversions.pose_to_msg(tool_from_tcp)
+    rest.phases = [copy.copy(phase) for phase in plan.phases if phase.end > begin]
+    for phase in rest.phases:
+        phase.start, phase.end = max(0.0, phase.start - begin), phase.end - begin
+    rest.arm_trajectory.header, rest.arm_trajectory.joint_names = arm.header, arm.joint_names
+    times = np.array([conversions.time_from_msg(p.time_from_start) for p in arm.points[point:]]) - begin
+    for time_, row in zip(times, arm.points[point:], strict=True):
+        row = copy.copy(row)
+        row.time_from_start = conversions.duration_to_msg(time_)
+        rest.arm_trajectory.points.append(row)
+    first = rest.arm_trajectory.points[0]
+    first.velocities, first.accelerations = [0.0] * len(first.velocities), [0.0] * len(first.accelerations)
+    poses = robot.forward(np.array([row.positions for row in arm.points[point:]])) @ transforms.inverse(tool_from_tcp)
+    if not math.isnan(rest.release_time):  # from there on it stays where it was let go
+        poses[times > rest.release_time] = poses[times <= rest.release_time][-1]
+    phases = tuple(Phase(phase.name, phase.start, phase.end) for phase in rest.phases)
+    tool_id, frame = plan.tool_trajectory.joint_names[0], plan.tool_trajectory.header.frame_id
+    rest.tool_trajectory = conversions.tool_motion_to_msg(ToolMotion(times, poses, phases), tool_id, frame)
+    return rest
+
+
 class HeldStages(Stages):
     """The stages of a run with the tool in the hand: nothing is grasped, and the tool is matched by its view from before.
 
     ``known``: ids of the other things.  ``before``: whose contacts are kept, for a scene that is as it was; else the target is looked at
-    and matched anew.
+    and matched anew.  ``rest``: a trial, and what is left of its motion, which is tried where no other can be planned from there.
     """
 
     def __init__(
@@ -109,10 +136,11 @@ class HeldStages(Stages):
         known: Collection[str],
         since: float,
         before: Stages | None = None,
+        rest: tuple[pipeline.Trial, MotionPlan] | None = None,
     ) -> None:
         super().__init__(server, token, run, needs_verifier, heatmap=False, since=since)
         self.held, self._known = held, frozenset(known)
-        self._kept = before
+        self._kept, self._rest = before, rest
         self._tool = held.tool
 
     def perceive(self, request: pipeline.Request, timeout: float) -> tuple[pipeline.Request, str]:
@@ -176,6 +204,21 @@ class HeldStages(Stages):
         sentence = f"{len(answer.candidates)} candidates for {request.target_id}, the tool is in the hand, {answer.features} features"
         self._matches = pipeline.Matches(answer.candidates, request.target_id, answer.features, None, sentence)
         return self._matches
+
+    def plan(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> pipeline.Planned:
+        """Ask the planner, and where it finds nothing for the trial that was under way take what is left of that."""
+        planned = super().plan(request, matches, trial, timeout)
+        if self._rest is None or planned.code == Code.OK or planned.code in pipeline.FATAL:
+            return planned
+        before, rest = self._rest
+        if trial.candidate is not before.candidate or trial.reflection != before.reflection:
+            return planned
+        sentence = f"no other motion from there ({planned.code.name}: {planned.message}); the rest of the one begun, with the tool as it is"
+        return pipeline.Planned(Code.OK, sentence, rest)
+
+    def goes_on(self, plan: MotionPlan) -> bool:
+        """Whether a plan is what was left of the motion before, and not another one."""
+        return self._rest is not None and plan is self._rest[1]
 
     def _same_target(self, target_id: str) -> None:
         """The contact on the target is told in its own frame, which the matcher may have from a newer scene than this run's: take that

@@ -286,6 +286,34 @@ def test_a_motion_planned_anew_has_its_own_verdict_or_does_not_begin(bench):
     assert moves(bench) == 2  # to the tool and the lift
 
 
+@pytest.mark.parametrize("passes", [True, False])
+def test_where_no_other_plan_is_found_the_rest_of_the_motion_is_tried_with_the_tool_as_it_is(bench, passes):
+    bench.table.off = off(0.015, 0.1)
+
+    def plan(goal, canceled):
+        return PlanMotion.Result(code=int(Code.PATH_IN_COLLISION), message="no way") if goal.tool.hanging else plans(goal, canceled)
+
+    def verify(goal, canceled):
+        passed = passes or not goal.tool.hanging
+        return fakes.FakeServers.verify(goal, canceled) if passed else VerifyMotion.Result(code=int(Code.DRIFT), message="it drifts")
+
+    bench.fakes.on_plan, bench.fakes.on_verify = plan, verify
+    result = run(bench, *(() if passes else (Code.TOOL_SLIPPED, False)))
+    first, *judged = asked(bench, "verify_motion")
+    assert len(judged) == 1  # nothing is left of the other candidate
+    rest = conversions.plan_from_msg(judged[0].plan)
+    before = conversions.plan_from_msg(first.plan)
+    after = before.arm_motion.times >= 2.0  # where the lift ends
+    np.testing.assert_allclose(rest.arm_motion.positions, before.arm_motion.positions[after])
+    np.testing.assert_allclose(rest.arm_motion.times, before.arm_motion.times[after] - 2.0)
+    assert rest.arm_motion.grasp_time == 0.0 and rest.tool_motion.phases[-1].end == pytest.approx(before.tool_motion.phases[-1].end - 2.0)
+    seen = conversions.pose_from_msg(judged[0].tool.pose)
+    np.testing.assert_allclose(rest.tool_motion.world_from_tool[0], seen, atol=1e-3)
+    hands = ROBOT.forward(rest.arm_motion.positions)
+    np.testing.assert_allclose(rest.tool_motion.world_from_tool @ rest.arm_motion.tool_from_tcp, hands, atol=1e-6)
+    assert moves(bench) == 2 + passes and ("DRIFT" in result.message) == (not passes)
+
+
 @pytest.mark.parametrize("when", ["before the look", "on the way"])
 def test_a_tool_that_has_fallen_out_of_the_hand_is_looked_for_where_it_lies(bench, when):
     begun = 2 if when == "before the look" else 3
