@@ -24,8 +24,10 @@ HEIGHTS, PASSES = 10, 7
 CLOSER = 4
 #: Points on each other thing for the first test of the hand.
 POINTS = 200
-#: Grasps whose hand comes within so many metres of where the target lies in the tool stand back by so much: the target rolls about there.
-BESIDE, BACK = 0.01, 5.0
+#: Grasps whose hand comes within so many metres of where the target lies in the tool stand back by so much: the target rolls about there.  So do
+#: those whose open hand comes within so many metres of the tool, as it is that far off where it was sent: what it brushes is pushed over, or
+#: dragged along, before the fingers close.
+BESIDE, BRUSHED, BACK = 0.01, 0.002, 5.0
 
 
 class GraspChoice:
@@ -69,7 +71,7 @@ class GraspChoice:
             blocked: dict[str, int] = {}
             free = collision_free(
                 self.robot,
-                self._beside_target(grasps),
+                self._with_room(grasps),
                 self.request.tool,
                 self._checks(),
                 blocked,
@@ -135,17 +137,21 @@ class GraspChoice:
         poses = request.poses[request.keys]
         return grip_at_rest(self.robot, self.grasping, request.tool, frames, self.tool_from_contact, poses, pushed)
 
-    def _beside_target(self, grasps: list[Grasp]) -> list[Grasp]:
-        """The grasps, those last whose hand would be in the way of a target that the tool takes along.  A ball that is met with a scoop's lip
-        rolls on to the place that was matched, and lay on the fingers there."""
-        if self.tool_from_target is None or self.fixed:
-            return grasps
-        hand, target = self.robot.hand_body(), Body(self.request.target.id, grown(solid_pieces(self.request.target), BESIDE))
-        target.move(self.tool_from_target)
+    def _with_room(self, grasps: list[Grasp]) -> list[Grasp]:
+        """The grasps, those last whose hand would be in the way of a target that the tool takes along, or hardly has room for the tool.  A ball that
+        is met with a scoop's lip rolls on to the place that was matched, and lay on the fingers there."""
+        hand, wide = self.robot.hand_body(), Body("hand", grown(self.robot.hand.values(), BRUSHED))
+        tool = Body(self.request.tool.id, solid_pieces(self.request.tool))
+        pairs = [(wide, tool)]
+        if self.tool_from_target is not None and not self.fixed:
+            target = Body(self.request.target.id, grown(solid_pieces(self.request.target), BESIDE))
+            target.move(self.tool_from_target)
+            pairs.append((hand, target))
 
         def in_the_way(grasp: Grasp) -> bool:
             hand.move(grasp.tool_from_tcp)
-            return hand.touches(target)
+            wide.move(grasp.tool_from_tcp)
+            return any(one.touches(other) for one, other in pairs)
 
         # In the order that they have, which is not quite that of their costs.
         costs = np.maximum.accumulate([grasp.cost for grasp in grasps])

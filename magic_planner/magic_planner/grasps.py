@@ -1,8 +1,9 @@
 """Antipodal grasps of a tool, chosen with the whole motion in view.
 
 Grasps are found on the tool's convex pieces, the shape that the physics grips too:
-a line through a surface point along its normal leaves the union of the pieces at
-the opposite finger.  That is robust to holes and flipped faces in the mesh.
+a line through a surface point along its normal leaves the last of the pieces
+between the fingers at the opposite one.  That is robust to holes and flipped faces in
+the mesh.
 
 The frame of a grasp is the arm's tip frame: z out of the hand, y (or x, by
 configuration) along the fingers' closing, the origin between the fingertips.
@@ -22,7 +23,7 @@ from magic_core.mesh import Mesh
 from magic_core.scene import SceneObject
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, hull, mass_centre, solid, solid_pieces
-from magic_planner.lines import crossings, through
+from magic_planner.lines import between, crossings
 from magic_planner.robot import Robot
 
 #: Sine of the slope up to which fingers are made to close level, which turns them against the faces by as much.
@@ -134,17 +135,19 @@ def antipodal(
     rng: np.random.Generator,
     up: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces.
+    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces: two opposite faces with
+    nothing else of it beside them between open fingers, though there may be a gap within.  Of a ring as narrow as the hand opens they are the two outer
+    sides, of which one finger would meet the other first that is to close on one side of it.
 
     up (3,): out of the table on which the pieces lie.  Few points are spent on faces across it, where a finger has no room below.
     """
     points, normals = surface(pieces, settings.samples, rng, up)
     if not len(points):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-    width, exit_normal, inside = through(solid(pieces), points, -normals)
+    width, exit_normal, crowded = between(solid(pieces), points, -normals, opening)
     faces_back = np.einsum("ij,ij->i", -normals, exit_normal) >= settings.agreement
     fits = (width > 1e-3) & (width <= opening - 2 * settings.margin)
-    keep = ~inside & faces_back & fits
+    keep = ~crowded & faces_back & fits
     return points[keep] - normals[keep] * width[keep, None] / 2, -normals[keep], width[keep]
 
 
@@ -390,16 +393,18 @@ class Patches:
 
 
 def _centred(robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Grasps (G, 4, 4) moved, within the plane of the pads, so that the middles of what the pads touch come to their middles; and
-    by how much (G,), metres."""
+    """Grasps (G, 4, 4) moved so that the middles of what the pads touch come to their middles, and that they touch it at the same time: the one
+    that is first would push the tool on to the other; and by how much (G,), metres."""
     if not len(frames):
         return frames, np.zeros(0)
     patches = Patches.of(robot, frames, pieces)
     shift = np.where(patches.there[:, None], patches.middles().mean(axis=1), 0.0)
+    first = np.where(patches.there[:, None], patches.first, 0.0)
+    aside = (first[:, :1] - first[:, 1:]) / 2
     index = "xy".index(robot.config.closing_axis)
     result = frames.copy()
-    result[:, :3, 3] += shift[:, :1] * frames[:, :3, 1 - index] + shift[:, 1:] * frames[:, :3, 2]
-    return result, np.linalg.norm(shift, axis=1)
+    result[:, :3, 3] += aside * frames[:, :3, index] + shift[:, :1] * frames[:, :3, 1 - index] + shift[:, 1:] * frames[:, :3, 2]
+    return result, np.linalg.norm(np.concatenate([aside, shift], axis=1), axis=1)
 
 
 def _misfit(

@@ -96,3 +96,30 @@ def through(pieces: Solid, points: Array, directions: Array) -> tuple[Array, Arr
         further = going[now_lines] & (leave[now] > length[now_lines])
         length[now_lines[further]], normal[now_lines[further]] = leave[now[further]], out[now[further]]
     return length, normal, inside
+
+
+def between(pieces: Solid, points: Array, directions: Array, opening: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """What two fingers ``opening`` metres apart close on, along lines (N, 3), (N, 3) from a surface into the convex pieces: the last face
+    between them, where the middle of the fingers is that of the line from the surface to that face.
+
+    Returns the length (N,) of that line, gaps between the pieces counted, the outward normal (N, 3) of that face, and whether the start is none
+    of a surface, or a piece lies before it between the fingers.
+    """
+    length, normal, before = through(pieces, points, directions)
+    found = list(crossings(pieces, points[:, None], directions))
+    if not found:
+        return length, normal, before
+    lines = np.concatenate([c.lines for c in found])
+    enter, leave = np.concatenate([c.enter for c in found]), np.concatenate([c.leave for c in found])
+    out = np.concatenate([c.out for c in found])
+    real = leave > enter + 1e-4
+    lines, enter, leave, out = lines[real], enter[real], leave[real], out[real]
+    while True:  # what else is between the fingers moves their middle, and they reach further
+        further = (leave > length[lines] + 1e-9) & (enter > 0) & (enter < (length[lines] + opening) / 2)
+        if not further.any():
+            break
+        order = np.argsort(leave[further], kind="stable")
+        now = lines[further][order]
+        length[now], normal[now] = leave[further][order], out[further][order]
+    before[lines[(enter < -3e-4) & (leave > (length[lines] - opening) / 2) & (leave < 0)]] = True
+    return length, normal, before

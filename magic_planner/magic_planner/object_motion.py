@@ -48,6 +48,9 @@ STEP_ANGLE = np.deg2rad(2.0)
 TABLE_CLEARANCE, LOW_SHARE, BENEATH_SHARE = 0.001, 0.2, 0.05
 #: A tool is beneath its target where its side at the contact faces up by at least so much (cosine).
 BENEATH = 0.7
+#: What comes so near (m) to the sides of a target that is met is to be beside it; into how many sectors about it that is parted; how far (m) within
+#: a side the lower end of it is looked for.
+TOUCHED, SECTORS, INSIDE = 0.003, 36, 0.0005
 #: By so much (rad) a tool is turned out of the attitude in which its contact was seen, where it would pass over its target in that.
 LEVELLED = np.deg2rad(45.0)
 #: How quickly the tool takes up and loses its speed between waypoints, m/s^2.
@@ -118,6 +121,8 @@ def plan_tool_motion(
     shown = demonstrated_motion(strategy) if strategy.mode == "retarget" else None
     beneath = shown is not None and _ends_beneath(world_from_contact @ shown[1], plane)
     clearance = _above_table(target, plane, gap, BENEATH_SHARE if beneath else LOW_SHARE)
+    if not beneath:
+        clearance = _beside(tool, tool_from_contact, target, world_from_contact, plane, clearance)
     if not candidate.companions:
         tool_from_contact = _not_over(tool, tool_from_contact, target, world_from_contact, plane, clearance)
     pairs = further_pairs(strategy, candidate, reflection, tool_from_contact)
@@ -185,6 +190,47 @@ def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float, sh
     pieces = np.concatenate([piece.vertices for piece in solid_pieces(target)])
     height = float((transforms.apply(target.world_from_object, pieces) @ plane[:3] + plane[3]).max())
     return max(TABLE_CLEARANCE, min(gap, share * height))
+
+
+def _beside(
+    tool: SceneObject,
+    tool_from_contact: NDArray[np.float64],
+    target: SceneObject,
+    world_from_contact: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    clearance: float,
+) -> float:
+    """The gap (m) to the table, ``clearance`` or less where the table raises parts of the tool that are to be beside the target until little of them
+    is: no more than a share of what the target rises above the lower side of each where the tool is led without any gap.  The stem of a hook that
+    stands on its plate was led over a cylinder."""
+    import trimesh
+
+    up, points = plane[:3], outer_points(tool)
+    met = world_from_contact @ OPPOSED @ transforms.inverse(tool_from_contact)
+    raised = lift_above(plane, met[None], points, clearance) > 0
+    if clearance <= TABLE_CLEARANCE or not raised or abs(world_from_contact[:3, 0] @ up) > BENEATH:
+        return clearance
+    met[2, 3] += lift_above(plane, met[None], points, 0.0)
+    wall = concatenate([Mesh(*hull(piece.vertices)) for piece in solid_pieces(target)]).transformed(target.world_from_object)
+    body = concatenate([Mesh(*hull(piece.vertices)) for piece in solid_pieces(tool)])
+    on = transforms.apply(met, np.asarray(trimesh.sample.sample_surface(body.to_trimesh(), ROOM_POINTS, seed=0)[0]))
+    heights = on @ up + plane[3]
+    level = float(world_from_contact[:3, 3] @ up + plane[3])
+    near = Raycaster([wall]).distances(on + (level - heights)[:, None] * up) < TOUCHED
+    on, heights = on[near], heights[near]
+    # Sector by sector about the target: a part that is low on one side of it says nothing of the other side.
+    away = on - wall.vertices.mean(axis=0)
+    away -= (away @ up)[:, None] * up
+    first = transforms.unit(world_from_contact[:3, 0] - (world_from_contact[:3, 0] @ up) * up)
+    sector = np.floor(np.arctan2(away @ np.cross(up, first), away @ first) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
+    # The tool's lower side there, a little within what faces the target.
+    below = on + INSIDE * away / np.linalg.norm(away, axis=1, keepdims=True) - (heights + INSIDE)[:, None] * up
+    hit = Raycaster([body.transformed(met)]).cast(below, np.tile(up, (len(below), 1))).distance - INSIDE
+    lowest_of = np.full(SECTORS, np.inf)
+    np.minimum.at(lowest_of, sector, np.minimum(heights, hit))
+    rises = float((wall.vertices @ up).max() + plane[3]) - lowest_of
+    rises = rises[np.isfinite(rises) & (rises > 0)]
+    return clearance if not len(rises) else max(TABLE_CLEARANCE, min(clearance, LOW_SHARE * float(rises.min())))
 
 
 def _not_over(

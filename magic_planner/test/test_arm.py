@@ -86,6 +86,23 @@ def test_the_hand_leaves_room_for_the_target_in_the_tool(arm):
     np.testing.assert_array_equal(best(transforms.make(translation=[0, 0, 1.0])), anywhere)
 
 
+def test_hands_that_would_brush_the_tool_come_last(arm):
+    """A hand is a millimetre or two off where it was sent: a light tool that it brushes is gone before the fingers close."""
+    strategy, tool, target, candidate, reflection, motion = problem()
+    request = arm._request(Problem(strategy, tool, target, candidate, reflection, motion), Budget(), lambda stage, message: None)
+    choice = GraspChoice(arm.robot, arm.grasping, arm.settings, request, tool_contact_frame(candidate, reflection))
+    roomy = next(choice.lots())[0]
+    deep = roomy.tool_from_tcp.copy()
+    hand, body = arm.robot.hand_body(), Body("tool", solid_pieces(tool))
+    while True:  # as deep as it can come
+        hand.move(deep @ transforms.make(translation=[0, 0, 0.0005]))
+        if hand.touches(body):
+            break
+        deep = deep @ transforms.make(translation=[0, 0, 0.0005])
+    close = dataclasses.replace(roomy, tool_from_tcp=deep, cost=roomy.cost - 1)
+    assert choice._with_room([close, roomy]) == [roomy, close]
+
+
 def test_the_contact_is_reached_at_the_end_of_its_phase(solved):
     (_, _, target, candidate, _, _), plan = solved
     when = span(plan, "contact").end

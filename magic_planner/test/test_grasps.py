@@ -59,6 +59,18 @@ def test_pieces_that_abut_are_one_body():
     assert set(np.round(pairs(stacked)[2], 6)) == {0.03, 0.04}
 
 
+def test_a_fork_is_gripped_by_both_prongs():
+    """Fingers open wider than the gap do not get in between: to close on one prong one of them would push the other."""
+    prongs = [scenes.box([0.2, 0.008, 0.02], [0, y, 0]) for y in (-0.014, 0.014)]
+    _, closing, widths = pairs([*prongs, scenes.box([0.02, 0.02, 0.02], [-0.09, 0, 0])])
+    across = np.abs(closing[:, 1]) > 0.99
+    assert across.any()
+    np.testing.assert_allclose(widths[across], 0.036, atol=1e-9)
+    apart = [scenes.box([0.2, 0.008, 0.02], [0, y, 0]) for y in (-0.05, 0.05)]
+    widths = pairs(apart)[2]
+    assert np.isclose(widths, 0.008).any() and widths.max() < 0.021, "a prong alone, where the other is not between the fingers"
+
+
 def test_slanted_faces_count_only_as_far_as_the_normals_agree():
     wedge = scenes.box([0.1, 0.04, 0.04])
     vertices = wedge.vertices.copy()
@@ -166,6 +178,14 @@ def test_a_grip_by_the_edge_of_the_pads_is_moved_to_their_middle(arm):
     assert shift[0] < 0.0025 < 0.003 < shift[1]
     np.testing.assert_allclose(moved[:, :2, 3], 0, atol=1e-6)
     assert _misfit(arm.robot, moved[1:], np.array([0.02]), bar)[0] < _misfit(arm.robot, frames[1:], np.array([0.02]), bar)[0]
+
+
+def test_a_grip_that_one_pad_would_begin_is_moved_to_where_both_meet_the_tool(arm):
+    bar = [scenes.box([0.2, 0.02, 0.02])]
+    frames = np.stack([transforms.make(translation=aside * arm.robot.closing) for aside in (0.0, 0.006, -0.009)])
+    moved, shift = _centred(arm.robot, frames, bar)
+    np.testing.assert_allclose(moved[:, :3, 3] @ arm.robot.closing, 0, atol=1e-6)
+    np.testing.assert_allclose(shift, [0, 0.006, 0.009], atol=1e-6)
 
 
 def test_what_the_edge_of_the_pads_holds_is_lost_by_a_small_shift(arm):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from magic_core import transforms
 from magic_planner.collision import solid
-from magic_planner.lines import crossings, through
+from magic_planner.lines import between, crossings, through
 
 
 def piece(turn, at, sides):
@@ -62,4 +62,22 @@ def test_pieces_that_abut_are_gone_through_as_one():
     row = solid([piece((0, 0, 0), (x, 0, 0), (0.02, 0.02, 0.02)) for x in (0.0, 0.02, 0.05)])
     length, normal, _ = through(row, np.array([[-0.01, 0.001, 0.002]]), np.array([[1.0, 0, 0]]))
     assert length[0] == pytest.approx(0.04, abs=1e-6)  # the third one is 10 mm behind
+    np.testing.assert_allclose(normal[0], [1, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("start", "opening", "length", "beside"),
+    [
+        (-0.01, 0.09, 0.07, False),
+        (-0.01, 0.05, 0.02, False),
+        (-0.01, 0.5, 0.27, False),
+        (0.04, 0.09, 0.02, True),
+        (0.04, 0.04, 0.02, False),
+    ],
+)
+def test_fingers_close_on_the_last_face_between_them(start, opening, length, beside):
+    """Two bars with a gap of 30 mm, and one far from both: of a line from the first or the second, however wide fingers about it are open."""
+    bars = solid([piece((0, 0, 0), (x, 0, 0), (0.02, 0.1, 0.02)) for x in (0.0, 0.05, 0.25)])
+    found, normal, before = between(bars, np.array([[start, 0.001, 0.002]]), np.array([[1.0, 0, 0]]), opening)
+    assert found[0] == pytest.approx(length, abs=1e-6) and before[0] == beside
     np.testing.assert_allclose(normal[0], [1, 0, 0], atol=1e-6)

@@ -144,6 +144,20 @@ def test_a_tool_in_a_gripper_keeps_off_the_table_as_off_other_things_and_meets_a
     assert lowest == pytest.approx(above, abs=1e-6)
 
 
+@pytest.mark.parametrize(("high", "above"), [(0.018, 0.0024), (0.025, TABLE_CLEARANCE), (0.010, 0.0036)])
+def test_a_stem_that_the_table_holds_up_is_not_led_over_its_target(high, above):
+    """A plate on edge and the stem that it carries, whose lower side is ``high`` over the plate's: the target, 30 mm high, is to be met by both."""
+    strategy, _tool, _, _ = setup()
+    plate, stem = scenes.box([0.004, 0.08, 2 * high + 0.006]), scenes.box([0.1, 0.006, 0.006], [-0.05, 0, 0])
+    tool = scenes.item("tool", [plate, stem], transforms.make(translation=[0.45, 0.25, high + 0.003]), scenes.DOWN)
+    contact = scenes.contact(scenes.DOWN, [-0.002, 0.003, 0], [-np.sqrt(0.5), np.sqrt(0.5), 0])
+    target, target_contact = scenes.standing_cylinder(0.015)
+    motion = plan_tool_motion(strategy, tool, target, scenes.candidate(tool, contact, target_contact), "keep", TABLE, gap=0.004)
+    vertices = np.concatenate([p.vertices for p in tool.pieces])
+    lowest = min(transforms.apply(pose, vertices)[:, 2].min() for pose in motion.world_from_tool)
+    assert lowest == pytest.approx(above, abs=1e-4)
+
+
 @pytest.mark.parametrize(("turn", "above"), [(90, 0.002), (30, 0.004)])
 def test_a_tool_that_goes_beneath_its_target_keeps_closer_to_the_table(turn, above):
     """A scoop: gap and lip together have to stay well below the target's middle, 20 mm above the table here."""
