@@ -453,7 +453,8 @@ class Matcher:
         around = room_for(task.asked, contour, radius)
         if around is not None and radius is not None and task.asked.hollow is not None:
             curves = holding.centres(around, radius)
-            pairs = [(p, _steadied(task.asked, contour, p, e, radius, curves)) for p, e in pairs]
+            floor = (asked or task.asked).floor  # a place that shows less is held no less surely
+            pairs = [(p, _steadied(task.asked, floor, contour, p, e, radius, curves)) for p, e in pairs]
         refused = refusals(
             asked or task.asked,
             contour,
@@ -533,10 +534,11 @@ def _in_proportion(task: _Task, view: CanonicalView, contour: Contour, proposal:
 
 
 def _steadied(
-    asked: Demands, contour: Contour, proposal: Proposal, found: curvature.Estimate, radius: float, curves: holding.Curves
+    asked: Demands, floor: float, contour: Contour, proposal: Proposal, found: curvature.Estimate, radius: float, curves: holding.Curves
 ) -> curvature.Estimate:
-    """An estimate whose place and normal are those by which the target is held surely, where a hollow is asked for (:func:`holding.steadied`)."""
-    if asked.hollow is None or found.concave != asked.concave or not proposal.similarity >= asked.floor:
+    """An estimate whose place and normal are those by which the target is held surely, where a hollow is asked for (:func:`holding.steadied`) and
+    the place is similar enough (``floor``)."""
+    if asked.hollow is None or found.concave != asked.concave or not proposal.similarity >= floor:
         return found
     held = holding.steadied(contour, found.point, found.normal, radius, curves, asked.hollow)
     return found if held is None else replace(found, point=held[0], normal=held[1])

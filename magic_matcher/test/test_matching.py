@@ -16,7 +16,7 @@ from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.views import find_view, view_of_contact
 from magic_matcher import contour, curvature, features, jobs, matching, plain, plausible, targets
 from magic_matcher.cache import Cache
-from magic_matcher.global_stage import make_reference
+from magic_matcher.global_stage import Proposal, make_reference
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +207,21 @@ def test_a_shallow_hollow_will_do_where_a_simulation_judges(matcher):
     (refusal,) = plausible.refusals(plausible.lesser(asked), c, point, normal * [-1.0, 1.0], *given[3:])
     assert refusal.what == "depth of the hollow"
     assert plausible.lesser(plausible.Demands(True, 0.3, None, None)).hollow is None
+
+
+def test_a_place_that_shows_less_is_held_as_surely(matcher):
+    """A bar with a wide head, and a disc twice as large as the step between them: however like the demonstrated one it is said to be, it is pulled towards
+    the step's end."""
+    mask = np.zeros((500, 500), bool)
+    mask[200:230, 60:300] = mask[178:230, 300:400] = True
+    view = CanonicalView(np.zeros((500, 500, 3), np.uint8), mask, 0.001, np.eye(4), "top")
+    reference, contact = reference_of("hooking", "l_hook", "inner", 3, 0.025)
+    task = matcher._task(reference, contact, jobs.disc_target(0.045, "top"), 0.025, 3)
+    places = [Proposal(np.array([299.0, 200.0]), 0.0, False, share * matcher.backend.floor) for share in (1.1, 0.9)]
+    tool, shape = matching.Tool("tool", view), contour.extract(mask)
+    alike, less = matcher._refine(task, tool, view, shape, 45.0, places, plausible.lesser(task.asked))[0]
+    np.testing.assert_allclose(less.tool.normal, alike.tool.normal)
+    assert np.degrees(np.arctan2(-alike.tool.normal[1], -alike.tool.normal[0])) > 58, "13 degrees and more past the corner's bisector"
 
 
 def test_other_views_make_up_the_candidates(matcher):
