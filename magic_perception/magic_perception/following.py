@@ -37,7 +37,7 @@ from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception.paths import CLEAR, Seen, State, changed, likeliest, moved, predicted
-from magic_perception.reshaped import Aside, Picture, Reshaping
+from magic_perception.reshaped import Aside, Picture, Reshaping, raycaster
 from magic_perception.tool_colors import Said, ToolColors, lab
 
 Array = NDArray[np.float64]
@@ -92,13 +92,14 @@ UNSURE = (0.006, np.deg2rad(5.0))
 @dataclass(frozen=True)
 class Followed:
     """times (T,) of the moments, s; world_from_tool (T, 4, 4); shift (T,) m and turn (T,) rad: standard deviations, of the worst direction;
-    seen: moments in which the tool was found."""
+    seen: moments in which the tool was found; surface: how the tool's own is mended by the pictures."""
 
     times: Array
     world_from_tool: Array
     shift: Array
     turn: Array
     seen: int
+    surface: Reshaping
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class Follower:
     """
 
     def __init__(self, mesh: Mesh, world_from_tool: Array, table: Array, others: Sequence[Mesh] = (), seed: int = 0) -> None:
-        self._scene = _raycaster(mesh)
+        self._scene = raycaster(mesh)
         self._others = tuple(others)
         sampled = mesh.to_trimesh()
         rng = np.random.default_rng(seed)
@@ -129,7 +130,8 @@ class Follower:
         face = rng.choice(len(areas), SURFACE, p=areas / areas.sum())
         self._points = np.einsum("ni,nij->nj", rng.dirichlet(np.ones(3), SURFACE), corners[face])
         self._normals = crosses[face] / areas[face][:, None]
-        self.middle = mesh.bounds.mean(axis=0)
+        self._bounds = mesh.bounds
+        self.middle = self._bounds.mean(axis=0)
         self._radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
         self._table = np.asarray(table, dtype=float)
         self._lying = np.asarray(world_from_tool, dtype=float)
@@ -210,21 +212,22 @@ class Follower:
         depth = self._scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
         return _View(slice(int(v0), int(v1)), slice(int(u0), int(u1)), np.isfinite(depth), depth)
 
-    def _distance(self, points: Array, pose: Array) -> tuple[Array, Array]:
-        """Signed distance (N,) of world points from the surface, and its gradient (N, 3) in the world."""
-        local = transforms.apply(transforms.inverse(pose), points).astype(np.float32)
-        tensor = o3d.core.Tensor(local)
-        closest = self._scene.compute_closest_points(tensor)
-        foot = closest["points"].numpy().astype(float)
-        signed = self._scene.compute_signed_distance(tensor).numpy().astype(float)
-        away = local - foot
+    def _near(self, points: Array, pose: Array, reach: float) -> tuple[Array, Array, Array]:
+        """Those of world points (M, 3) that are nearer than ``reach`` to the surface, their signed distance (M,) and its gradient (M, 3) in the world."""
+        local = transforms.apply(transforms.inverse(pose), points)
+        # What is farther from the mesh's box is farther from the mesh.
+        boxed = ((local > self._bounds[0] - reach) & (local < self._bounds[1] + reach)).all(axis=1)
+        points, local = points[boxed], local[boxed].astype(np.float32)
+        closest = self._scene.compute_closest_points(o3d.core.Tensor(local))
+        away = local - closest["points"].numpy().astype(float)
         length = np.linalg.norm(away, axis=1)
+        near = length < reach
+        points, local, away, length = points[near], local[near], away[near], length[near]
+        side = 1 - 2 * self._scene.compute_occupancy(o3d.core.Tensor(local)).numpy().astype(float)
         gradient = np.where(
-            length[:, None] > 2e-4,
-            np.sign(signed)[:, None] * away / np.maximum(length, 1e-9)[:, None],
-            closest["primitive_normals"].numpy(),
+            length[:, None] > 2e-4, side[:, None] * away / np.maximum(length, 1e-9)[:, None], closest["primitive_normals"].numpy()[near]
         )
-        return signed, gradient @ pose[:3, :3].T
+        return points, side * length, gradient @ pose[:3, :3].T
 
     def _measured(self, frame: RgbdFrame, pose: Array) -> tuple[Array, NDArray[np.int64]]:
         """World points (N, 3) above the table about the tool, and their pixels (N, 2)."""
@@ -347,13 +350,11 @@ class Follower:
         middle = transforms.apply(pose, self.middle)
         points, own = measured
         matrix, vector = np.zeros((6, 6)), np.zeros(6)
-        if len(points):
-            signed, gradient = self._distance(points, pose)
-            near = (np.abs(signed) < reach) & own
-            if near.sum() >= 6:
-                # Points move with the tool's frame the other way: a shift of the tool by d lowers the distance by gradient . d.
-                jacobian = np.concatenate([gradient[near], np.cross(points[near] - middle, gradient[near])], axis=1)
-                matrix, vector = _add(matrix, vector, jacobian, signed[near], NOISE, reach)
+        points, signed, gradient = self._near(points[own], pose, reach)
+        if len(points) >= 6:
+            # Points move with the tool's frame the other way: a shift of the tool by d lowers the distance by gradient . d.
+            jacobian = np.concatenate([gradient, np.cross(points - middle, gradient)], axis=1)
+            matrix, vector = _add(matrix, vector, jacobian, signed, NOISE, reach)
         on, depth, pixels, places = self._model(frame, pose)
         if len(on):
             crop = _crop(pixels, frame.depth.shape, ASTRAY)
@@ -504,19 +505,13 @@ def _add(matrix: Array, vector: Array, jacobian: Array, residual: Array, noise: 
     return matrix + (jacobian * weight[:, None]).T @ jacobian, vector + (jacobian * weight[:, None]).T @ residual
 
 
-def _raycaster(mesh: Mesh) -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-    return scene
-
-
 def _shown(frame: RgbdFrame, mesh: Mesh) -> NDArray[np.bool_]:
     """Pixels (H, W), but for those at its edge, in which a thing is seen where it is in the world."""
     v, u = np.indices(frame.depth.shape)
     k = frame.intrinsics
     rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(u.shape)], axis=-1) @ frame.world_from_camera[:3, :3].T
     rays = np.concatenate([np.broadcast_to(frame.world_from_camera[:3, 3], rays.shape), rays], axis=-1)
-    depth = _raycaster(mesh).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+    depth = raycaster(mesh).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
     seen = np.isfinite(depth) & (np.abs(depth - frame.depth) < BEHIND)
     return cv2.erode(seen.astype(np.uint8), np.ones((3, 3))) > 0
 
@@ -548,7 +543,8 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
     start = State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(np.repeat(START, 3) ** 2))
     times, told = _found(follower, start, frames)
     smooth = likeliest(start, times, told, follower.middle)
-    mended = Follower(_mended(mesh, follower, times, smooth, frames), world_from_tool, table, others)
+    surface = _mended(mesh, follower, times, smooth, frames)
+    mended = Follower(surface.mended()[0], world_from_tool, table, others)
     told = _again(mended, told, smooth, frames)
     smooth = likeliest(start, times, told, mended.middle)
     shift = np.sqrt([np.linalg.eigvalsh(s.covariance[:3, :3])[-1] for s in smooth])
@@ -563,7 +559,7 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
             f"known to {1000 * shift[worst]:.1f} mm and {np.degrees(turn[worst]):.1f} degrees (standard deviations)",
             f"{1000 * UNSURE[0]:g} mm and {np.degrees(UNSURE[1]):g} degrees: more of it in sight, nearer cameras that are not moved, or more pictures a second",
         )
-    return Followed(times, np.stack([s.pose for s in smooth]), shift, turn, sum(seen is not None for seen in told))
+    return Followed(times, np.stack([s.pose for s in smooth]), shift, turn, sum(seen is not None for seen in told), surface)
 
 
 def _found(follower: Follower, start: State, frames: Iterable[RgbdFrame]) -> tuple[Array, list[Seen | None]]:
@@ -599,8 +595,8 @@ def _found(follower: Follower, start: State, frames: Iterable[RgbdFrame]) -> tup
     return np.array(times), told
 
 
-def _mended(mesh: Mesh, follower: Follower, times: Array, path: Sequence[State], frames: Iterable[RgbdFrame]) -> Mesh:
-    """The mesh as all pictures show it, most of all those in which it has not moved yet."""
+def _mended(mesh: Mesh, follower: Follower, times: Array, path: Sequence[State], frames: Iterable[RgbdFrame]) -> Reshaping:
+    """The surface as all pictures show it, most of all those in which it has not moved yet."""
     lying = path[0].pose
     moves = [bool((np.abs(changed(state.pose, lying, follower.middle)) > np.repeat(STILL, 3)).any()) for state in path]
     first = moves.index(True) if True in moves else len(path)
@@ -611,7 +607,7 @@ def _mended(mesh: Mesh, follower: Follower, times: Array, path: Sequence[State],
             pose, known = (lying, LIES) if k < first else (state.pose, LOOSE[:2])
             reshaping.see(follower.pictures(moment, pose), pose, follower.middle, np.diag(np.repeat(known, 3) ** -2.0))
             told = now
-    return reshaping.mesh()
+    return reshaping
 
 
 def _again(follower: Follower, told: Sequence[Seen | None], path: Sequence[State], frames: Iterable[RgbdFrame]) -> list[Seen | None]:

@@ -10,6 +10,7 @@ expected to be: a Gaussian process over the surface, as far off as reconstructed
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,8 +60,7 @@ class Reshaping:
 
     def __init__(self, mesh: Mesh, points: Array, normals: Array) -> None:
         self._mesh = mesh
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        self._scene = raycaster(mesh)
         inward = np.concatenate([points - 1e-4 * normals, -normals], axis=1).astype(np.float32)
         thick = self._scene.cast_rays(o3d.core.Tensor(inward))["t_hit"].numpy().astype(float)
         self._least = -np.minimum(MOST * OFF, THINNER * np.where(np.isfinite(thick), thick, 0.0))
@@ -94,14 +94,24 @@ class Reshaping:
         self._matrix += alone - both.T @ moved[:, :-1]
         self._vector += off - both.T @ moved[:, -1]
 
-    def mesh(self) -> Mesh:
-        """The mesh with its surface where the pictures say."""
+    def mended(self, pieces: Sequence[Mesh] = ()) -> tuple[Mesh, tuple[Mesh, ...]]:
+        """The mesh with its surface where the pictures say, and convex pieces of its solid, their corners moved as the surface nearest to them is."""
+        whole = trimesh.Trimesh(self._mesh.vertices, self._mesh.faces, process=True)  # what is one corner is moved as one
+        fine = trimesh.Trimesh(*divided(whole.vertices, whole.faces, EDGE), process=False)
         off = np.clip(np.linalg.solve(self._matrix, self._vector), self._least, MOST * OFF)
-        vertices, faces = trimesh.remesh.subdivide_to_size(self._mesh.vertices, self._mesh.faces, EDGE, max_iter=20)
-        fine = trimesh.Trimesh(vertices, faces, process=True)
-        return Mesh(
-            fine.vertices + (self._shares(fine.vertices, fine.vertex_normals) @ off)[:, None] * fine.vertex_normals, np.asarray(fine.faces)
-        )
+        shift = (self._shares(fine.vertices, fine.vertex_normals) @ off)[:, None] * fine.vertex_normals
+        colors = None if self._mesh.colors is None else self._mesh.colors[cKDTree(self._mesh.vertices).query(fine.vertices)[1]]
+        scene = raycaster(Mesh(fine.vertices, fine.faces))
+
+        def moved(piece: Mesh) -> Mesh:
+            closest = scene.compute_closest_points(o3d.core.Tensor(piece.vertices.astype(np.float32)))
+            second, third = closest["primitive_uvs"].numpy().astype(float).T
+            corners = shift[fine.faces[closest["primitive_ids"].numpy()]]
+            return replace(
+                piece, vertices=piece.vertices + np.einsum("nk,nki->ni", np.column_stack([1 - second - third, second, third]), corners)
+            ).convex_hull()
+
+        return Mesh(fine.vertices + shift, fine.faces, colors), tuple(moved(piece) for piece in pieces)
 
     def _measured(self, picture: Picture, pose: Array) -> Aside:
         """Of a picture's points those that are the tool's: depth that is smeared past the tool's outline is not of it."""
@@ -125,6 +135,34 @@ class Reshaping:
         weight /= weight.sum(axis=1, keepdims=True)
         rows = np.repeat(np.arange(len(places)), NEIGHBOURS)
         return csr_matrix((weight.ravel(), (rows, near.ravel())), (len(places), len(self._vector)))
+
+
+def raycaster(mesh: Mesh) -> o3d.t.geometry.RaycastingScene:
+    """A mesh, ready for rays and for what is nearest on it."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    return scene
+
+
+def divided(vertices: Array, faces: NDArray[np.int64], longest: float) -> tuple[Array, NDArray[np.int64]]:
+    """The same surface, vertices (V, 3) and faces (F, 3), with no edge longer than ``longest``, and closed if it was: an edge is halved for both
+    of its faces, when it is the longest of either."""
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
+    while True:
+        edges, which = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+        length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+        which, rank = which.reshape(-1, 3), np.argsort(np.argsort(length, kind="stable"))
+        side = rank[which].argmax(axis=1)
+        most = which[np.arange(len(faces)), side]
+        halved = (length > longest) & (np.bincount(most, minlength=len(edges)) == np.bincount(which.ravel(), minlength=len(edges)))
+        if not halved.any():
+            return vertices, faces
+        middle = len(vertices) - 1 + np.cumsum(halved)
+        vertices = np.concatenate([vertices, vertices[edges[halved]].mean(axis=1)])
+        cut = np.flatnonzero(halved[most])
+        a, b, c = (faces[cut, (side[cut] + k) % 3] for k in range(3))
+        m = middle[most[cut]]
+        faces = np.concatenate([np.delete(faces, cut, axis=0), np.column_stack([a, m, c]), np.column_stack([m, b, c])])
 
 
 def _placed(points: Array, normals: Array) -> Array:

@@ -7,7 +7,7 @@ import trimesh
 
 from magic_core import transforms
 from magic_core.mesh import from_trimesh
-from magic_perception.reshaped import Aside, Picture, Reshaping
+from magic_perception.reshaped import Aside, Picture, Reshaping, divided
 
 EYES = np.array([[0.5, 0.45, 0.6], [0.5, -0.45, 0.6]])
 NOTHING = Aside(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -28,7 +28,8 @@ def measured(true, pose, eye, rng):
 
 
 def mended(model, true, turned, rng):
-    """The model after a moment in which it lies and those in which it is turned (N, 4, 4), then 3 mm from where it is thought to be."""
+    """The model, and as a piece of itself, after a moment in which it lies and those in which it is turned (N, 4, 4), then 3 mm from where it is
+    thought to be."""
     mesh = from_trimesh(model)
     points, face = trimesh.sample.sample_surface(model, 500, seed=1)
     reshaping = Reshaping(mesh, np.asarray(points), np.asarray(model.face_normals[face]))
@@ -36,7 +37,8 @@ def mended(model, true, turned, rng):
         shown = [Picture(measured(true, pose, eye, rng), eye, NOTHING) for eye in EYES]
         aside = transforms.make(translation=[0.003, 0, 0]) if k >= 5 else np.eye(4)
         reshaping.see(shown, aside @ pose, np.zeros(3), LYING if k < 5 else MOVED)
-    return reshaping.mesh()
+    found, (piece,) = reshaping.mended([from_trimesh(model.subdivide().subdivide())])
+    return found, piece
 
 
 @pytest.mark.parametrize("off", [-0.002, 0.002])
@@ -44,7 +46,7 @@ def test_a_ball_of_the_wrong_size_is_not_taken_for_one_elsewhere(off):
     rng = np.random.default_rng(0)
     true, model = (trimesh.creation.icosphere(3, radius) for radius in (0.03, 0.03 + off))
     turned = [transforms.make(translation=[0.0, 0.02 * k, 0.05]) @ transforms.from_rpy(0.5 * k, 0.4 * k, 0) for k in range(12)]
-    radii = np.linalg.norm(mended(model, true, turned, rng).vertices, axis=1)
+    radii = np.linalg.norm(mended(model, true, turned, rng)[0].vertices, axis=1)
     assert abs(radii.mean() - 0.03) < 0.4 * abs(off) and radii.std() < 0.0005
 
 
@@ -54,9 +56,22 @@ def test_what_was_hidden_as_it_lay_is_seen_as_it_turns():
     true = model.copy()
     true.vertices[true.vertices[:, 2] < 0, 2] -= 0.003  # its lower side
     turned = [transforms.from_rpy(0.15 * k, 0, 0.1 * k) for k in range(21)]
-    found = mended(model, true, turned, rng)
+    found, piece = mended(model, true, turned, rng)
     below = (np.abs(found.vertices[:, :2]) < [0.03, 0.015]).all(axis=1) & (found.vertices[:, 2] < 0)
     above = (np.abs(found.vertices[:, :2]) < [0.03, 0.015]).all(axis=1) & (found.vertices[:, 2] > 0)
     # How thick it is hangs on the moments in which one camera sees it from above and the other from below.
     assert found.vertices[below, 2].mean() < -0.0157
     assert found.vertices[above, 2].mean() == pytest.approx(0.015, abs=0.0003)
+    assert found.to_trimesh().is_watertight  # its long sides were divided first
+    np.testing.assert_allclose(piece.bounds, found.bounds, atol=0.0005)  # what physics takes it for
+
+
+def test_a_surface_is_divided_for_both_of_its_sides():
+    for solid in (
+        trimesh.creation.box([0.3, 0.02, 0.004]),
+        trimesh.creation.cylinder(0.01, 0.2, sections=7),
+        trimesh.creation.icosphere(1, 0.02),
+    ):
+        fine = trimesh.Trimesh(*divided(solid.vertices, solid.faces, 0.006), process=False)
+        assert fine.edges_unique_length.max() <= 0.006
+        assert fine.is_watertight and fine.volume == pytest.approx(solid.volume) and fine.area == pytest.approx(solid.area)

@@ -226,8 +226,9 @@ def left_first(scene: Scene, frames: list[RgbdFrame]) -> str:
     raise MagicError(Code.BAD_MOTION, "the tool", "nothing leaves its place", "a tool that a hand takes while the cameras look, or --tool")
 
 
-def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tuple[Array, Array]:
-    """Times (T,) in seconds and world_from_tool (T, 4, 4), by nothing but pictures; raises BAD_MOTION where the tool is lost."""
+def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tuple[Array, Array, SceneObject]:
+    """Times (T,) in seconds and world_from_tool (T, 4, 4), by nothing but pictures, and the tool as these show it, which its first look showed
+    from one side alone; raises BAD_MOTION where the tool is lost."""
     from magic_perception.following import follow
 
     others = [item.mesh.transformed(item.world_from_object) for item in scene.objects if item.id != tool.id]
@@ -238,7 +239,8 @@ def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tupl
     )
     times, poses = found.times, found.world_from_tool
     track.check_motion(f"track of {tool.id}", times, poses)
-    return times, poses
+    mesh, pieces = found.surface.mended(tool.pieces)
+    return times, poses, replace(tool, mesh=mesh, pieces=pieces)
 
 
 def later_frames(bag: Recorded, world: str) -> list[RgbdFrame]:
@@ -517,7 +519,7 @@ def demonstrated(given: argparse.Namespace) -> Demonstration:
     if fixed and given.goal in ("hook", "scoop"):
         raise MagicError(Code.BAD_REQUEST, f"target of --goal {given.goal}", f"{target.id} is a known fixture", "a target that can move")
     if bare:
-        times, poses = followed(bag, given.world, tool, scene)
+        times, poses, tool = followed(bag, given.world, tool, scene)
     # What is tracked is fixed to the tool, wherever on it.
     first, later = transforms.interpolate(times, poses, [seen])[0], times > seen
     times = np.concatenate([[seen], times[later]])
@@ -553,6 +555,8 @@ def _reported(given: argparse.Namespace, bag: Recorded, what: str, topic: str, b
 
 def _say(learned: Learned, strategy: Strategy) -> None:
     """What was learned, in words."""
+    from magic_verifier.learning import doubts
+
     if learned.changed is not None:
         print("what the demonstration changes, replayed:")
         print("\n".join(f"  {line}" for line in learned.changed.words()))
@@ -575,6 +579,8 @@ def _say(learned: Learned, strategy: Strategy) -> None:
         print("not tried in simulation: it cannot judge this goal")
     else:
         print(f"tried with the demonstrated objects: {learned.verdict.code.name}, {learned.verdict.message}")
+    for line in doubts(learned):
+        print(f"note: {line}")
 
 
 def _keep(learned: Learned, strategy: Strategy, given: argparse.Namespace) -> int:

@@ -113,7 +113,8 @@ class Learned:
     """The strategy; how far (m) the contacts that the replay read are from the outlines' points that stand for them; the verdict on
     the strategy carried out with the demonstrated objects by a floating gripper, and that on the demonstrated motion itself (None where
     simulation cannot judge the goal); where the goal was found, what the demonstration changed, and why other goals that this suggested
-    are not it."""
+    are not it; askew: how far (rad) the contact that was read is turned from the way that a round target was led, where no other place of
+    the tool explains that way."""
 
     strategy: Strategy
     tool_gap: float
@@ -122,6 +123,7 @@ class Learned:
     shown: Verdict | None
     changed: Changed | None = None
     rejected: tuple[str, ...] = ()
+    askew: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ def learn(demonstration: Demonstration, task: Task) -> Learned:
         task = replace(task, releases=task.releases or TARGET in seen.tool_on)
     motion = _motion(demonstration, task)
     found, made, parted, meetings = _contacts(demonstration, task, motion)
-    draft, tool_gap, target_gap = _drafted(demonstration, task, motion, found, made, parted)
+    draft, tool_gap, target_gap, askew = _drafted(demonstration, task, motion, found, made, parted)
     if len(meetings) > 1:
         strategy = _with_motions(_with_earlier(draft, demonstration.target, meetings[:-1]), motion, meetings)
     else:
@@ -162,12 +164,12 @@ def learn(demonstration: Demonstration, task: Task) -> Learned:
     made = meetings[0].first if len(meetings) > 1 else made
     if seen is None:
         shown = _shown(demonstration, strategy, motion, made, parted)
-        return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown)
+        return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown, askew=askew)
     found_goals = []
     for goal in proposals(seen):
         strategy = replace(strategy, goal=_with_numbers(goal, task.values))
         verdict, shown = _tried(demonstration, strategy), _shown(demonstration, strategy, motion, made, parted)
-        found_goals.append(Learned(strategy, tool_gap, target_gap, verdict, shown, seen))
+        found_goals.append(Learned(strategy, tool_gap, target_gap, verdict, shown, seen, askew=askew))
         if verdict is None or verdict.success:
             break
     # Where none passes surely, the one that the demonstrated motion itself passes.
@@ -193,8 +195,9 @@ def _changed(demonstration: Demonstration, task: Task) -> Changed:
 
 def _drafted(
     demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float, parted: float
-) -> tuple[Strategy, float, float]:
-    """The strategy but for its phases, looked at so that both contacts are where they were shown, and how far (m) each is from there.
+) -> tuple[Strategy, float, float, float]:
+    """The strategy but for its phases, looked at so that both contacts are where they were shown; how far (m) each is from there; and how far
+    (rad) askew of the way that the target was led.
 
     The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  A round thing that was met a
     millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led, and so does the tool; in a hollow
@@ -239,11 +242,13 @@ def _drafted(
         try:
             draft, target_gap, tool_gap = drawn(direction, towards, found)
             radius = draft.target_contact.disc_radius if draft.target_outline == "outer" else None
+            askew = 0.0
             if radius and way @ towards < 0:
                 led = levelled(transforms.unit(way - (way @ direction) * direction))
                 tool_led, target_led = world_from_tool[:3, :3].T @ led, -target.world_from_object[:3, :3].T @ led
                 about = radius if _elsewhere(draft, found, tool_led, radius) <= OFF_OUTLINE else 0.0
-                if about or way @ towards < -np.cos(NEARLY) * np.linalg.norm(way):
+                askew = float(np.arccos(np.clip(-(way @ towards) / np.linalg.norm(way), -1.0, 1.0)))
+                if about or askew < NEARLY:
                     # On a round thing the place goes with the normal.
                     met = found.target_point + radius * (target_led - found.target_normal)
                     draft, _, tool_gap = drawn(
@@ -254,7 +259,8 @@ def _drafted(
                         found.target_point
                     )
                     target_gap = float(np.linalg.norm(off)) * draft.target_view.metres_per_pixel
-            return draft, tool_gap, target_gap
+                    askew = 0.0
+            return draft, tool_gap, target_gap, askew
         except MagicError as error:
             why.append(error)
     if why:
@@ -683,6 +689,18 @@ def advice(learned: Learned) -> list[str]:
         ]
     lines = [f"the demonstrated motion itself fails, replayed: {shown.code.name}, {shown.message}"]
     return [*lines, f"to change: {_remedy(shown, strategy)}"]
+
+
+def doubts(learned: Learned) -> list[str]:
+    """What the trial with the demonstrated objects, passed or not, does not tell of other tools and targets: sentences, none where nothing is to be said."""
+    if not learned.askew:
+        return []
+    return [
+        f"the tool met the target {np.degrees(learned.askew):.0f} degrees off the way that it led it, and has no place near there that is square to "
+        "that way: the tool's shape or its track is off where they met, or the tool was held askew. With tools and targets of other shapes this "
+        "strategy will fail more often; to change: record again, the place of the tool that meets the target in the cameras' sight, nearer or "
+        "from more sides"
+    ]
 
 
 def _remedy(shown: Verdict, strategy: Strategy) -> str:

@@ -29,9 +29,11 @@ from magic_core.shapes import make
 from magic_core.strategy import Goal, Physics, load
 from magic_matcher.features import load as load_features
 from magic_matcher.matching import Matcher
+from magic_perception import following
+from magic_perception.following import Followed
 from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
-from magic_verifier.learn import Pictures, Recorded, choose, left_first, main, track_of, write
+from magic_verifier.learn import Pictures, Recorded, choose, followed, left_first, main, track_of, write
 from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import Proposal, verify_proposal
 
@@ -295,6 +297,17 @@ def test_every_picture_finds_its_depth_and_its_place_in_time(tmp_path):
         np.testing.assert_array_equal(read.color, written.color)
         np.testing.assert_allclose(read.depth, written.depth, atol=1e-6)
         np.testing.assert_allclose(read.world_from_camera, written.world_from_camera, atol=1e-6)
+
+
+def test_a_tool_that_was_followed_is_what_all_pictures_showed_of_it(monkeypatch):
+    first = ring_pulling().tool
+    mended = [mesh.scaled(1.02) for mesh in (first.mesh, *first.pieces)]
+    times = np.arange(0.0, 2.0, 0.1)
+    poses = np.stack([first.world_from_object @ transforms.make(translation=[0.02 * t, 0, 0.05 * t]) for t in times])
+    surface = SimpleNamespace(mended=lambda pieces: (mended[0], tuple(mended[1:])) if pieces is first.pieces else None)
+    monkeypatch.setattr(following, "follow", lambda *seen: Followed(times, poses, 0.001 + 0 * times, 0.01 + 0 * times, 20, surface))
+    tool = followed(SimpleNamespace(), "panda_link0", first, Scene((first,), scenes.TABLE))[2]
+    assert [tool.mesh, *tool.pieces] == mended and tool.id == first.id
 
 
 def test_a_ring_that_the_cameras_see_is_pulled_by_its_inside():

@@ -18,7 +18,7 @@ from magic_matcher.matching import target_contact, target_view
 from magic_verifier import learning
 from magic_verifier.demonstration import Meeting
 from magic_verifier.inference import Changed, asked, proposals
-from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, learn, levelled, smoothed
+from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, doubts, learn, levelled, smoothed
 
 #: A spoon whose bowl is hardly wider than the ball that it is to take up (35 mm).
 NARROW = {
@@ -106,6 +106,17 @@ def test_a_ball_met_in_a_bowl_was_met_the_way_it_was_led(bowl, higher, monkeypat
     assert strategy.target_normal @ annotated.target_normal > np.cos(np.deg2rad(2))
     off = transforms.inverse(contact) @ strategy.tool_contact.object_from_contact
     assert np.linalg.norm(off[:2, 3]) < 0.003 and off[0, 0] > np.cos(np.deg2rad(2))
+
+
+@pytest.mark.parametrize("turn", [0.0, 30.0])
+def test_a_contact_that_the_way_contradicts_is_told(turn):
+    """A straight bar, held askew, has no place that is square to the way: what was read is kept, and not in silence."""
+    seen = pushing()
+    target = scenes.item("target", [scenes.standing_cylinder(0.03)], seen.target.world_from_object)
+    poses = seen.world_from_tool @ transforms.from_rpy(0, 0, np.deg2rad(turn))
+    learned = learn(replace(seen, target=target, world_from_tool=poses), Task("pushing", Goal("none"), Physics(1.0), simulatable=False))
+    assert np.degrees(learned.askew) == pytest.approx(turn, abs=8)
+    assert [f"{np.degrees(learned.askew):.0f} degrees off the way" in line for line in doubts(learned)] == [True] * (turn > 0)
 
 
 def test_the_waypoints_tell_the_motion_that_was_shown():

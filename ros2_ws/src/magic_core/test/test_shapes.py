@@ -195,6 +195,13 @@ def test_the_section_of_a_spoon_is_its_profile() -> None:
     assert ball_view.mask.sum() * ball_view.metres_per_pixel**2 == pytest.approx(np.pi * 0.03**2, rel=0.01)
 
 
+def test_a_sheet_has_no_section() -> None:
+    sheet = Mesh(np.array([[0.0, -0.05, 0.0], [0.1, -0.05, 0.0], [0.1, 0.05, 0.0], [0.0, 0.05, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    with pytest.raises(MagicError, match="closed mesh") as caught:
+        section_view(sheet, (0, -1, 0), (0, 0, 1))
+    assert caught.value.code == Code.BAD_MESH
+
+
 def test_as_object_is_complete() -> None:
     pose = transforms.from_rpy(0.1, 0.2, 0.3, [0.4, 0.1, 0.2])
     item = SHAPES["caliper", 0].as_object("caliper", pose)

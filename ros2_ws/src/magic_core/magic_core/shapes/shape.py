@@ -142,6 +142,8 @@ def section_view(mesh: Mesh, direction: ArrayLike, up: ArrayLike, size: int = VI
         ring = transforms.apply(view_from_object, path)[:, :2] / metres_per_pixel + (size - 1) / 2
         if len(ring) >= 4:
             area = area.symmetric_difference(shapely.Polygon(ring).buffer(0))
+    if area.is_empty:
+        raise MagicError(Code.BAD_MESH, "cut of the mesh", "no closed outline", "a closed mesh")
     shift = 4  # sub-pixel corners: 1/16 px
     for polygon in getattr(area, "geoms", [area]):
         rings = [np.round(np.asarray(r.coords) * 2**shift).astype(np.int32) for r in (polygon.exterior, *polygon.interiors)]
