@@ -24,7 +24,7 @@ PICTURES, PICTURE_WIDTH = 12, 420
 
 @dataclass(frozen=True)
 class Figure:
-    """What came of a cell: counts without the cases that geometry forbids, which stand apart, and mean seconds a problem.
+    """What came of a cell: counts without the cases that geometry forbids, which stand apart, and the median of the seconds a problem: a machine may have been suspended in one.
 
     ``wanted`` and ``done``: cases asked for and finished; ``missing``: why nothing was run; ``truth``: the four counts of :func:`magic_verifier.evaluate.truths`, for cases from images.
     """
@@ -77,7 +77,7 @@ def figure(cell: Any, results: Sequence[Mapping[str, Any]], wanted: int) -> Figu
         len(counted),
         good,
         wilson(good, len(counted)),
-        float(np.mean([r["seconds"]["total"] for r in counted])) if counted else math.nan,
+        float(np.median([r["seconds"]["total"] for r in counted])) if counted else math.nan,
         dict(Counter(r["reason"] for r in failed).most_common()),
         [(r["object"], r["reason"], (r["candidates"] or [{}])[0].get("message", "")) for r in failed],
         {} if cell.control else hopeless,
@@ -243,7 +243,7 @@ def page(figures: Sequence[Figure], titles: Mapping[str, str], pictures: Mapping
         "td,th{border:1px solid #ccc;padding:.3em .6em;text-align:left;vertical-align:top}th{background:#f2f2f2}"
         ".sheet{display:flex;flex-wrap:wrap;gap:8px}figure{margin:0}.sheet figure{width:300px}img{max-width:100%}figcaption{font-size:12px}"
         "</style><h1>The paper's tables, measured here</h1><p>The paper's figures are for other objects (ShapeNet mugs, its own tools) with DINOv2. "
-        "Ours: success rate, its 95 % interval (Wilson) and count, mean seconds a problem. What geometry forbids is counted apart.</p>"
+        "Ours: success rate, its 95 % interval (Wilson) and count, median seconds a problem. What geometry forbids is counted apart.</p>"
     ]
     for name, members in _tables(figures).items():
         parts.append(f"<h2>Table {html.escape(name)}</h2><p>{html.escape(titles[name])}</p>")
