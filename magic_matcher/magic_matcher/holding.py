@@ -265,6 +265,11 @@ def _pressed(radius: float, curve: NDArray[np.float64], free: NDArray[np.float64
     return found
 
 
+def _around(good: NDArray[np.bool_], at: int, most: int) -> int:
+    """How many to either side of one are good as well, at most so many; -1 where it is not good itself."""
+    return next((k - 1 for k in range(most + 1) if not good[at - k : at + k + 1].all()), most)
+
+
 def steadied(
     contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float64], radius: float, curves: Curves, enough: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -273,7 +278,8 @@ def steadied(
 
     A large disc in a small corner touches both of its arms, the shorter one at its end: pulled along the bisector of the corner it rolls
     over that end.  Of normals turned about the disc's centre the one that is turned least counts for which the hollow is ``enough``
-    radii deep, pulled along it and :data:`ASTRAY` to either side; where none is so deep, the deepest.  The contact is then where the
+    radii deep, pulled along it and :data:`ASTRAY` to either side; where none is so deep, the deepest, and where none bears such pulls the one that
+    bears the most to either side.  The contact is then where the
     line through the disc's centre meets the outline.
     """
     if not curves:
@@ -307,7 +313,11 @@ def steadied(
     steady = np.min([held[side + k : len(held) - side + k] for k in (-side, 0, side)], axis=0)
     best = int(np.lexsort((np.abs(turns[side:-side]), -steady))[0])
     if steady[best] <= own + TOLERANCE:
-        return None
+        # Too shallow for such pulls: the middle of those that it bears.
+        bears = [_around(held > TOLERANCE, side + k, side) for k in range(len(steady))]
+        best = int(np.lexsort((np.abs(turns[side:-side]), -np.array(bears)))[0])
+        if bears[best] <= bears[count]:
+            return None
     direction, centre = directions[side + best], curve[rest[side + best]]
     way = np.arange(0.0, 3 * radius, 0.25)
     ahead = centre - way[:, None] * direction

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from magic_core import shapes
+from magic_core import shapes, transforms
 from magic_core.errors import MagicError
 from magic_matcher import bench, contour, embedded, holding, jobs, match_meshes
 
@@ -99,6 +99,24 @@ def test_where_a_contact_holds_its_own_normal_stays():
     # On the bar's long side there is no hollow within reach, however it is turned.
     side = deep.points[deep.nearest((120.0, 200.0))]
     assert holding.steadied(deep, side, np.array([0.0, -1.0]), 30.0, curves, 0.2) is None
+
+
+def test_in_a_shallow_hollow_the_pull_goes_to_the_middle_of_those_that_it_bears():
+    # A V whose arms rise by 8 and by 22 degrees: pulls from 8 degrees to one side to 22 to the other are borne, none and 15 to either side of it.
+    rise = [150 * np.tan(np.deg2rad(angle)) for angle in (8, 22)]
+    mask = np.zeros((500, 600), np.uint8)
+    cv2.fillPoly(mask, [np.array([(150, 300 - rise[0]), (300, 300), (450, 300 - rise[1]), (450, 400), (150, 400)], np.int32)], 1)
+    edge, radius, up = contour.extract(mask > 0), 60.0, np.array([0.0, -1.0])
+    place = edge.points[edge.nearest((300.0, 300.0))]
+    around = holding.room(edge, radius)
+    point, normal = holding.steadied(edge, place, up, radius, holding.centres(around, radius), 0.2)
+
+    def borne(point, normal):
+        turned = [transforms.from_rpy(0, 0, np.deg2rad(angle))[:2, :2] @ normal for angle in (-10, 10)]
+        return holding.hold(edge, np.array([point] * 2), np.array(turned), radius, around).press[:, 0].min()
+
+    assert np.degrees(np.arctan2(abs(normal[0]), -normal[1])) == pytest.approx(7, abs=3)
+    assert borne(place, up) < 0.02 < borne(point, normal)
 
 
 def test_sides_tips_and_outer_corners_do_not_hold(corner):

@@ -64,10 +64,6 @@ class Ungripped(Description):
         path = self.mesh_file(name)
         return name if path is None else path.resolve().as_uri()
 
-    def beyond(self, link: str) -> list[str]:
-        """A link and all those that it carries."""
-        return self.beyond(link)
-
     def above(self, link: str) -> Joint | None:
         """The joint that a link hangs on."""
         return self._above.get(link)

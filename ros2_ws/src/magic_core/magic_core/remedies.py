@@ -248,10 +248,6 @@ REMEDIES: dict[Code, Remedy] = {
         "The tool is off in the hand, by more than is allowed or than a plan could be made for; the arm stands with it.",
         "Take the tool out of the hand; more effort, softer pads, a grasp nearer to its middle. loop.slip_shift and loop.slip_turn are the limits.",
     ),
-    Code.TOOL_WEIGHT: Remedy(
-        "By the arm's torques the tool weighs something else than its motion was verified with, and no motion passed with what it weighs; the arm stands with it.",
-        "Take the tool out of the hand, weigh it and give tool_mass; loop.torque_error: 0 where the arm's efforts are no measured torques.",
-    ),
     Code.GOAL_MISSED: Remedy(
         "Carried out, but by what cameras see afterwards the goal is not met, and no further try was allowed or found.",
         "The message says what was measured; loop.executions allows more tries. Compare friction and densities of the strategy with the real things.",
@@ -263,6 +259,10 @@ REMEDIES: dict[Code, Remedy] = {
     Code.ARM_NOT_AT_REST: Remedy(
         "The arm was told to stop and is not known to stand.",
         "Look at the arm first. Its controller may not honour a cancel, or joint_states are late or silent; loop.rest_time is the time given.",
+    ),
+    Code.TOOL_WEIGHT: Remedy(
+        "By the arm's torques the tool weighs something else than its motion was verified with, and no motion passed with what it weighs; the arm stands with it.",
+        "Take the tool out of the hand, weigh it and give tool_mass; loop.torque_error: 0 where the arm's efforts are no measured torques.",
     ),
     Code.INTERNAL: Remedy("A defect of this software.", "Please report it with the node's output: it holds the traceback."),
 }
