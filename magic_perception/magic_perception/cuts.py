@@ -30,9 +30,8 @@ CRITERIA = {
     "own": "share of points that are nearer in colour to their own side's mean than to the other's, less a half",
     "hull": "log of the share of the plan's convex hull that is in neither side's, over 0.03",
     "block": "the same of the upright blocks on these hulls, each as high as what is in it",
-    "breadth": "log of the lesser breadth of the sides in plan, over 35 mm, 0 where it is more: handles and blades are narrow",
+    "breadth": "log of the lesser breadth of the sides in plan, over 40 mm",
     "slim": "lesser ratio of breadth and length of the sides in plan",
-    "along": "log of how long the narrower side is along the plane over how deep it is: a handle meets its head with its end",
     "share": "log of the smaller side's share of the points",
     "filled": "share of their hull in plan that both sides fill",
 }
@@ -46,11 +45,8 @@ SPREAD, ROUGH = np.array([12.0, 5.0, 5.0]), 0.004
 LITTLE, SMALL, FEW, STEPPED = 0.3, 0.03, 20, 0.5
 #: So many planes of a cluster are judged, by so many of its points; two differ by so many degrees, or by so much beside each other, m.
 PLANES, POINTS, TURNED, MOVED = 4, 3000, 20.0, 0.010
-#: A side has at least so many points, and is so broad in plan, m; where it is broader than the last it does not matter how much.
-LEAST, NARROW, BROAD = 120, 0.012, 0.035
-#: What lies in the upper half of a side covers such a share of the side's hull in plan: half a foot with a post on it is no thing, though the post looks like the
-#: other half's neighbour.
-BODY = 0.3
+#: A side has at least so many points, and is so broad in plan, m.
+LEAST, NARROW = 120, 0.012
 #: Cells of the plan, and how near to the plane what is seen may be the other side's, m.
 CELL, UNSURE = 0.004, 0.004
 #: What lies so near to the plane, m, is the side's whose colour is nearer by this factor.
@@ -107,10 +103,6 @@ class Plane(NamedTuple):
         """Of places (N, 2) in plan, m, negative on the first side."""
         return place @ [np.cos(self.angle), np.sin(self.angle)] - self.offset
 
-    def along(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far along it places (N, 2) in plan are, m."""
-        return place @ [-np.sin(self.angle), np.cos(self.angle)]
-
 
 def planes(points: Points) -> list[Plane]:
     """The planes across which colour changes most, and height, the best first."""
@@ -158,7 +150,7 @@ def planes(points: Points) -> list[Plane]:
 
 
 def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
-    """The :data:`CRITERIA` (C,) of a plane; ``None`` where a side is too small, or no body of its height."""
+    """The :data:`CRITERIA` (C,) of a plane; ``None`` where a side is too small."""
     points = seen.points
     distance = plane.distance(points.place)
     first = distance < 0
@@ -175,14 +167,9 @@ def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
     whole = _hull(np.concatenate(clear))
     area = max(float(cv2.contourArea(whole)), 1e-6)
     areas = [max(float(cv2.contourArea(outline)), 1e-6) for outline in outlines]
-    narrow = clear[int(np.argmin([box[0] for box in boxes]))]
-    long, deep = np.subtract(*np.percentile(np.column_stack([plane.along(narrow), plane.distance(narrow)]), [95, 5], axis=0))
     strip = 2 * UNSURE * _chord(whole, plane)
     hidden = _outside(seen.hidden, outlines, plane) * PLACE**2
     tops = [max(float(np.percentile(points.height[side], 95)), 1e-3) for side in sides]
-    upper = [points.place[side & (np.abs(distance) > UNSURE) & (points.height > top / 2)] for side, top in zip(sides, tops, strict=True)]
-    if any(len(place) < 3 or cv2.contourArea(_hull(place)) < BODY * own for place, own in zip(upper, areas, strict=True)):
-        return None
     scaled = points.lab / SPREAD
     away = [np.linalg.norm(scaled - scaled[side].mean(axis=0), axis=1) for side in sides]
     return np.array([
@@ -190,9 +177,8 @@ def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
         min(float(np.mean(away[i][side] < away[1 - i][side])) for i, side in enumerate(sides)) - 0.5,
         np.log(max(1 - (sum(areas) + strip + hidden) / area, 0.004) / 0.03),
         np.log(max(1 - (areas[0] * tops[0] + areas[1] * tops[1] + strip * np.mean(tops) + hidden * max(tops)) / (area * max(tops)), 0.004) / 0.03),
-        min(np.log(min(box[0] for box in boxes) / BROAD), 0.0),
+        np.log(min(box[0] for box in boxes) / 0.040),
         min(float(box[0] / max(box[1], box[0])) for box in boxes),
-        np.log(max(long, 1e-3) / max(deep, 1e-3)),
         np.log(min(counts) / len(first)),
         (seen.covered + hidden) / area,
     ])  # fmt: skip
@@ -214,7 +200,7 @@ def _extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
 def _chord(outline: NDArray[np.float32], plane: Plane) -> float:
     """How long a plane is within a convex outline (N, 1, 2) in plan, m."""
     ring = outline[:, 0].astype(float)
-    distance, run = plane.distance(ring), plane.along(ring)
+    distance, run = plane.distance(ring), ring @ [-np.sin(plane.angle), np.cos(plane.angle)]
     after, beyond = np.roll(distance, -1), np.roll(run, -1)
     cut = (distance < 0) != (after < 0)
     at = run[cut] + distance[cut] / (distance[cut] - after[cut]) * (beyond[cut] - run[cut])

@@ -1,7 +1,7 @@
-"""Procedural neighbours of different colours, two or three, and single things of several colours: what is to be parted, and what is to stay one.
+"""Procedural pairs of neighbours of different colours, and single things of several colours: what is to be parted, and what is to stay one.
 
-A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), and as many threes, single things, and single things
-that another hides in part.
+A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), as many single things, and as many that another thing
+hides in part.
 """
 
 from __future__ import annotations
@@ -41,30 +41,8 @@ MIDDLE = (0.52, 0.0)
 def pair(seed: int, number: int) -> Pile:
     """The pair of a seed and of a number in :data:`PAIRS`."""
     random = np.random.default_rng([seed, number, 2911])
-    table = TABLES[int(random.integers(len(TABLES)))]
-    meshes, _, turn = _two(random, number, table)
-    place = transforms.from_rpy(0, 0, turn, [*MIDDLE, 0])
-    return _seen(random, [mesh.transformed(place) for mesh in meshes], table)
-
-
-def three(seed: int, number: int) -> Pile:
-    """Such a pair and a third thing beside it on any side, as far from it as its two are from each other."""
-    random = np.random.default_rng([seed, number, 2913])
-    table = TABLES[int(random.integers(len(TABLES)))]
-    meshes, colors, turn = _two(random, number, table)
-    (_, form), gap, (low, high), _ = PAIRS[number]
-    color = _color(random, [table, *colors])
-    third = _standing(random, form, random.uniform(low, high), color).transformed(transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi)))
-    meshes = [mesh.transformed(transforms.from_rpy(0, 0, turn)) for mesh in meshes]
-    meshes = [*meshes, _beside(meshes, third, gap)]
-    middle = np.mean([mesh.vertices[:, :2].mean(axis=0) for mesh in meshes], axis=0)
-    place = transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi), [*MIDDLE, 0]) @ transforms.from_rpy(0, 0, 0, [*-middle, 0])
-    return _seen(random, [mesh.transformed(place) for mesh in meshes], table)
-
-
-def _two(random: np.random.Generator, number: int, table: tuple[int, int, int]) -> tuple[list[Mesh], list[tuple[int, int, int]], float]:
-    """Two things side by side about the origin, their colours, and a turn to place them by."""
     forms, gap, (low, high), equal = PAIRS[number]
+    table = TABLES[int(random.integers(len(TABLES)))]
     first = _color(random, [table])
     colors = [first, _color(random, [table, first])]
     tall = random.uniform(low, high)
@@ -76,9 +54,9 @@ def _two(random: np.random.Generator, number: int, table: tuple[int, int, int]) 
         _standing(random, form, height, color).transformed(transforms.from_rpy(0, 0, own, [0, random.uniform(-0.012, 0.012), 0]))
         for form, color, height, own in zip(forms, colors, heights, turns, strict=True)
     )
-    meshes = [one, _beside([one], two, gap)]
-    middle = transforms.from_rpy(0, 0, 0, [-float(meshes[1].vertices[:, 0].mean() - two.vertices[:, 0].mean()) / 2, 0, 0])
-    return [mesh.transformed(middle) for mesh in meshes], colors, turn
+    far = _apart(one, two, gap)
+    place = transforms.from_rpy(0, 0, turn, [*MIDDLE, 0]) @ transforms.from_rpy(0, 0, 0, [-far / 2, 0, 0])
+    return _seen(random, [mesh.transformed(place) for mesh in (one, _along(two, far))], table)
 
 
 def _standing(random: np.random.Generator, form: str, height: float, color: tuple[int, int, int]) -> Mesh:
@@ -92,15 +70,19 @@ def _standing(random: np.random.Generator, form: str, height: float, color: tupl
     return _printed(random, mesh, solid.extents, color) if random.random() < PRINTED else mesh
 
 
-def _beside(meshes: list[Mesh], mesh: Mesh, gap: float) -> Mesh:
-    """The mesh moved along x until it is so far from the others, m."""
-    others = shapely.union_all([shapely.MultiPoint(other.vertices[:, :2]).convex_hull for other in meshes])
-    outline = shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull
+def _apart(one: Mesh, two: Mesh, gap: float) -> float:
+    """How far along x the second mesh is to be moved until it is so far from the first, m."""
+    outlines = [shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull for mesh in (one, two)]
     near, far = 0.0, 0.4
     for _ in range(20):
         middle = (near + far) / 2
-        close = others.distance(shapely.affinity.translate(outline, middle, 0.0)) <= gap
+        close = outlines[0].distance(shapely.affinity.translate(outlines[1], middle, 0.0)) <= gap
         near, far = (middle, far) if close else (near, middle)
+    return far
+
+
+def _along(mesh: Mesh, far: float) -> Mesh:
+    """The mesh moved along x, m."""
     return mesh.transformed(transforms.from_rpy(0, 0, 0, [far, 0, 0]))
 
 
@@ -138,12 +120,10 @@ def single(seed: int, number: int) -> Pile:
     elif kind == "handle":
         head = random.uniform([0.03, 0.03, 0.02], [0.09, 0.09, 0.06])
         solid = trimesh.creation.box([random.uniform(0.06, 0.14), *random.uniform(0.010, 0.028, 2)])
-        aside = random.choice([0.0, random.uniform(-0.3, 0.3) * head[1]])
-        rounded = random.random() < 0.5
-        # A round head is as wide in both directions, and narrower beside its middle: the handle begins where all its breadth is in it.
-        reach = np.sqrt(max((head[1] / 2) ** 2 - (abs(aside) + solid.extents[1] / 2) ** 2, 0.0)) if rounded else head[0] / 2
-        solid.apply_translation([reach + solid.extents[0] / 2, aside, solid.extents[2] / 2])
-        mesh = concatenate([_row(head, [], [one], round_=rounded), Mesh(solid.vertices, solid.faces).painted(two)])
+        solid.apply_translation(
+            [(head[0] + solid.extents[0]) / 2, random.choice([0.0, random.uniform(-0.3, 0.3) * head[1]]), solid.extents[2] / 2]
+        )
+        mesh = concatenate([_row(head, [], [one], round_=random.random() < 0.5), Mesh(solid.vertices, solid.faces).painted(two)])
     elif kind == "bottle":
         radius, long, cap = random.uniform(0.015, 0.035), random.uniform(0.08, 0.16), random.uniform(0.015, 0.04)
         body = _post(radius, 0.0, long, one, box=False)
@@ -180,8 +160,9 @@ def behind(seed: int, number: int) -> Pile:
     way = sensor.STATION[names[0]][:2, 3] - MIDDLE
     turn = transforms.from_rpy(0, 0, float(np.arctan2(way[1], way[0])), [*MIDDLE, 0])
     away = transforms.from_rpy(0, 0, 0, [0, random.uniform(-0.08, 0.08), 0])
-    front = _beside([mesh.transformed(transforms.inverse(turn))], front.transformed(away), random.uniform(0.012, 0.06)).transformed(turn)
-    return _seen(random, [mesh, front], table, names)
+    front = front.transformed(away)
+    far = _apart(mesh.transformed(transforms.inverse(turn)), front, random.uniform(0.012, 0.06))
+    return _seen(random, [mesh, _along(front, far).transformed(turn)], table, names)
 
 
 def _seen(random: np.random.Generator, meshes: list[Mesh], table: tuple[int, int, int], names: tuple[str, ...] | None = None) -> Pile:
