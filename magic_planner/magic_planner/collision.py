@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from magic_core import transforms
+from magic_core import masses, transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.recent import Recent
@@ -142,15 +142,7 @@ def _grown(piece: Mesh, margin: float) -> Hull:
 
 def mass_centre(pieces: Sequence[Mesh]) -> tuple[float, NDArray[np.float64]]:
     """Volume in m^3 of convex pieces taken together, and the centre (3,) of their mass."""
-    hulls = [hull(piece.vertices) for piece in pieces]
-    # Tetrahedra between each face and a corner of its piece.
-    corners = np.concatenate([vertices[faces] - vertices[0] for vertices, faces in hulls])
-    apexes = np.array([vertices[0] for vertices, _ in hulls])
-    first = np.cumsum([0] + [len(faces) for _, faces in hulls[:-1]])
-    tetrahedra = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-    volumes = np.maximum(np.add.reduceat(tetrahedra, first), 1e-12)
-    centres = apexes + np.add.reduceat(tetrahedra[:, None] * corners.sum(axis=1) / 4, first) / volumes[:, None]
-    return float(volumes.sum()), np.average(centres, axis=0, weights=volumes)
+    return masses.mass_centre([hull(piece.vertices) for piece in pieces])
 
 
 def fcl_pose(transform: NDArray[np.float64]) -> Any:

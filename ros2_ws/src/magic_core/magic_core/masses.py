@@ -6,11 +6,12 @@ No camera sees a weight, and it decides what a grip holds: a steel hammer is thi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import QhullError
 
 from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
@@ -21,28 +22,32 @@ from magic_core.strategy import Strategy
 LEAST, MOST = 2.0, 25_000.0
 
 
+def mass_centre(hulls: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]]) -> tuple[float, NDArray[np.float64]]:
+    """Volume in m^3 of convex solids taken together, and the centre (3,) of their mass; of each its vertices (V, 3) and outward faces (F, 3)."""
+    # Tetrahedra between each face and a corner of its solid.
+    corners = np.concatenate([vertices[faces] - vertices[0] for vertices, faces in hulls])
+    apexes = np.array([vertices[0] for vertices, _ in hulls])
+    first = np.cumsum([0] + [len(faces) for _, faces in hulls[:-1]])
+    tetrahedra = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    volumes = np.maximum(np.add.reduceat(tetrahedra, first), 1e-12)
+    centres = apexes + np.add.reduceat(tetrahedra[:, None] * corners.sum(axis=1) / 4, first) / volumes[:, None]
+    return float(volumes.sum()), np.average(centres, axis=0, weights=volumes)
+
+
 def volume(item: SceneObject) -> float:
     """m^3 that an object's convex pieces hold together, as they are simulated; of the hull of its mesh where it has none."""
-    return sum(hull.volume for hull in _hulls(item))
+    return mass_centre(_hulls(item))[0]
 
 
 def centre(item: SceneObject) -> NDArray[np.float64]:
     """(3,): the middle of what these hold, m in the object's frame."""
-    parts = []
-    for hull in _hulls(item):
-        # Tetrahedra over the faces from a point inside.
-        inside = hull.points[hull.vertices].mean(axis=0)
-        corners = hull.points[hull.simplices] - inside
-        volumes = np.abs(np.linalg.det(corners)) / 6
-        parts.append((volumes.sum(), inside + volumes @ corners.sum(axis=1) / 4 / volumes.sum()))
-    weights, middles = zip(*parts, strict=True)
-    return np.average(middles, axis=0, weights=weights)
+    return mass_centre(_hulls(item))[1]
 
 
-def _hulls(item: SceneObject) -> list[ConvexHull]:
-    pieces = [piece.vertices for piece in item.pieces if len(piece.vertices)] or [item.mesh.vertices]
+def _hulls(item: SceneObject) -> list[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    pieces = [piece for piece in item.pieces if len(piece.vertices)] or [item.mesh]
     try:
-        return [ConvexHull(np.asarray(points, dtype=float)) for points in pieces]
+        return [(hull.vertices, hull.faces) for hull in (piece.convex_hull() for piece in pieces)]
     except (QhullError, ValueError) as error:
         raise MagicError(Code.BAD_MESH, f"shape of {item.id}", "flat or empty", "a solid that can weigh something") from error
 

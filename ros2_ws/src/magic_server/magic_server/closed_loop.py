@@ -398,7 +398,8 @@ class ClosedLoop:
         except MagicError as failure:
             self.notes.append(f"the tool was not weighed: {failure.message}")
             return None
-        grams = 1000 * (taken := masses.taken(self._goal.strategy, tool, self._masses.get(name, self._goal.request.tool_mass)))
+        taken = masses.taken(self._goal.strategy, tool, self._masses.get(name, self._goal.request.tool_mass))
+        grams = 1000 * taken
         if rests or self._above_table(held) < CLEAR:
             if weight.least > weighing.DRAWN * taken:
                 least = 1000 * weight.least
