@@ -365,7 +365,8 @@ class StrategyServer(LifecycleNode):
         waiting = [f"{r.server} ({r.name})" for r in (self.matcher, self.planner, self.verifier) if not r.ready()]
         waiting += self._arm.ready() if self._arm is not None else []
         if self.scene is None:
-            waiting.append(f"perception ({self.objects_topic})")
+            there = self.count_publishers(self.objects_topic) > 0
+            waiting.append(f"perception's objects ({self.objects_topic})" if there else f"perception (publishes {self.objects_topic})")
         waiting += [f"the end of other servers of {name}" for name, there in self.servers().items() if len(there) > 1]
         if waiting != self._waiting:
             self._waiting = waiting

@@ -12,10 +12,11 @@ from pathlib import Path
 import killed_roles
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
-from magic_core import presence
+from magic_core import presence, qos
 from magic_core import strategy as strategies
 from magic_core.domain import free_domain
 from magic_core.errors import Code, MagicError
@@ -72,6 +73,8 @@ class Bench:
         self.arm.on_move = lambda trajectory, canceled: self.at("execute", (0, ""))
         self.node = Node("client", context=self.context)
         self.client = RemoteAction(self.node, RunStrategy, "run_strategy", "strategy server", ReentrantCallbackGroup())
+        self.known = threading.Event()
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.on_diagnostics, qos.RELIABLE)
         self.executor = ThreadedExecutor(8, context=self.context)
         for node in (self.fakes, self.arm, self.node):
             self.executor.add_node(node)
@@ -98,6 +101,10 @@ class Bench:
             self.reached.set()
             assert self.killed.wait(DEADLINE)
         return answer
+
+    def on_diagnostics(self, message):
+        if any(s.name == "strategy_server: readiness" and f"{self.role} (" not in s.message for s in message.status):
+            self.known.set()
 
     def feedback(self, feedback):
         if feedback.stage == self.stage and self.stage in ("perceive", OWN.get(self.role)):
@@ -132,6 +139,8 @@ class Bench:
         self.arm.positions = [0.0] * 7
         if self.role not in self.running:
             self.start(self.role, blind=True)
+        # Who is killed before the strategy server knows of it has never been there, and is waited for.
+        assert self.known.wait(DEADLINE), f"the strategy server does not find the {self.role}"
         if stage != "perceive":
             self.see()
         with ThreadPoolExecutor(1) as pool:
