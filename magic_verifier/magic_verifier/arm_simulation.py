@@ -130,8 +130,6 @@ class ArmRun:
         frequency = setup.settings.frequency
         self._lag = round(lag * frequency)
         self._q, self._qd = self._sampled(motion)
-        self._positions = self._q.tolist()
-        self._led = self._commands().tolist()
         self._index = self._first = 0
         self._hold = 0.0
         self._widths: list[float] = []  # between the closing fingers, step by step
@@ -152,6 +150,8 @@ class ArmRun:
         self._effort = self._arm.effort.tolist()
         self._metrics = {"torque_ratio": 0.0, "grip_load": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
         self._begin(held, begin)
+        self._positions = self._q[self._first :].tolist()
+        self._led = self._commands()[self._first :].tolist()
 
     def _iterate_for_weight(self) -> None:
         """More solver iterations where the target is much heavier than the tool (:data:`HEAVIER`)."""
@@ -249,7 +249,7 @@ class ArmRun:
             self.world.step()
             self._index += 1
             return
-        row = min(max(self._index - self._lag, self._first), len(self._q) - 1)
+        row = min(max(self._index - self._lag - self._first, 0), len(self._positions) - 1)
         waiting = self._gripper()
         still = waiting or self._index >= len(self._q)
         self._arm.drive(self._positions[row] if still else self._led[row])

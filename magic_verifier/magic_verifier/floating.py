@@ -66,7 +66,7 @@ class Body:
         """Of each hull the ball that it stands for, ``None`` where it is none."""
         return tuple(sphere_of(hull) for hull in self.hulls) if self.known_balls is None else self.known_balls
 
-    @property
+    @cached_property
     def corners(self) -> NDArray[np.float64]:
         """(N, 3): all hull corners in the object's frame."""
         return np.concatenate(self.hulls)
@@ -77,7 +77,7 @@ class Body:
         corners = self.corners
         return corners[ConvexHull(corners).vertices]
 
-    @property
+    @cached_property
     def centre(self) -> NDArray[np.float64]:
         """(3,): middle of the axis-aligned box in the object's frame."""
         corners = self.corners
@@ -195,7 +195,7 @@ def phase_at(phases: tuple[Phase, ...], time: float) -> str:
 
 
 def speed(motion: ToolMotion, tool: Body, start: float = 0.0) -> float:
-    """How fast the fastest corner of the tool's box ever is from a moment of its motion (s) on, m/s."""
+    """How fast the fastest point of the tool ever is from a moment of its motion (s) on, m/s."""
     times = motion.times - motion.times[0]
     used = slice(max(int(np.searchsorted(times, start, "right")) - 1, 0), None)
     times, poses = times[used], motion.world_from_tool[used]
@@ -205,11 +205,9 @@ def speed(motion: ToolMotion, tool: Body, start: float = 0.0) -> float:
 
 
 def _ways(poses: NDArray[np.float64], tool: Body) -> NDArray[np.float64]:
-    """(T - 1,): how far the fastest corner of the tool's box comes from each of the poses (T, 4, 4) to the next, m; no point of the tool comes farther."""
-    low, high = tool.corners.min(axis=0), tool.corners.max(axis=0)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    """(T - 1,): how far the fastest point of the tool comes from each of the poses (T, 4, 4) to the next, m."""
     steps = np.diff(poses, axis=0)
-    ways = corners @ steps[:, :3, :3].transpose(0, 2, 1) + steps[:, None, :3, 3]
+    ways = tool.outermost @ steps[:, :3, :3].transpose(0, 2, 1) + steps[:, None, :3, 3]
     return np.asarray(np.linalg.norm(ways, axis=2).max(axis=1))
 
 
@@ -331,7 +329,8 @@ class FloatingRun:
 
         ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it cannot
         be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.  ``planned``: what this found of the
-        tool as it is thought to be, at the deepest, m: no obstacle is looked at where what the tool is off by adds too little to that.
+        tool as it is thought to be, at the deepest, m: no obstacle is looked at where what the tool is off by adds too little to that, nor the
+        table where that itself is harmless, as a tool that is off is raised to go no deeper into it.
         """
         setup, motion = self.setup, self._motion
         end = min((t for t in (self.release_time, self.strike_time) if t is not None), default=self.duration)
@@ -344,17 +343,16 @@ class FloatingRun:
             if depth > 0 and ((known := worst.get((name, early))) is None or depth > known.depth):
                 worst[(name, early)] = Intrusion(name, depth, time, early)
 
-        corners = setup.tool.outermost
-        heights = (setup.table[:3] @ poses[:, :3, :3]) @ corners.T  # (T, N): along the table's normal
-        below = -(heights.min(axis=1) + poses[:, :3, 3] @ setup.table[:3] + setup.table[3])
-        for time, depth in zip(times, below, strict=True):
-            note(TABLE, float(depth), float(time))
+        if planned > harmless:
+            below = -_heights(poses, setup.tool.outermost, setup.table)
+            for time, depth in zip(times, below, strict=True):
+                note(TABLE, float(depth), float(time))
         others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}
         if setup.target_kind == STATIC:
             others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
         elif planned + self._off <= harmless:
             others = {}
-        near = _near(corners, poses, others)
+        near = _near(setup.tool, poses, others)
         if near.any():
             probe = Probe(setup.settings, list(setup.tool.hulls), others)
             way = np.concatenate([[0.0], np.cumsum(_ways(poses, setup.tool))])[near]
@@ -385,14 +383,17 @@ def _clear_of_table(
     """The poses (T, 4, 4) of a tool that is held otherwise, and shaped otherwise, than thought, raised together so that it goes no deeper
     into the table than 0, or than it was planned to: a hand gives way to the table by what it is off; and by how much (m)."""
     held = poses @ tool_from_held
-    normal = setup.table[:3]
-
-    def lowest(at: NDArray[np.float64], corners: NDArray[np.float64]) -> float:
-        return float(((normal @ at[:, :3, :3]) @ corners.T + (at[:, :3, 3] @ normal)[:, None]).min() + setup.table[3])
-
-    depth = max(0.0, min(0.0, lowest(poses, thought.outermost)) - lowest(held, setup.tool.outermost))
-    held[:, :3, 3] += depth * normal
+    allowed = min(0.0, float(_heights(poses, thought.outermost, setup.table).min()))
+    # All corners of a tool that is drawn: to find the outermost of them takes longer than what they save.
+    depth = max(0.0, allowed - float(_heights(held, setup.tool.corners, setup.table).min()))
+    held[:, :3, 3] += depth * setup.table[:3]
     return held, depth
+
+
+def _heights(poses: NDArray[np.float64], corners: NDArray[np.float64], table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T,): how high the lowest of corners (N, 3) is above the table (4,) at each of the poses (T, 4, 4), m."""
+    normal = table[:3]
+    return np.asarray(((normal @ poses[:, :3, :3]) @ corners.T).min(axis=1) + poses[:, :3, 3] @ normal + table[3])
 
 
 def nears(
@@ -404,7 +405,7 @@ def nears(
     boxes = [transforms.apply(body.world_from_object, hull) for body in others for hull in body.hulls]
     low, high = np.array([b.min(axis=0) for b in boxes]) - within, np.array([b.max(axis=0) for b in boxes]) + within
     whole = {"": ([np.array([low.min(axis=0), high.max(axis=0)])], np.eye(4))}
-    for index in np.flatnonzero(_near(setup.tool.outermost, poses, whole)):
+    for index in np.flatnonzero(_near(setup.tool, poses, whole)):
         moved = [hull @ poses[index, :3, :3].T + poses[index, :3, 3] for hull in setup.tool.hulls]
         mine_low, mine_high = np.array([m.min(axis=0) for m in moved]), np.array([m.max(axis=0) for m in moved])
         if np.any(np.all((mine_low[:, None] <= high) & (mine_high[:, None] >= low), axis=2)):
@@ -413,9 +414,9 @@ def nears(
 
 
 def _near(
-    corners: NDArray[np.float64], poses: NDArray[np.float64], others: dict[str, tuple[list[NDArray[np.float64]], NDArray[np.float64]]]
+    tool: Body, poses: NDArray[np.float64], others: dict[str, tuple[list[NDArray[np.float64]], NDArray[np.float64]]]
 ) -> NDArray[np.bool_]:
-    """At which of the poses (T, 4, 4) the axis-aligned box of corners (N, 3) meets that of one of the bodies: (T,)."""
+    """At which of the poses (T, 4, 4) the axis-aligned box of the tool meets that of one of the bodies: (T,)."""
     boxes = []
     for hulls, world_from_object in others.values():
         points = transforms.apply(world_from_object, np.concatenate(hulls))
@@ -425,7 +426,7 @@ def _near(
         return near
     meets = np.ones((len(boxes), len(poses)), dtype=bool)
     for axis in range(3):
-        along = poses[:, axis, :3] @ corners.T + poses[:, axis, 3:]
+        along = poses[:, axis, :3] @ tool.outermost.T + poses[:, axis, 3:]
         low, high = along.min(axis=1), along.max(axis=1)
         for row, (box_low, box_high) in zip(meets, boxes, strict=True):
             row &= (low <= box_high[axis]) & (high >= box_low[axis])

@@ -100,7 +100,7 @@ class Watch:
     """
 
     def __init__(self, strategy: Strategy, run: Any, rng: np.random.Generator, nudge: float | None = None) -> None:
-        goal = strategy.goal.resolved()
+        goal = strategy.goal.filled
         self.run = run
         self.rng = rng
         self.nudge = nudge

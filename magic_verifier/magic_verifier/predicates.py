@@ -295,8 +295,7 @@ def _held_by(asked: Asked, what: str, whom: str) -> Told:
 
 
 def _overlap(asked: Asked, what: str, whom: str, below: float) -> Told:
-    touches = [t for name in asked.bodies(what) for t in asked.state.run.world.touches(name, whom, TOUCH)]
-    depth = max([0.0, *(-touch.separation for touch in touches)])
+    depth = max(asked.state.run.world.depth(name, whom) for name in asked.bodies(what))
     return Told(depth <= below, f"{1000 * depth:.1f} mm in the {whom}", f"allowed: {1000 * below:g} mm", {f"depth_in_{whom}": depth})
 
 

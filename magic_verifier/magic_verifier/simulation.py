@@ -532,8 +532,16 @@ class World:
 
     def touching(self, first: str, second: str, within: float = 0.0) -> bool:
         """Whether two bodies were within ``within`` metres of each other in the last step."""
-        pairs = ((first, second), (second, first))
-        return any(p.separation <= within for pair in pairs for contact in self._contacts().get(pair, ()) for p in contact.points)
+        return any(point.separation <= within for contact in self._between(first, second) for point in contact.points)
+
+    def depth(self, first: str, second: str) -> float:
+        """How deep two bodies were in each other in the last step, m, at the deepest contact point; 0 where they were not."""
+        return max([0.0, *(-point.separation for contact in self._between(first, second) for point in contact.points)])
+
+    def _between(self, first: str, second: str) -> list[Any]:
+        """The last step's contacts of two bodies, whichever of them is named first."""
+        contacts = self._contacts()
+        return [*contacts.get((first, second), ()), *contacts.get((second, first), ())]
 
     def touched_by(self, name: str, within: float = 0.0) -> tuple[str, ...]:
         """Names of the bodies that were within ``within`` metres of one in the last step, sorted."""
@@ -589,7 +597,6 @@ class Probe:
         self._world.step()
         name, depth = "", 0.0
         for other in self._others:
-            for touch in self._world.touches("probe", other):
-                if -touch.separation > depth:
-                    name, depth = other, -touch.separation
+            if (found := self._world.depth("probe", other)) > depth:
+                name, depth = other, found
         return name, depth

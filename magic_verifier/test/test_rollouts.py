@@ -86,11 +86,14 @@ def test_steps_are_longer_where_the_tool_is_slow():
             task = verification.make_task(Proposal(strategy, tool, thing, (), scenes.TABLE, scenes.plan(poses), settings=DEFAULTS["arm"]))
             assert task.under(task.drawn(1)).settings.contact_offset == pytest.approx(found)
             assert task.setup.settings.contact_offset == 0.002, "the scene as given"
-    # About the middle of the box a corner at 0.1 m goes by 0.1 m for each radian, in steps by their chords.
+    # About the middle of a rod its ends at 0.1 m go by 0.1 m for each radian, in steps by their chords.
     turn = [transforms.from_rotvec([0, 0, angle]) for angle in (0.0, 1.0, 1.5)]
     plan = scenes.plan([(turn[0], "goal", 1.0), (turn[1], "goal", 2.0), (turn[2], "goal", 0.5)])
-    rod = Body("rod", (np.array([[-0.1, 0, 0], [0.1, 0, 0]]),), np.eye(4))
+    rod = Body("rod", (np.array([[-0.1, 0, 0], [0.1, 0, 0], [0.0, 0.001, 0], [0.0, 0, 0.001]]),), np.eye(4))
     assert fastest(plan.tool_motion, rod) == pytest.approx(0.1, rel=1e-3)
+    # The corners of the box of a bent tool are no points of it.
+    bent = replace(rod, hulls=(*rod.hulls, rod.hulls[0][:, [1, 0, 2]]))
+    assert fastest(plan.tool_motion, bent) == pytest.approx(0.1, rel=1e-3)
     assert fastest(plan.tool_motion, rod, 2.01) == pytest.approx(0.1, rel=1e-3)
     assert fastest(plan.tool_motion, rod, 0.5) == fastest(plan.tool_motion, rod)
 
@@ -391,7 +394,9 @@ def test_a_hand_gives_way_to_the_table_by_what_the_tool_is_thicker(thicker):
 
     planned = deepest(FloatingRun(setup, plan))
     assert deepest(FloatingRun(changed, plan, 0.0, np.eye(4), setup.tool)) <= planned + 1e-6
-    assert thicker < 0 or deepest(FloatingRun(changed, plan)) > planned + 0.003
+    lower = FloatingRun(changed, plan)
+    assert thicker < 0 or deepest(lower) > planned + 0.003
+    assert not lower.intrusions(harmless=0.01, planned=planned), "the table is not looked at: one that is off is raised"
 
 
 @pytest.mark.parametrize("lower", [0.0, 0.02])

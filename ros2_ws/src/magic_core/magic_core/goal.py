@@ -38,7 +38,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -317,9 +317,14 @@ class Goal:
     @property
     def tree(self) -> Node:
         """The tree with its numbers; raises as :meth:`resolved`."""
-        tree = self.resolved().test
+        tree = self.filled.test
         assert isinstance(tree, Node)
         return tree
+
+    @cached_property
+    def filled(self) -> Goal:
+        """:meth:`resolved`, once for all who ask."""
+        return self.resolved()
 
     def resolved(self, path: str = "goal") -> Goal:
         """The goal with its tree, and the numbers in it in place of their names; ``path`` is where it stands, for messages.
