@@ -30,7 +30,7 @@ from magic_perception.room import bordered, room
 from magic_perception.seen import cut_off, joined, witnessed
 from magic_perception.segmentation import DepthSegmenter, Segmenter
 from magic_perception.sight import agreement
-from magic_perception.smear import behind
+from magic_perception.smear import before, behind
 from magic_perception.solids import hangs_together, hull_of
 from magic_perception.surface_error import Departure, departure, likely
 from magic_perception.table import Plane
@@ -471,12 +471,11 @@ def _seen(label: int, views: _Views, parameters: Parameters) -> _Seen:
         cut = (slice(y, y + h), slice(x, x + w))
         sigma = float(np.median(looked.sigma[cut][mask[cut]][::7]))
         hidden = (image != 0) & ~mask
-        # What colour gives to the thing and depth to the table behind it has no depth.
-        lost = behind(mask, looked.heights)
+        # What colour gives to the thing and depth to the table behind it, or to another thing before it, has no depth.
+        lost = behind(mask, looked.heights) | before(mask, hidden, looked.frame.depth, looked.frame.intrinsics.fx)
         depth, heights = (np.where(lost, np.float32(np.nan), values) for values in (looked.frame.depth, looked.heights))
-        sights.append(
-            Sight(looked.frame.intrinsics, table_from_world @ looked.frame.world_from_camera, mask, hidden, depth, heights, sigma)
-        )
+        table_from_camera = table_from_world @ looked.frame.world_from_camera
+        sights.append(Sight(looked.frame.intrinsics, table_from_camera, mask, hidden, looked.frame.color, depth, heights, sigma))
         rows, columns = np.nonzero(mask[cut] & np.isfinite(heights[cut]))
         clouds.append(looked.points(rows + y, columns + x))
         paints.append(looked.frame.color[rows + y, columns + x])

@@ -20,13 +20,14 @@ class Sight:
     """One camera's view of one thing.
 
     mask (H, W) bool: the thing; hidden (H, W) bool: something else in front may hide it, so that a miss there says nothing.
-    depth (H, W) float32 metres, NaN none; heights (H, W) float32 above the table; sigma: noise of the heights at the thing.
+    color (H, W, 3) uint8 RGB; depth (H, W) float32 metres, NaN none; heights (H, W) float32 above the table; sigma: noise of the heights at the thing.
     """
 
     intrinsics: Intrinsics
     table_from_camera: NDArray[np.float64]
     mask: NDArray[np.bool_]
     hidden: NDArray[np.bool_]
+    color: NDArray[np.uint8]
     depth: NDArray[np.float32]
     heights: NDArray[np.float32]
     sigma: float

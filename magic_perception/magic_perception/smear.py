@@ -348,3 +348,31 @@ def behind(mask: NDArray[np.bool_], heights: NDArray[np.float32]) -> NDArray[np.
         low = (heights[cut] < LOW) & (around > HIGH)
         result[cut] = mask[cut] & (low | (bar & (heights[cut] < around - FALL)))
     return result
+
+
+#: A thing lies so far behind another, m, that a depth between theirs is told to be nearer to the one or the other.
+APART_IN_DEPTH = 0.03
+
+
+def before(mask: NDArray[np.bool_], others: NDArray[np.bool_], depth: NDArray[np.float32], focal: float) -> NDArray[np.bool_]:
+    """Pixels of a mask (H, W) that have the depth of something before the thing, carried past that one's edge.
+
+    others (H, W): other things; depth (H, W) metres; focal: focal length, pixels.
+    """
+    reach = max(3, round(REACH * focal / 615))
+    result = np.zeros_like(mask)
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    cut = (slice(max(y - reach, 0), y + h + reach), slice(max(x - reach, 0), x + w + reach))
+    mine, measured = mask[cut], depth[cut]
+    around = np.ones((2 * reach + 1,) * 2, np.uint8)
+    nearest = cv2.erode(np.where(others[cut] & np.isfinite(measured), measured, np.float32(np.inf)), around)
+    inner = mine & np.isinf(nearest) & np.isfinite(measured)
+    if not inner.any() or not (mine & np.isfinite(nearest)).any():
+        return result
+    _, index = cv2.distanceTransformWithLabels((~inner).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    value = np.zeros(int(np.count_nonzero(inner)) + 1, np.float32)
+    value[index[inner]] = measured[inner]
+    own = value[index]
+    with np.errstate(invalid="ignore"):
+        result[cut] = mine & (own - nearest > APART_IN_DEPTH) & (measured < 0.75 * own + 0.25 * nearest)
+    return result

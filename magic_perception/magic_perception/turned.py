@@ -4,42 +4,25 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from functools import cached_property
 
-import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from magic_core import transforms
 from magic_core.mesh import Mesh, concatenate
-from magic_perception import clusters, polygons, primitives
+from magic_perception import primitives
+from magic_perception.body import Body
+from magic_perception.handles import HOLE, handle_of, standing_off
 from magic_perception.parameters import Parameters
 from magic_perception.sight import Sight, carve
 from magic_perception.solids import Reconstruction, hull_of
 
 
-@dataclass(frozen=True)
-class Body:
-    """A round body: axis (2,), profile (K, 2) of radius and z from the table up, open at the top or not, or through and through (a band).
-
-    floor: height of the floor inside, m, where it was seen.
-    """
-
-    axis: NDArray[np.float64]
-    profile: NDArray[np.float64]
-    open: bool = False
-    through: bool = False
-    floor: float | None = None
-
-    def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.interp(z, self.profile[:, 1], self.profile[:, 0])
-
-
 def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: float, noise: float, wall: float, seed: int) -> Body | None:
     """The body of revolution on which most of the side points lie, or ``None``.
 
-    x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in a parabola q, so that conical and bulged bodies fit at once.
+    x^2 + y^2 = 2 a x + 2 b y + q(z): linear in the axis (a, b) and in q, straight between levels, so that
+    conical, bulged and waisted bodies fit at once.
     """
     index = np.nonzero((points[:, 2] > 0.08 * height) & (points[:, 2] < 0.94 * height))[0]
     if len(index) < 60:
@@ -100,7 +83,7 @@ def _sector(points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
 
 @dataclass(frozen=True)
 class _Side:
-    """What :func:`round_body` fits: axis (2,); q (3,), the parabola in z / height, with respect to ``origin`` (2,)."""
+    """What :func:`round_body` fits: axis (2,); q (K,), r^2 with respect to ``origin`` (2,) at levels from the table to the height."""
 
     origin: NDArray[np.float64]
     shift: NDArray[np.float64]
@@ -113,8 +96,18 @@ class _Side:
 
     def radius(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """At heights z above the table, metres."""
-        z = z / self.height
-        return np.sqrt(np.maximum(self.q[0] + self.q[1] * z + self.q[2] * z**2 + self.shift @ self.shift, 1e-6))
+        return np.sqrt(np.maximum(_hats(z / self.height, len(self.q)) @ self.q + self.shift @ self.shift, 1e-6))
+
+
+#: Between its levels a side is straight; they are about so far apart, m.
+LEVEL = 0.012
+#: How stiff a side is, against bends between levels.
+STIFF = 0.1
+
+
+def _hats(z: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """(N, count): the weights of levels at heights z (N,) from 0 to 1."""
+    return np.maximum(0.0, 1.0 - np.abs(np.clip(z, 0.0, 1.0)[..., None] * (count - 1) - np.arange(count)))
 
 
 def _fit(
@@ -131,16 +124,19 @@ def _fit(
     near = np.abs(np.linalg.norm(front[:, :2] - origin, axis=1) - first) < start
     # From the start on: a front alone, with a handle before it, tells little of where the axis is.
     on = np.abs(first - wall - np.linalg.norm(inner[:, :2] - origin, axis=1)) < start
-    side = _Side(origin, np.zeros(2), np.array([first**2, 0.0, 0.0]), height)
-    for width in (3 * band, 2 * band, 1.5 * band, 1.5 * band):
+    count = max(3, min(12, round(height / LEVEL) + 1))
+    bends = np.diff(np.eye(count), 2, axis=0)
+    side = _Side(origin, np.zeros(2), np.full(count, first**2), height)
+    for width in (3 * band, 3 * band, 2 * band, 1.5 * band, 1.5 * band):
         if np.count_nonzero(near) < 25:
             return None
         away = inner[on, :2] - side.axis
         opposite = inner[on, :2] + away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6) * wall
         local = np.concatenate([front[near, :2], opposite]) - origin
         z = np.concatenate([front[near, 2], inner[on, 2]]) / height
-        matrix = np.column_stack([2 * local, np.ones(len(z)), z, z**2])
-        model = np.linalg.lstsq(matrix, np.sum(local**2, axis=1), rcond=None)[0]
+        stiff = np.sqrt(STIFF * len(z)) * np.column_stack([np.zeros((count - 2, 2)), bends])
+        matrix = np.vstack([np.column_stack([2 * local, _hats(z, count)]), stiff])
+        model = np.linalg.lstsq(matrix, np.append(np.sum(local**2, axis=1), np.zeros(count - 2)), rcond=None)[0]
         side = _Side(origin, model[:2], model[2:], height)
         near = np.abs(np.linalg.norm(front[:, :2] - side.axis, axis=1) - side.radius(front[:, 2])) < width
         on = np.abs(side.radius(inner[:, 2]) - wall - np.linalg.norm(inner[:, :2] - side.axis, axis=1)) < width
@@ -310,7 +306,7 @@ def build_round(
     out = points[beyond > max(0.005, 2.5 * noise)]
     handle = None
     if len(out) > 20:
-        out = _standing_off(out, body)
+        out = standing_off(out, body)
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
         if len(out) > 0.02 * len(points) and np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010:
             handle = handle_of(sights, out, body)
@@ -395,237 +391,3 @@ def turned_body(body: Body, wall: float, sectors: int = 16) -> tuple[Mesh, list[
             if hull is not None:
                 pieces.append(hull)
     return mesh, pieces
-
-
-#: Edge of a cell of a handle's plane, m; cameras see it where they look at it no more askew than this cosine.
-CELL, SQUARELY = 0.001, 0.25
-#: Pixels around a round body within which a mask may be the body's own.
-EDGE = 3
-#: The largest width of a handle's bar, or of bar and hole where no camera sees through that, m: what is wider is a part of another form. (Handles of made
-#: mugs stand off by 28 to 48 mm.)
-BAR = 0.05
-#: The least hole between a handle and its body, m^2.
-HOLE = 6e-5
-#: A handle's bow is what stands off from the body farther than this share of how far it stands off at most; of nine made mugs the surface is as near with 0.4,
-#: without it up to 5 mm farther off.
-BOW = 0.2
-
-
-@dataclass(frozen=True)
-class Handle:
-    """Bars beside a round body: their meshes and convex pieces, and the largest hole that they enclose with the body, m^2."""
-
-    bars: list[Mesh]
-    pieces: list[Mesh]
-    hole: float
-
-
-@dataclass(frozen=True)
-class _Plane:
-    """The upright plane of a handle, which holds the body's axis, in cells of :data:`CELL`.
-
-    base (3,): where the axis meets the table; out, up, across (3,): unit vectors away from the axis, upwards, and along the normal; start: distance of the
-    first column of cells from the axis, m; s, z (Z, S): distances of the cells from the axis, and their heights, m.
-    """
-
-    base: NDArray[np.float64]
-    out: NDArray[np.float64]
-    up: NDArray[np.float64]
-    across: NDArray[np.float64]
-    start: float
-    s: NDArray[np.float64]
-    z: NDArray[np.float64]
-
-    @classmethod
-    def through(cls, points: NDArray[np.float64], along: NDArray[np.float64], body: Body) -> _Plane:
-        """The plane in the direction ``along`` (2,) from a body's axis, as large as a handle with these points (N, 3) may be."""
-        out, up = np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])
-        start = float(body.profile[:, 0].min()) - 0.004
-        top = float(max(body.profile[-1, 1], np.percentile(points[:, 2], 99))) + 0.004
-        # Farther out than its points: depth may have lost its bow.
-        end = float(np.percentile((points[:, :2] - body.axis) @ along, 99.5)) + 0.025
-        s, z = np.meshgrid(np.arange(start, end, CELL), np.arange(0.0, top, CELL))
-        return cls(np.array([*body.axis, 0.0]), out, up, np.cross(out, up), start, s, z)
-
-    @cached_property
-    def places(self) -> NDArray[np.float64]:
-        """(Z, S, 3): where the cells are."""
-        return self.base + self.s[..., None] * self.out + self.z[..., None] * self.up
-
-    @cached_property
-    def middle(self) -> NDArray[np.float64]:
-        """(3,)."""
-        return self.places.mean(axis=(0, 1))
-
-    def facing(self, sight: Sight) -> float:
-        """How squarely a camera looks at the plane: the cosine of the angle from its normal."""
-        return abs(float((self.middle - sight.eye) @ self.across)) / np.linalg.norm(self.middle - sight.eye)
-
-    def cells_of(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """(Z, S): 1 where points (N, 3) fall."""
-        cells = np.zeros(self.s.shape, np.uint8)
-        column = np.round(((points[:, :2] - self.base[:2]) @ self.out[:2] - self.start) / CELL).astype(int)
-        row = np.round(points[:, 2] / CELL).astype(int)
-        good = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
-        cells[row[good], column[good]] = 1
-        return cells
-
-    def seen(self, sight: Sight, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(Z, S): the cells that a camera sees in a mask (H, W) of its picture."""
-        return sight.look_up(self.places, mask.astype(np.float32)) > 0.5
-
-
-def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body) -> Handle | None:
-    """A handle as bars in the upright plane through the body's axis, from points (N, 3) beyond the body; ``None`` if nothing is left after carving."""
-    local = out[:, :2] - body.axis
-    along, thickness = _handle_plane(local, np.linalg.norm(local, axis=1) - body.radius(out[:, 2]))
-    plane = _Plane.through(out, along, body)
-    points = plane.cells_of(out)
-    near = cv2.dilate(points, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))) > 0
-    covered = np.zeros(near.shape, bool)
-    useful = [sight for sight in sights if plane.facing(sight) > SQUARELY]
-    if useful:
-        # Where depth lost a thin bar, the mask beside the body's outline is the handle's.
-        drawn = [_drawn(sight, body) for sight in useful]
-        beside = [sight.mask & ~_wider(there, EDGE) for sight, there in zip(useful, drawn, strict=True)]
-        thickness = min([thickness, *(_widest(sight, mask, plane.middle) for sight, mask in zip(useful, beside, strict=True))])
-        seen = [plane.seen(sight, mask) for sight, mask in zip(useful, beside, strict=True)]
-        near |= clusters.connected(near | np.any(seen, axis=0), near, 8)
-        field = _carved(plane, useful, drawn, thickness)
-        covered = _covered(plane, useful, drawn, body, field)
-    else:
-        field = cv2.morphologyEx(points, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
-    solid = _bars(field > 0.5, near, covered, plane.s, plane.z, body)
-    if 2 * CELL * float(cv2.distanceTransform(solid, cv2.DIST_L2, 5).max()) > BAR:
-        return None
-    outlines = polygons.outline(polygons.smooth_field(solid > 0, 1.2), np.array([plane.start, 0.0]), CELL, simplify=0.0004)
-    # Only what reaches farther out than noise is a handle.
-    parts = [p for p in outlines if p.area > 3e-5 and p.bounds[2] - float(body.radius(np.array((p.bounds[1] + p.bounds[3]) / 2))) > 0.008]
-    if not parts:
-        return None
-    frame = transforms.make(np.column_stack([plane.out, plane.up, plane.across]), plane.base)
-    low, high = -thickness / 2, thickness / 2
-    rings = [ring for p in parts for ring in polygons.convex_parts(p.simplify(0.0006), 0.0005)]
-    return Handle(
-        [polygons.extrude(p, low, high).transformed(frame) for p in parts],
-        [polygons.prism(ring, low, high).transformed(frame) for ring in rings],
-        _largest_hole(plane, solid, body),
-    )
-
-
-def _carved(plane: _Plane, sights: list[Sight], drawn: list[NDArray[np.bool_]], thickness: float) -> NDArray[np.float32]:
-    """(Z, S) 0..1: how solid the cells are by the masks and depths of cameras; drawn (H, W) of each: where it sees the body; thickness: of the handle, m."""
-    # Half of the thickness, so that a few degrees of error in the plane do not eat thin bars.
-    columns = [plane.places + n * plane.across for n in np.linspace(-thickness / 4, thickness / 4, 3)]
-    # Where a camera has the body in its picture its mask says nothing of the handle.
-    told = [replace(sight, hidden=sight.hidden | there) for sight, there in zip(sights, drawn, strict=True)]
-    # Of a bar no wider than the smear of depth a measurement a little behind it says nothing: only one far behind shows a hole.
-    return carve(told, columns, max(0.04, 1.5 * thickness), [plane.facing(sight) ** 2 for sight in sights])
-
-
-def _covered(
-    plane: _Plane, sights: list[Sight], drawn: list[NDArray[np.bool_]], body: Body, field: NDArray[np.float32]
-) -> NDArray[np.bool_]:
-    """(Z, S): the cells that are behind the body for all cameras; drawn (H, W) of each camera: where it sees the body; field: as :func:`_carved` has it."""
-    # Before the body depth sees the handle, behind it nothing does; at the body's edge a mask may be the body's.
-    behind = [bool((sight.eye[:2] - body.axis) @ plane.out[:2] < 0) for sight in sights]
-
-    def behind_for_all(masks: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-        return np.all([plane.seen(sight, mask) & far for sight, mask, far in zip(sights, masks, behind, strict=True)], axis=0)
-
-    return behind_for_all(drawn) | (behind_for_all([_wider(there, EDGE) for there in drawn]) & (field > 0.5))
-
-
-def _largest_hole(plane: _Plane, solid: NDArray[np.uint8], body: Body) -> float:
-    """The largest area, m^2, that a handle's cells (Z, S) enclose with the body."""
-    filled = (solid > 0) | ((plane.s < body.radius(plane.z)) & (plane.z < body.profile[-1, 1]))
-    _, holes, stats, _ = cv2.connectedComponentsWithStats(np.pad(~filled, 1, constant_values=True).view(np.uint8), connectivity=4)
-    enclosed = np.delete(stats[:, cv2.CC_STAT_AREA], [0, holes[0, 0]])
-    return float(enclosed.max(initial=0)) * CELL**2
-
-
-def _standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:
-    """Of the points (N, 3) beyond the body the largest cluster, and the others in its direction, to ``apart`` radians: a handle that depth tore."""
-    labels = clusters.cluster(out, 0.012, 4, 0.003)
-    if labels.max(initial=-1) < 0:
-        return out
-    sizes = np.bincount(labels[labels >= 0])
-    middles = np.array([out[labels == i, :2].mean(axis=0) - body.axis for i in range(len(sizes))])
-    angles = np.arctan2(middles[:, 1], middles[:, 0])
-    off = np.abs((angles - angles[np.argmax(sizes)] + np.pi) % (2 * np.pi) - np.pi)
-    return out[np.isin(labels, np.flatnonzero((off < apart) & (sizes >= 8)))]
-
-
-def _drawn(sight: Sight, body: Body) -> NDArray[np.bool_]:
-    """Where the round body is in a camera's picture (H, W)."""
-    turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-    radius, z = body.profile.T
-    rings = np.stack(
-        [
-            body.axis[0] + radius[:, None] * np.cos(turns),
-            body.axis[1] + radius[:, None] * np.sin(turns),
-            np.broadcast_to(z[:, None], (len(z), 32)),
-        ],
-        axis=-1,
-    )
-    drawn = np.zeros(sight.mask.shape, np.uint8)
-    for low, high in itertools.pairwise(sight.pixels(rings)):
-        cv2.fillConvexPoly(drawn, cv2.convexHull(np.concatenate([low, high])).round().astype(np.int32), 1)
-    return drawn > 0
-
-
-def _wider(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    return cv2.dilate(mask.view(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
-
-
-def _widest(sight: Sight, mask: NDArray[np.bool_], place: NDArray[np.float64]) -> float:
-    """How wide a handle's bar is at its widest in a mask, metres at the handle's place (3,), and no less than 5 mm; a bar is about as thick."""
-    if not mask.any():
-        return float("inf")
-    distance = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, 5)
-    away = float(np.linalg.norm(place - sight.eye))
-    return max(2 * float(distance.max()) * away / sight.intrinsics.fx, 0.005)
-
-
-def _handle_plane(local: NDArray[np.float64], beyond: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Direction (2,) from the axis in which a handle's points (N, 2) stand off, seen from above, and its thickness in metres; beyond (N,): how far they are
-    outside of the body.
-
-    What stands off farthest tells it: near the body there is smear as well, and what of the body is not quite round.
-    """
-    local = local[beyond > BOW * np.percentile(beyond, 95)]
-    direction = local.mean(axis=0)
-    angle = float(np.arctan2(direction[1], direction[0]))
-    for _ in range(3):
-        along = np.array([np.cos(angle), np.sin(angle)])
-        across = np.array([-along[1], along[0]])
-        low, high = np.percentile(local @ across, [4, 96])
-        angle += float(np.arctan2((low + high) / 2, np.median(local @ along)))
-    return np.array([np.cos(angle), np.sin(angle)]), float(np.clip(high - low, 0.005, 0.03))
-
-
-def _bars(
-    seen: NDArray[np.bool_],
-    near: NDArray[np.bool_],
-    covered: NDArray[np.bool_],
-    grid_s: NDArray[np.float64],
-    grid_z: NDArray[np.float64],
-    body: Body,
-) -> NDArray[np.uint8]:
-    """The handle's cells in its plane: what was ``seen`` solid ``near`` its points, joined to the body.
-
-    All (Z, S); covered: behind the body for all cameras; grid_s and grid_z are the cells' distances from the axis and heights, metres.
-    """
-    within = grid_s < body.radius(grid_z)
-    attach = within & (grid_s > body.radius(grid_z) - 0.0025) & (grid_z < body.profile[-1, 1])
-    solid = seen & near & ~within & ~covered
-    # What goes out of sight behind the body goes on to it, level by level, and so does a hole.
-    known = ~covered & ~within
-    first = known.argmax(axis=1)
-    on = solid[np.arange(len(solid)), first] & known.any(axis=1)
-    solid |= on[:, None] & covered & ~within & (np.arange(solid.shape[1]) < first[:, None])
-    # Where the bar meets the body its points are few: join them over 5 mm.
-    reachable = cv2.dilate(attach.astype(np.uint8), np.ones((1, 11), np.uint8)) > 0
-    solid |= reachable & seen & ~within & (cv2.dilate(solid.astype(np.uint8), np.ones((5, 11), np.uint8)) > 0)
-    solid |= attach & (cv2.dilate(solid.astype(np.uint8), np.ones((3, 7), np.uint8)) > 0)
-    return cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import primitives
+from magic_perception.body import Body
 from magic_perception.parameters import Parameters
 from magic_perception.sight import Sight
 from magic_perception.solids import Reconstruction
-from magic_perception.turned import Body, fit_to_silhouettes, seen_into, turned_body
+from magic_perception.turned import fit_to_silhouettes, seen_into, turned_body
 
 #: Of the rim: its least and largest radius, m; four fifths of the highest points lie within this share of the radius from its circle, in this
 #: share of all directions from its middle.

@@ -358,7 +358,14 @@ def test_what_agrees_with_a_ring():
     mesh = hoop()
     frame, ids = scenes.capture([mesh], noise=0.0)
     sight = Sight(
-        frame.intrinsics, frame.world_from_camera, ids == 0, np.zeros(ids.shape, bool), frame.depth, np.zeros(ids.shape, np.float32), 1e-3
+        frame.intrinsics,
+        frame.world_from_camera,
+        ids == 0,
+        np.zeros(ids.shape, bool),
+        frame.color,
+        frame.depth,
+        np.zeros(ids.shape, np.float32),
+        1e-3,
     )
     true, filled = agreement(mesh, [sight]), agreement(mesh.convex_hull(), [sight])
     assert true.overlap > 0.95 and true.through < 0.01

@@ -174,3 +174,21 @@ def test_smear_is_cut_beside_a_thing_whose_colour_the_room_behind_the_table_has(
     found = cleared(wide, picture(thing | room), depth, thing)
     assert found[94:126, 64:98].mean() > 0.95
     assert not found[94:126, 102:].any()
+
+
+def test_depth_of_what_stands_before_a_thing_is_none_of_the_thing():
+    # A post 0.3 m before a plate; its depth is carried 6 pixels over the plate, and pixels between are of both.
+    u = np.mgrid[0:120, 0:160][1]
+    post, plate = (u >= 70) & (u < 84), np.zeros((120, 160), bool)
+    plate[20:100, 20:140] = True
+    depth = np.where(post, 0.6, 0.9).astype(np.float32)
+    depth[(u >= 64) & (u < 70)] = 0.6
+    depth[(u >= 84) & (u < 88)] = 0.8
+    carried = smear.before(plate & ~post, post, depth, 615.0)
+    assert np.array_equal(carried, plate & ~post & (depth < 0.85))
+    # A handle that reaches towards the camera beside the post is the thing's.
+    depth[40:60, 60:64] = 0.85
+    assert not smear.before(plate & ~post, post, depth, 615.0)[40:60, 60:64].any()
+    # Nothing is taken from what lies behind, or beside what is as near.
+    assert not smear.before(plate & ~post, post, np.where(post, 1.2, 0.9).astype(np.float32), 615.0).any()
+    assert not smear.before(plate & ~post, post, np.where(post, 0.88, 0.9).astype(np.float32), 615.0).any()

@@ -33,7 +33,7 @@ def sights(mesh: Mesh) -> list[Sight]:
         frame, ids = scenes.capture([mesh], name, noise=0.0)
         mask = ids == 0
         heights = transforms.apply(pose, frame.intrinsics.unproject(frame.depth).reshape(-1, 3).astype(float))[:, 2].reshape(mask.shape)
-        found.append(Sight(frame.intrinsics, pose, mask, np.zeros_like(mask), frame.depth, heights.astype(np.float32), 0.001))
+        found.append(Sight(frame.intrinsics, pose, mask, np.zeros_like(mask), frame.color, frame.depth, heights.astype(np.float32), 0.001))
     return found
 
 
