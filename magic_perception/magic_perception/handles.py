@@ -29,6 +29,8 @@ HOLE = 6e-5
 #: A handle's bow is what stands off from the body farther than this share of how far it stands off at most; of nine made mugs the surface is as near with 0.4,
 #: without it up to 5 mm farther off.
 BOW = 0.2
+#: A handle is no thicker than this, m; points lie about its plane with a deviation of so much.
+THICKEST, ABOUT = 0.03, 0.006
 
 
 @dataclass(frozen=True)
@@ -250,15 +252,21 @@ def _handle_plane(local: NDArray[np.float64], beyond: NDArray[np.float64]) -> tu
 
     What stands off farthest tells it: near the body there is smear as well, and what of the body is not quite round.
     """
-    local = local[beyond > BOW * np.percentile(beyond, 95)]
-    direction = local.mean(axis=0)
-    angle = float(np.arctan2(direction[1], direction[0]))
+    far = beyond > BOW * np.percentile(beyond, 95)
+    local, weight = local[far], beyond[far]
+    # The direction about which most of it lies: smear beside a handle would draw a mean to itself.
+    turns = np.radians(np.arange(360))
+    out, across = (np.stack([np.cos(turns + quarter), np.sin(turns + quarter)]) for quarter in (0.0, np.pi / 2))
+    beside = np.exp(-0.5 * (local @ across / ABOUT) ** 2) * (local @ out > 0)
+    angle = float(turns[np.argmax(weight @ beside)])
+    low, high = -THICKEST / 2, THICKEST / 2
     for _ in range(3):
         along = np.array([np.cos(angle), np.sin(angle)])
-        across = np.array([-along[1], along[0]])
-        low, high = np.percentile(local @ across, [4, 96])
-        angle += float(np.arctan2((low + high) / 2, np.median(local @ along)))
-    return np.array([np.cos(angle), np.sin(angle)]), float(np.clip(high - low, 0.005, 0.03))
+        aside = local @ np.array([-along[1], along[0]])
+        own = np.abs(aside) < THICKEST / 2
+        low, high = np.percentile(aside[own], [4, 96])
+        angle += float(np.arctan2((low + high) / 2, np.median((local @ along)[own])))
+    return np.array([np.cos(angle), np.sin(angle)]), float(np.clip(high - low, 0.005, THICKEST))
 
 
 def _bars(
