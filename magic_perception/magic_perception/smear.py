@@ -30,6 +30,8 @@ APART, MOST = 2.5, 0.4
 LIKE = 25.0
 #: A hole is hollow in depth, by so many metres, or it has the table's colour to so many squared standard deviations.
 HOLLOW, SAME = 0.004, 4.0
+#: A filled hole is hollow by so many metres where so much of its border is of the thing's own colours.
+SHALLOW, CLOSED = 0.002, 0.95
 #: Depth falls back beyond an outline by so many metres more than a surface at 45 degrees would, looked for so many pixels beside it.
 STEP, BESIDE = 0.005, 3
 #: Least pixels of a hole, and of either kind for its histogram to tell anything.
@@ -248,7 +250,7 @@ def _smeared(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDAr
             and float(told.field[cut][part].mean()) >= HOLE
             and (_hollow(near, part, ring, cut) or float(np.median(near.unlike[cut][part])) < SAME)
             and not _sticks_out(near, parts == i, empty, 2 * most)
-            and not _stands(told, part, cut, reach)
+            and (not _stands(told, part, cut, reach) or _sunk(near, part, ring, cut, empty))
         ):
             removed[cut] |= part
     # A surface of the table's colour that goes on farther than smear reaches is the thing's own.
@@ -266,6 +268,16 @@ def _hollow(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: 
     # Behind its rim, and more so than a slope explains.
     back = float(np.median(near.depth[cut][inside]) - np.median(near.depth[cut][rim]))
     return back > HOLLOW and float(np.median(_from_plane(near.depth[cut], rim, inside))) > HOLLOW
+
+
+def _sunk(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: tuple[slice, slice], empty: NDArray[np.bool_]) -> bool:
+    """Whether a patch of the table's colour has the region's own colours all around, as no face has that meets the table, and depth lies behind theirs, if only by as
+    much as is left of a hole that it fills."""
+    border = (cv2.dilate(part.view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~part
+    inside, rim = part & np.isfinite(near.depth[cut]), ring & np.isfinite(near.depth[cut])
+    if float((near.mine[cut] & ~empty[cut])[border].mean()) < CLOSED or np.count_nonzero(rim) <= 8 or not inside.any():
+        return False
+    return float(np.median(_from_plane(near.depth[cut], rim, inside))) > SHALLOW
 
 
 def _stands(told: _Told, part: NDArray[np.bool_], cut: tuple[slice, slice], reach: int) -> bool:

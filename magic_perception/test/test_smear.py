@@ -46,6 +46,18 @@ def test_a_fattened_ring_with_its_hole_filled_becomes_the_ring_again(hollow: flo
     assert not found[96:104, 96:104].any()
 
 
+@pytest.mark.parametrize(("hollow", "remains"), [(0.003, False), (0.0, True)])
+def test_a_hole_that_depth_filled_almost_is_open_also_where_depth_goes_on_past_the_rim(hollow: float, remains: bool) -> None:
+    # A handle close to the table; and a label of the table's colour, which lies on its face.
+    truth = ring(24, 12)
+    table = cv2.dilate(ring(24, 0).astype(np.uint8), np.ones((9, 9))) == 0
+    depth = np.where(ring(200, 12), 0.6, 0.6 + hollow).astype(np.float32)
+    unlike, everywhere = np.where(truth, 100, 0.0).astype(np.float32), np.ones(truth.shape, bool)
+    color = picture(truth)
+    found, _ = smear.cleared(ring(24, 0), color, depth, table, unlike, everywhere, np.zeros(truth.shape, bool), 615.0)
+    assert found[96:104, 96:104].any() == remains
+
+
 def test_a_rim_that_depth_lost_is_put_back() -> None:
     truth = ring(50, 0)
     found = cleared(ring(44, 0), picture(truth), np.full(truth.shape, 0.6, np.float32), truth)
