@@ -308,7 +308,7 @@ def build_round(
     if len(out) > 20:
         out = standing_off(out, body)
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
-        if len(out) > 0.02 * len(points) and np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010:
+        if len(out) > 0.01 * len(points) and np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010:
             handle = handle_of(sights, out, body)
             if handle is None and len(out) > 0.15 * len(points):
                 return None
