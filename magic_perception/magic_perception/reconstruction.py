@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception import clusters, polygons, primitives
+from magic_perception.body import Body
 from magic_perception.boxes import recognise_box
 from magic_perception.carved import build_carved
 from magic_perception.lain import build_lain
@@ -38,7 +39,7 @@ from magic_perception.parameters import Parameters
 from magic_perception.scoops import build_scoop
 from magic_perception.sight import Agreement, Sight, agreement, surfaces
 from magic_perception.solids import Reconstruction, extruded
-from magic_perception.turned import build_round
+from magic_perception.turned import build_round, seen_into
 from magic_perception.vessels import build_vessel
 
 __all__ = ["Reconstruction", "Sight", "as_in_paper", "reconstruct"]
@@ -56,12 +57,12 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
     found = primitives.recognise(points, height, noise)
     if found is not None:
         fit = agreement(found.mesh, sights)
-        if fit.overlap > 0.75 and fit.through < _FREE:
+        if fit.overlap > 0.75 and fit.through < _FREE and not _open(found, sights, noise):
             return replace(found, fit=fit)
     found = recognise_box(sights, height, noise)
     if found is not None:
         fit = agreement(found.mesh, sights)
-        if fit.overlap > _LEAST[found.shape] and fit.through < _FREE:
+        if fit.overlap > _LEAST[found.shape] and fit.through < _FREE and not _open(found, sights, noise):
             return replace(found, fit=fit)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     axes = np.linalg.svd(spread[:: max(1, len(spread) // 4000)], full_matrices=False)[2]
@@ -115,6 +116,15 @@ _WELL = 0.86
 DRAWS = 3
 #: A solid is clearly better than another by so much of the score.
 _CLEARLY = 0.05
+
+
+def _open(found: Reconstruction, sights: list[Sight], noise: float) -> bool:
+    """Whether cameras look into what is taken for a cylinder: of a narrow cup little of the inside shows."""
+    if found.shape != "cylinder":
+        return False
+    (x, y, _), (wide, deep, high) = found.mesh.bounds.mean(axis=0), found.mesh.extents
+    radius = (wide + deep) / 4
+    return seen_into(sights, Body(np.array([x, y]), np.array([[radius, 0.0], [radius, high]])), noise)
 
 
 def _agreeing(solid: Reconstruction | None, sights: list[Sight], least: float) -> list[tuple[float, Reconstruction]]:

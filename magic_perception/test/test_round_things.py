@@ -186,6 +186,20 @@ def test_a_fin_before_its_body_has_no_hole():
     assert item.mesh.to_trimesh().euler_number == 2
 
 
+@pytest.mark.parametrize("is_open", [True, False])
+def test_a_narrow_cup_that_one_camera_sees_is_open_and_a_tin_is_not(is_open):
+    radius, height = 0.028, 0.137
+    inside = [[radius - 0.0035, height], [radius - 0.0035, 0.004], [0, 0.004]]
+    solid = trimesh.creation.revolve(
+        np.array([[0, 0], [radius, 0], [radius, height], *(inside if is_open else [[0, height]])]), sections=64
+    )
+    cup = scenes.placed(Mesh(solid.vertices, solid.faces), 0.6, 0.1).painted((60, 120, 170))
+    item, _ = seen(cup, ("right",), poses=sensor.STATION)
+    found = item.mesh.to_trimesh()
+    assert (found.volume < 0.6 * found.convex_hull.volume) == is_open
+    assert distance(cup, item.mesh.transformed(item.world_from_object)) < 0.002
+
+
 def test_a_waisted_body_is_no_handle():
     z = np.linspace(0, 0.09, 40)
     outer = np.column_stack([0.036 + 0.008 * np.sin(2 * np.pi * z / 0.09), z])
