@@ -54,6 +54,9 @@ HEAVIER, MOST_ITERATIONS = 10.0, 4.0
 #: While the fingers close on a tool that weighs less than this (kg) steps are solved by more iterations, in proportion, up to so many times as
 #: many: with 8 the fingers sank through a spoon of 18 g from both sides, with 16 through one of 9 g, and squeezed light hooks out.
 LIGHTER, MOST_CLOSING = 0.07, 16.0
+#: A tool that lies on the table is left unsolved once it has been slower than this (m/s) for 0.4 s, until the fingers begin to close or something
+#: touches it: half of a step are contacts with the table that do nothing.
+LYING = 0.001
 #: An arm that has let go and come to the end of its motion is left to stand still, unsolved, after so many seconds.
 ASLEEP = 0.15
 #: So is one that holds its tool at the end, and the tool with it, where the pads bear no more than this share of what they hold and it has moved by
@@ -123,6 +126,8 @@ class ArmRun:
         self._motion = motion
         self._rests = rests and held is None and not self._in_hand
         self.world = fill_world(setup, KINEMATIC if self._rests else DYNAMIC)
+        if self._coupled and held is None and not self._in_hand:
+            self.world.doze(TOOL, LYING)
         if setup.target_kind == DYNAMIC:
             self._iterate_for_weight()
         self._arm = Articulation(self.world, robot, self.options)
@@ -289,6 +294,7 @@ class ArmRun:
         dt = self.world.timestep
         if self._hold == 0 and self._coupled:
             tool = self.world.component(TOOL)
+            self.world.doze(TOOL, 0.0)
             self._iterations = tool.solver_position_iterations
             self._iterate(round(min(max(LIGHTER / tool.mass, 1.0), MOST_CLOSING) * self._iterations))
         self._hold += dt

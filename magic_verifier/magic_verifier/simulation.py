@@ -444,6 +444,12 @@ class World:
         """Take speed off a free body, linear and angular, by so much per second."""
         self._bodies[name].linear_damping = self._bodies[name].angular_damping = float(damping)
 
+    def doze(self, name: str, speed: float) -> None:
+        """Let the engine leave a body where it is once it has been slower than this (m/s) for 0.4 s, until something touches it; 0: never."""
+        self._bodies[name].sleep_threshold = speed**2 / 2
+        if speed == 0 and not self._bodies[name].kinematic:
+            self._bodies[name].wake_up()
+
     def move_to(self, name: str, pose: Any) -> None:
         """Where a kinematic body shall be after the next step (a sapien.Pose)."""
         self._bodies[name].kinematic_target = pose

@@ -10,7 +10,8 @@ from magic_core import transforms
 from magic_core.motion import ArmMotion, MotionPlan, ToolMotion
 from magic_core.robot import Description
 from magic_core.strategy import Physics
-from magic_verifier.arm_simulation import ArmRun
+from magic_verifier import arm_simulation
+from magic_verifier.arm_simulation import LYING, ArmRun
 from magic_verifier.articulation import ArmOptions
 from magic_verifier.floating import make_setup
 from magic_verifier.grip import LEAST, Grip, Patch, patch_of
@@ -196,9 +197,9 @@ def run_of(options, speed=0.0, grasp_time=0.1):
     return ArmRun(setup, MotionPlan("arm", ToolMotion(times, np.tile(tcp, (len(times), 1, 1))), arm), options, Limits(), robot)
 
 
-def closing_on(block, physics, rests=False):
-    """The Panda at home, its hand straight down to a stand 20 mm below the tip, closing at 0.2 s on a block (its ranges about the tip, y along the
-    fingers' way, z up); also where the block is put."""
+def closing_on(block, physics, rests=False, grasp_time=0.2):
+    """The Panda at home, its hand straight down to a stand 20 mm below the tip, closing after so many seconds on a block (its ranges about the tip,
+    y along the fingers' way, z up); also where the block is put."""
     robot = Description()
     home = np.asarray(robot.config.home, dtype=float)
     tcp = robot.forward(home)[0]
@@ -209,7 +210,7 @@ def closing_on(block, physics, rests=False):
     settings = Settings(position_iterations=8, velocity_iterations=1, contact_offset=0.002)
     times = np.linspace(0.0, 0.8, 81)
     q, still = np.tile(home, (len(times), 1)), np.zeros((len(times), len(home)))
-    arm = ArmMotion(times, robot.names, q, still, still, transforms.inverse(pose) @ tcp, 0.012, 0.2)
+    arm = ArmMotion(times, robot.names, q, still, still, transforms.inverse(pose) @ tcp, 0.012, grasp_time)
     plan = MotionPlan("arm", ToolMotion(times, np.tile(pose, (len(times), 1, 1))), arm)
     return ArmRun(make_setup(tool, target, (stand,), scenes.TABLE, physics, settings), plan, None, Limits(), robot, rests=rests), pose
 
@@ -278,6 +279,25 @@ def test_what_was_seen_to_lie_lies_until_it_is_touched(rests):
     if rests:
         assert run.held() is not None and transforms.rotation_angle(run.world.pose("tool"), pose) < 0.02
         assert not run.world.component("tool").kinematic
+
+
+@pytest.mark.parametrize("ends", [-0.3, -0.04])
+def test_what_lies_still_is_not_solved_until_the_fingers_close(ends, monkeypatch):
+    """A bar that lies on its stand, and one that reaches beyond it and tips; fingers close on the first as on one that was solved all the time."""
+    held = []
+    for speed in (LYING, 0.0):
+        monkeypatch.setattr(arm_simulation, "LYING", speed)
+        run, pose = closing_on(((ends, 0.04), (-0.006, 0.006), (-0.02, 0.006)), Physics(0.5, 600.0, 600.0), grasp_time=0.6)
+        while run.time < 0.595:
+            run.advance()
+        lies = transforms.rotation_angle(run.world.pose("tool"), pose) < 0.01
+        assert lies == (ends == -0.04)
+        assert run.world.component("tool").is_sleeping == (lies and speed > 0)
+        while lies and run.held() is None:
+            run.advance()
+            assert run.time < 0.7 and (run.time < 0.602 or not run.world.component("tool").is_sleeping)
+        held.append(run.world.pose("tool"))
+    np.testing.assert_allclose(*held, atol=3e-4)
 
 
 def test_what_is_held_is_free_whatever_touches_it():
