@@ -36,6 +36,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_perception.color_edges import parted
 from magic_perception.paths import CLEAR, Seen, State, changed, likeliest, moved, predicted
 from magic_perception.reshaped import Aside, Picture, Reshaping, raycaster
 from magic_perception.tool_colors import Said, ToolColors, lab
@@ -299,7 +300,8 @@ class Follower:
 
         Along the normal of each place of the drawn outline the tool's profile (inside, outside, and inside again behind a slit) is shifted
         until it agrees best with the colours; its mean shift and how sharp that is make the residual and its weight (after Stoiber and
-        others, "Iterative Corresponding Geometry", CVPR 2022).  What is hidden says nothing.
+        others, "Iterative Corresponding Geometry", CVPR 2022).  There the edge is sought (:mod:`magic_perception.color_edges`).  What is
+        hidden says nothing, nor does a place with no edge.
         """
         none = Aside(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         view = self._drawn(frame, pose)
@@ -335,6 +337,11 @@ class Follower:
         weight /= weight.sum(axis=1, keepdims=True)
         shift = weight @ shifts
         spread = weight @ shifts**2 - shift**2
+        drawn, room = _drawn_edges(profile)
+        starts = np.column_stack([columns, rows])
+        edge, found = parted(frame.color[view.rows, view.columns], hidden, starts, normal, drawn + shift, room)
+        found &= np.abs(shift) < sought
+        shift = edge - drawn
         depth = view.depth[rows, columns].astype(float)
         places = np.column_stack([columns + view.columns.start, rows + view.rows.start])
         k = frame.intrinsics
@@ -342,7 +349,7 @@ class Follower:
         points = transforms.apply(frame.world_from_camera, rays * depth[:, None])
         axis = normal @ frame.world_from_camera[:3, :2].T
         scale = depth / k.fx
-        sure = 1 / ((spread + SHARP**2) * scale**2) * np.clip(1 - spread / (sought**2 / 3), 0, 1)
+        sure = found / ((spread + SHARP**2) * scale**2) * np.clip(1 - spread / (sought**2 / 3), 0, 1)
         return Aside(shift * scale, axis, points, sure * min(1.0, LINES / len(sure)))
 
     def _information(self, frame: RgbdFrame, pose: Array, measured: tuple[Array, NDArray[np.bool_]], reach: float) -> tuple[Array, Array]:
@@ -497,6 +504,24 @@ class Follower:
             if reach == CLOSE and np.abs(change[:6]).max() < 2e-5:
                 break
         return State(pose, velocity, np.linalg.inv(matrix))
+
+
+def _drawn_edges(profile: Array) -> tuple[Array, Array]:
+    """Where on lines (K, 2n + 1) from inside a drawn thing (1) out of it (-1) its edge is, (K,) pixels from their middles, which are its outermost pixels;
+    and half of what there is of it to the inner side and of nothing to the outer, (K, 2) pixels."""
+    middle = profile.shape[1] // 2
+    outside = profile[:, middle + 1 :] <= 0
+    first = np.where(outside.any(axis=1), outside.argmax(axis=1), 0)
+    before, after = (np.take_along_axis(profile, (middle + first + k)[:, None], axis=1)[:, 0] for k in range(2))
+    edge = first + np.where(after < before, before / np.maximum(before - after, 1e-6), 0.5)
+    within = edge + _run(profile[:, middle::-1] > 0) - 0.5
+    beside = _run(np.where(np.arange(middle) < first[:, None], True, outside)) - first
+    return edge, np.column_stack([within, beside]) / 2
+
+
+def _run(true: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """How many (K,) of the first of (K, n) are true."""
+    return np.where(true.all(axis=1), true.shape[1], (~true).argmax(axis=1))
 
 
 def _add(matrix: Array, vector: Array, jacobian: Array, residual: Array, noise: float, reach: float) -> tuple[Array, Array]:

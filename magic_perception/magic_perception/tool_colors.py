@@ -26,6 +26,8 @@ SHAPE = tuple(256 // size for size in BIN)
 EVEN = 1 / math.prod(SHAPE)
 #: What is not the tool is ground, what moves, one of the other things, and anything else, with these chances.
 CHANCES = (0.3, 0.3, 0.3, 0.1)
+#: A pixel says what those of a square of so many to a side say on average.
+ALONE = 3
 #: Evidence of a pixel at most (natural logarithm of the ratio of likelihoods).
 EVIDENCE = 3.0
 #: The share of what is learned anew from each picture: of ground, and of what moves.
@@ -33,7 +35,7 @@ LEARNING = (0.1, 0.3)
 
 
 class Said(NamedTuple):
-    """What the colours of a picture say.  tool (H, W): the logarithm of how much likelier a pixel's colour is the tool's than that of anything
+    """What the colours of a picture say.  tool (H, W): the logarithm of how much likelier the colours about a pixel are the tool's than those of anything
     else; touches (H, W): it is not, and rather that of a hand or of another thing, which may touch the tool, than that of ground."""
 
     tool: NDArray[np.float32]
@@ -66,9 +68,11 @@ class ToolColors:
         own = self._own + STRANGE * EVEN
         other = ground * self._ground + moving * self._moving + others * self._others + rest * EVEN
         tool = np.clip(np.log(own / other), -EVIDENCE, EVIDENCE).astype(np.float32)
-        touches = (tool < 0) & ((self._moving + self._others) / 2 > self._ground)
+        touches = ((tool < 0) & ((self._moving + self._others) / 2 > self._ground)).astype(np.float32)
         bins = tuple(np.moveaxis(lab(frame) // BIN, -1, 0))
-        return Said(tool[bins], touches[bins])
+        # A pixel alone is of another thing's colour by chance, its neighbours are not.
+        tool, touches = (cv2.blur(each[bins], (ALONE, ALONE)) for each in (tool, touches))
+        return Said(tool, (tool < 0) & (touches > 0.5))
 
 
 def lab(frame: RgbdFrame) -> NDArray[np.uint8]:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from magic_core import transforms
-from magic_core.camera import Intrinsics
+from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.sensor import SMEARED, STATION, capture, scene_raycaster
 from magic_core.shapes import make
 from magic_core.testing.hand import coming, hand
-from magic_perception.following import BLIND, CLOSE, UNSURE, Followed, Follower, _known, follow
+from magic_perception.following import BLIND, CLOSE, SOUGHT, UNSURE, Followed, Follower, _known, follow
 from magic_perception.paths import moved
-from magic_perception.tool_colors import Said, ToolColors
+from magic_perception.tool_colors import Said, ToolColors, lab
 
 SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -149,6 +149,34 @@ def test_colours_tell_the_tool_from_the_ground_and_from_what_comes(hook):
     of_table = np.abs(empty - last.depth) < 0.005
     assert min(of_tool.sum(), of_hand.sum()) > 100
     assert (evidence[of_tool] > 0).mean() > 0.8 and (evidence[of_hand] < 0).mean() > 0.8 and (evidence[of_table] < 0).mean() > 0.95
+
+
+def test_the_outline_by_colours_is_where_it_is_and_not_where_they_mix():
+    """Brown on brown wood: what lies between both is a colour of the bowl's as well."""
+    spoon, _, poses, frames, _ = scooped()
+    follower = Follower(spoon.mesh, poses[0], TABLE)
+    follower.learn_colors(frames[:2])
+    off = []
+    for k in range(2, len(poses), 3):
+        for frame in frames[2 * k : 2 * k + 2]:
+            aside = follower.outline(frame, poses[k], follower.colors.said(frame), SOUGHT[1])
+            off.append(aside.off @ aside.weights / aside.weights.sum())
+            follower.see_around([frame], poses[k])
+    assert abs(np.mean(off)) < 0.0005 and np.max(np.abs(off)) < 0.0015
+
+
+def test_a_pixel_alone_is_not_another_thing():
+    colors, color = ToolColors(), np.full((40, 60, 3), (70, 40, 20), np.uint8)
+    color[:, 30:] = (205, 160, 135)
+    frame = RgbdFrame(color, np.ones((40, 60), np.float32), Intrinsics(60, 40, 50.0, 50.0, 30.0, 20.0), np.eye(4), "left", 0.0)
+    colors.learn(lab(frame)[:, :30].reshape(-1, 3), np.zeros((50, 3), np.uint8), [])
+    for _ in range(20):
+        colors.see_moving(lab(frame)[:, 30:].reshape(-1, 3))
+    color[20, 40] = color[0, 0]
+    color[20, 10] = color[0, -1]
+    tool, touches = colors.said(frame)
+    assert (tool[:, :29] > 0).all() and not touches[:, :29].any()
+    assert (tool[:, 31:] < 0).all() and touches[:, 31:].all()
 
 
 def test_what_is_looked_through_tells_of_a_wrong_pose_and_not_of_the_edge_of_a_right_one(hook):
