@@ -24,7 +24,7 @@ The track is lost, and refused, where too much of the model is looked through, o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -568,7 +568,7 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
     start = State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(np.repeat(START, 3) ** 2))
     times, told = _found(follower, start, frames)
     smooth = likeliest(start, times, told, follower.middle)
-    surface = _mended(mesh, follower, times, smooth, frames)
+    surface, _ = _mended(mesh, follower, _moments(frames), {now: state.pose for now, state in zip(times, smooth, strict=True)}.get)
     mended = Follower(surface.mended()[0], world_from_tool, table, others)
     told = _again(mended, told, smooth, frames)
     smooth = likeliest(start, times, told, mended.middle)
@@ -620,19 +620,60 @@ def _found(follower: Follower, start: State, frames: Iterable[RgbdFrame]) -> tup
     return np.array(times), told
 
 
-def _mended(mesh: Mesh, follower: Follower, times: Array, path: Sequence[State], frames: Iterable[RgbdFrame]) -> Reshaping:
-    """The surface as all pictures show it, most of all those in which it has not moved yet."""
-    lying = path[0].pose
-    moves = [bool((np.abs(changed(state.pose, lying, follower.middle)) > np.repeat(STILL, 3)).any()) for state in path]
-    first = moves.index(True) if True in moves else len(path)
+def reshaped_along(
+    mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame], times: Array, poses: Array, others: Sequence[Mesh] = ()
+) -> tuple[Reshaping, int]:
+    """How the pictures mend the surface of a tool whose path something else tells, poses (T, 4, 4) at times (T,) of which the first is where it lies,
+    and in how many moments of its use they show it; mesh, world_from_tool, table and others: as :func:`follow`.
+
+    Another clock and a marker's calibration are not those of the pictures: where the tool is in a moment is sought about what the path says.
+    """
+    follower = Follower(mesh, world_from_tool, table, others)
+
+    def pose_at(now: float) -> Array | None:
+        return transforms.interpolate(times, poses, [now])[0] if now <= times[-1] else None
+
+    def sought(moment: list[RgbdFrame], pose: Array) -> Array | None:
+        seen = follower.again(moment, pose)
+        return None if seen is None or seen.through > CLEAR else seen.pose
+
+    def moments() -> Iterator[list[RgbdFrame]]:
+        for k, moment in enumerate(_moments(frames)):
+            if k == 0:
+                follower.learn_colors(moment)
+            yield moment
+            if (pose := pose_at(moment[-1].stamp)) is not None:
+                follower.see_around(moment, pose)
+
+    return _mended(mesh, follower, moments(), pose_at, sought)
+
+
+def _mended(
+    mesh: Mesh,
+    follower: Follower,
+    moments: Iterable[list[RgbdFrame]],
+    pose_at: Callable[[float], Array | None],
+    sought: Callable[[list[RgbdFrame], Array], Array | None] = lambda _, pose: pose,
+) -> tuple[Reshaping, int]:
+    """The surface as all pictures show it, most of all those in which it has not moved yet, and how many later moments there were.
+
+    pose_at: the pose (4, 4) at a time, None from the end of what is known on; sought: where exactly it is in the frames of a moment, if that is seen.
+    """
     reshaping = Reshaping(mesh, *follower.surface)
-    told = -math.inf
-    for k, (now, state, moment) in enumerate(zip(times, path, _moments(frames), strict=True)):
-        if k < first or now - told >= RESHAPED:
-            pose, known = (lying, LIES) if k < first else (state.pose, LOOSE[:2])
+    lying, moves, told, shown = None, False, -math.inf, 0
+    for moment in moments:
+        now = moment[-1].stamp
+        if (pose := pose_at(now)) is None:
+            break
+        lying = pose if lying is None else lying
+        moves = moves or bool((np.abs(changed(pose, lying, follower.middle)) > np.repeat(STILL, 3)).any())
+        if moves and now - told < RESHAPED:
+            continue
+        told, known = now, LOOSE[:2] if moves else LIES
+        if (pose := sought(moment, pose) if moves else lying) is not None:
             reshaping.see(follower.pictures(moment, pose), pose, follower.middle, np.diag(np.repeat(known, 3) ** -2.0))
-            told = now
-    return reshaping
+            shown += moves
+    return reshaping, shown
 
 
 def _again(follower: Follower, told: Sequence[Seen | None], path: Sequence[State], frames: Iterable[RgbdFrame]) -> list[Seen | None]:

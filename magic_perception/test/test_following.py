@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from magic_core import transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
+from magic_core.mesh import Mesh
 from magic_core.sensor import SMEARED, STATION, capture, scene_raycaster
 from magic_core.shapes import make
 from magic_core.testing.hand import coming, hand
-from magic_perception.following import BLIND, CLOSE, SOUGHT, UNSURE, Followed, Follower, _known, follow
+from magic_perception.following import BLIND, CLOSE, SOUGHT, UNSURE, Followed, Follower, _known, follow, reshaped_along
 from magic_perception.paths import moved
+from magic_perception.reshaped import divided, raycaster
 from magic_perception.tool_colors import Said, ToolColors, lab
 
 SMALL = Intrinsics(424, 240, 307.5, 307.5, 212.0, 120.0)
@@ -130,6 +133,25 @@ def test_a_track_that_cameras_contradict_is_refused(hook):
     with pytest.raises(MagicError, match=r"known to .* mm and .* degrees") as caught:
         follow(hook.mesh, poses[0], TABLE, frames)
     assert caught.value.code == Code.BAD_MOTION and "more of it in sight" in caught.value.message
+
+
+@pytest.mark.parametrize("late", [0.0, 0.02])
+def test_a_mesh_is_mended_along_a_path_that_something_else_tells(hook, late):
+    """A hand is about it, and the other's clock may differ."""
+    times, poses = path(hook)
+    solid = trimesh.Trimesh(*divided(hook.mesh.vertices, hook.mesh.faces, 0.006), process=True)
+    thin = Mesh(solid.vertices - 0.0025 * solid.vertex_normals, solid.faces)
+    surface, shown = reshaped_along(thin, poses[0], TABLE, pictures(hook, times, poses), 100.0 + times + late, poses)
+    assert shown >= 3
+    # What no camera sees of it, its lower side and what the hand holds, stays as it was.
+    points, _ = trimesh.sample.sample_surface(hook.mesh.to_trimesh(), 3000, seed=0)
+    points = points[(points[:, 0] > -0.03) & (points[:, 2] > hook.mesh.bounds[:, 2].mean())]
+    before, after = (
+        np.abs(raycaster(mesh).compute_signed_distance(points.astype(np.float32)).numpy()).mean() for mesh in (thin, surface.mended()[0])
+    )
+    assert after < 0.5 * before
+    # Where the path ends nothing is known: no picture after it counts.
+    assert reshaped_along(thin, poses[0], TABLE, pictures(hook, times, poses), 100.0 + times[:14], poses[:14])[1] < shown
 
 
 def test_colours_tell_the_tool_from_the_ground_and_from_what_comes(hook):

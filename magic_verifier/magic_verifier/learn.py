@@ -50,6 +50,8 @@ PICTURES = 5
 TOGETHER, WAITING = 0.02, 4
 #: Of the depth pictures after them every tenth, and of these no more than so many, evenly over the bag.
 EVERY, LATER = 10, 60
+#: The tool's surface is mended by the pictures of its use if these show it in so many moments.
+MOMENTS = 8
 #: The tool's track and the tool as it was first seen belong together if they are so near each other (m); so far where the tool is named.
 NEAR, FAR = 0.10, 0.30
 #: A pose that came so long (s) before or after the pictures does not tell where the tool was in them.
@@ -79,7 +81,7 @@ class Recorded:
         self.types = {topic.name: topic.type_name for topic in bag_file.info(path).topics}
         self._messages: dict[str, list[Any]] = {topic: [] for topic in self.types}
         self._later: dict[str, list[Any]] = {}
-        counts = dict.fromkeys(self.types, 0)
+        self.counts = counts = dict.fromkeys(self.types, 0)
         strides = dict.fromkeys(self.types, EVERY)
 
         def wanted(topic: str, type_name: str) -> bool:
@@ -241,6 +243,22 @@ def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tupl
     track.check_motion(f"track of {tool.id}", times, poses)
     mesh, pieces = found.surface.mended(tool.pieces)
     return times, poses, replace(tool, mesh=mesh, pieces=pieces)
+
+
+def all_shown(bag: Recorded, world: str, tool: SceneObject, scene: Scene, times: Array, poses: Array) -> SceneObject:
+    """The tool as all pictures show it that there are of its use, along a track that something else told, times (T,) and world_from_tool (T, 4, 4); as
+    it was first seen where they do not show it in :data:`MOMENTS` moments."""
+    if min(bag.counts[f"{camera}/{COLOR}"] for camera in _cameras(bag)) < MOMENTS:
+        return tool
+    from magic_perception.following import reshaped_along
+
+    others = [item.mesh.transformed(item.world_from_object) for item in scene.objects if item.id != tool.id]
+    surface, shown = reshaped_along(tool.mesh, tool.world_from_object, scene.table, Pictures(bag, world), times, poses, others)
+    if shown < MOMENTS:
+        return tool
+    print(f"{tool.id}: its surface is mended by {shown} moments of its use")
+    mesh, pieces = surface.mended(tool.pieces)
+    return replace(tool, mesh=mesh, pieces=pieces)
 
 
 def later_frames(bag: Recorded, world: str) -> list[RgbdFrame]:
@@ -530,6 +548,8 @@ def demonstrated(given: argparse.Namespace) -> Demonstration:
         f"tool: {tool.id}, target: {target.id}{' (fixed)' if fixed else ''}, {len(times)} poses over {times[-1] - times[0]:.1f} s, "
         + (f"seen there in {told} depth pictures" if told else "compared with no later picture: there is none")
     )
+    if not bare:
+        tool = all_shown(bag, given.world, tool, scene, times, world_from_tool)
     others = tuple(item for item in scene.objects if item.id not in (tool.id, target.id))
     return Demonstration(tool, target, others, scene.table, times, world_from_tool)
 

@@ -33,7 +33,7 @@ from magic_perception import following
 from magic_perception.following import Followed
 from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
-from magic_verifier.learn import Pictures, Recorded, choose, followed, left_first, main, track_of, write
+from magic_verifier.learn import COLOR, DEPTH, MOMENTS, Pictures, Recorded, all_shown, choose, followed, left_first, main, track_of, write
 from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import Proposal, verify_proposal
 
@@ -308,6 +308,18 @@ def test_a_tool_that_was_followed_is_what_all_pictures_showed_of_it(monkeypatch)
     monkeypatch.setattr(following, "follow", lambda *seen: Followed(times, poses, 0.001 + 0 * times, 0.01 + 0 * times, 20, surface))
     tool = followed(SimpleNamespace(), "panda_link0", first, Scene((first,), scenes.TABLE))[2]
     assert [tool.mesh, *tool.pieces] == mended and tool.id == first.id
+
+
+@pytest.mark.parametrize(("pictures", "shown", "is_mended"), [(MOMENTS - 1, None, False), (20, MOMENTS - 1, False), (20, MOMENTS, True)])
+def test_a_tool_that_something_else_tracked_is_what_enough_pictures_show_of_it(pictures, shown, is_mended, monkeypatch):
+    first = ring_pulling().tool
+    mended = [mesh.scaled(1.02) for mesh in (first.mesh, *first.pieces)]
+    surface = SimpleNamespace(mended=lambda pieces: (mended[0], tuple(mended[1:])))
+    monkeypatch.setattr(following, "reshaped_along", lambda *seen: (surface, shown))
+    topics = [f"/camera/left/{kind}" for kind in (COLOR, DEPTH)]
+    bag = SimpleNamespace(topics=set(topics), counts=dict.fromkeys(topics, pictures))
+    tool = all_shown(bag, "panda_link0", first, Scene((first,), scenes.TABLE), np.arange(2.0), np.stack([first.world_from_object] * 2))
+    assert [tool.mesh, *tool.pieces] == (mended if is_mended else [first.mesh, *first.pieces])
 
 
 def test_a_ring_that_the_cameras_see_is_pulled_by_its_inside():
