@@ -88,7 +88,8 @@ class ArmRun:
     the plan has it: real pads have turned it as they do, which those about its reconstruction would do once more.
     ``lag``: seconds by which the arm follows its command late; ``begin``: the moment of the trajectory at which a run
     with an empty hand begins.  ``rests``: the tool was seen to lie where it is, and does so until something touches it, whatever its shape
-    and its masses are taken to be.  :attr:`stands_still`: the tool may be taken to stay where it is when the motion is over and it is held still.
+    and its masses are taken to be.  ``offset``: the contact offset (m) of tool and target as soon as the tool is held; closing fingers need the
+    world's.  :attr:`stands_still`: the tool may be taken to stay where it is when the motion is over and it is held still.
     """
 
     variant = "arm"
@@ -104,6 +105,7 @@ class ArmRun:
         lag: float = 0.0,
         begin: float = 0.0,
         rests: bool = False,
+        offset: float | None = None,
     ) -> None:
         self.robot = robot = robot or panda()
         motion = plan.arm_motion
@@ -125,6 +127,7 @@ class ArmRun:
         self.contact_time = self.duration if start is None else start
         self._motion = motion
         self._rests = rests and held is None and not self._in_hand
+        self._offset = setup.settings.contact_offset if offset is None else offset
         self.world = fill_world(setup, KINEMATIC if self._rests else DYNAMIC)
         if self._coupled and held is None and not self._in_hand:
             self.world.doze(TOOL, LYING)
@@ -340,6 +343,8 @@ class ArmRun:
         if self._in_hand:
             self.world.place(TOOL, self._arm.tcp() @ transforms.inverse(planned))
         self.world.component(TOOL).disable_gravity = False
+        if self._offset != self.setup.settings.contact_offset:
+            self.world.set_offset((TOOL, TARGET), self._offset)
         if self._coupled:
             self._grip = self._arm.grips(self.world.component(TOOL), patch, self._friction)
         self._from_reference = self._arm.tcp_pose.inv() * self.world.component(TOOL).entity_pose

@@ -99,7 +99,8 @@ class Task:
     ``eyes``: how well tool and target are known, and by how much these widths are to be multiplied; ``start``: the moment of the
     motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``overlap``: how deep the tool that is led goes into
     things as it was planned, m, where that is known; ``longer``: how many times as long their
-    steps are; ``offset``: the contact offset of their worlds, m (``None``: that of the scene as given); ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
+    steps are; ``offset``: the contact offset of their worlds, and of tool and target in the arm's scene as given as soon as it holds the tool, m
+    (``None``: that of the scene as given); ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
     """
 
     strategy: Strategy
@@ -515,7 +516,7 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None, taken_anew: Any = Non
     from magic_verifier.articulation import ArmOptions
 
     if drawn is None:
-        return ArmRun(setup, task.plan, task.arm_options or ArmOptions(), task.limits, task.robot, rests=_seen(task))
+        return ArmRun(setup, task.plan, task.arm_options or ArmOptions(), task.limits, task.robot, rests=_seen(task), offset=task.offset)
     options = _drawn_options(task, drawn)
     if options.past is not None:  # what contacts alone have taken hold of has no state that could be begun from
         return ArmRun(setup, task.plan, options, task.limits, task.robot, None, drawn.lag)

@@ -440,6 +440,12 @@ class World:
         for shape in self._bodies[name].collision_shapes:
             shape.physical_material = self.material(friction)
 
+    def set_offset(self, names: Sequence[str], offset: float) -> None:
+        """Give bodies another contact offset, m."""
+        for name in names:
+            for shape in self._bodies[name].collision_shapes:
+                shape.contact_offset = offset
+
     def calm(self, name: str, damping: float) -> None:
         """Take speed off a free body, linear and angular, by so much per second."""
         self._bodies[name].linear_damping = self._bodies[name].angular_damping = float(damping)

@@ -49,10 +49,10 @@ ROLLOUTS = 24
 LEAD, NEAR = 0.1, 0.03
 #: A drawn rollout takes steps so many times as long as the scene as given: the longest for which the tool is slow enough (:func:`_longer`).
 LONGER = {"fg": (4.0, 2.0), "arm": (2.0,)}
-#: In a drawn rollout of the arm with a free ball contacts are solved ahead of a touch as far as the tool comes in a step at its fastest, but no less than this
-#: (m), as with the floating gripper: every piece of a bowl that its ball is near to costs, touched or not.  Faces that meet faces find fewer of
-#: their points so, and a cylinder that hardly stays in its hook may do otherwise (1 of 26 draws).
-LEAST_OFFSET = 0.001
+#: Where the arm moves a free ball contacts are solved ahead of a touch as far as the tool at its fastest, or the ball in a fall, comes in a step, and no less than
+#: twice this (m), what goals take for a touch: every piece of a bowl that its ball is near to costs, touched or not.  Faces that meet faces find
+#: fewer of their points so, and a cylinder that hardly stays in its hook may do otherwise (1 of 26 draws).
+LEAST_OFFSET = goals.TOUCH / 2
 #: A parameter is named as the cause of failures if as clean a separation by any of the parameters had a chance of less than this.
 BY_CHANCE = 0.05
 
@@ -234,9 +234,12 @@ def _longer(setup: Setup, plan: MotionPlan, start: float) -> float:
 
 
 def _offset(setup: Setup, plan: MotionPlan, start: float, longer: float) -> float:
-    """The contact offset (m) of drawn rollouts: half of how far the tool comes in one of their steps, between :data:`LEAST_OFFSET` and that of the scene as given."""
-    given = setup.settings.contact_offset
-    return max(min(given, LEAST_OFFSET), min(given, speed(plan.tool_motion, setup.tool, start) * longer / setup.settings.frequency / 2))
+    """The contact offset (m) of drawn rollouts: half of how far the tool, or a ball that begins to fall, comes in one of their steps, between
+    :data:`LEAST_OFFSET` and that of the scene as given."""
+    settings = setup.settings
+    step = longer / settings.frequency
+    come = max(speed(plan.tool_motion, setup.tool, start) * step, settings.gravity * step**2)
+    return min(settings.contact_offset, max(LEAST_OFFSET, come / 2))
 
 
 def rollouts(

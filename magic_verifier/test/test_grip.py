@@ -197,7 +197,7 @@ def run_of(options, speed=0.0, grasp_time=0.1):
     return ArmRun(setup, MotionPlan("arm", ToolMotion(times, np.tile(tcp, (len(times), 1, 1))), arm), options, Limits(), robot)
 
 
-def closing_on(block, physics, rests=False, grasp_time=0.2):
+def closing_on(block, physics, rests=False, grasp_time=0.2, offset=None):
     """The Panda at home, its hand straight down to a stand 20 mm below the tip, closing after so many seconds on a block (its ranges about the tip,
     y along the fingers' way, z up); also where the block is put."""
     robot = Description()
@@ -212,7 +212,9 @@ def closing_on(block, physics, rests=False, grasp_time=0.2):
     q, still = np.tile(home, (len(times), 1)), np.zeros((len(times), len(home)))
     arm = ArmMotion(times, robot.names, q, still, still, transforms.inverse(pose) @ tcp, 0.012, grasp_time)
     plan = MotionPlan("arm", ToolMotion(times, np.tile(pose, (len(times), 1, 1))), arm)
-    return ArmRun(make_setup(tool, target, (stand,), scenes.TABLE, physics, settings), plan, None, Limits(), robot, rests=rests), pose
+    return ArmRun(
+        make_setup(tool, target, (stand,), scenes.TABLE, physics, settings), plan, None, Limits(), robot, rests=rests, offset=offset
+    ), pose
 
 
 def test_fingers_press_harder_on_what_sticks_to_the_table():
@@ -279,6 +281,20 @@ def test_what_was_seen_to_lie_lies_until_it_is_touched(rests):
     if rests:
         assert run.held() is not None and transforms.rotation_angle(run.world.pose("tool"), pose) < 0.02
         assert not run.world.component("tool").kinematic
+
+
+def test_contacts_are_solved_less_far_ahead_once_the_tool_is_held():
+    run, _ = closing_on(((-0.04, 0.04), (-0.006, 0.006), (-0.02, 0.006)), Physics(0.5, 600.0, 600.0), offset=0.0005)
+
+    def offsets():
+        return {
+            name: {round(s.contact_offset, 6) for s in run.world.component(name).collision_shapes} for name in ("tool", "target", "stand")
+        }
+
+    assert offsets() == {"tool": {0.002}, "target": {0.002}, "stand": {0.002}}
+    while run.held() is None:
+        run.advance()
+    assert offsets() == {"tool": {0.0005}, "target": {0.0005}, "stand": {0.002}}
 
 
 @pytest.mark.parametrize("ends", [-0.3, -0.04])

@@ -79,7 +79,8 @@ def test_steps_are_longer_where_the_tool_is_slow():
         task = verification.make_task(Proposal(strategy, tool, target, (), scenes.TABLE, plan))
         assert task.longer == longer
         assert task.under(task.drawn(1)).settings.frequency == pytest.approx(240 / longer)
-    for speed, offset in ((0.1, 0.001), (0.4, 0.4 / 240)):  # with those of the arm
+    # With the settings of the arm: half of what a ball falls in a step (of 1/60 s), and of how far a fast tool comes in one (of 1/120 s).
+    for speed, offset in ((0.1, 9.81 / 60**2 / 2), (0.4, 0.4 / 240)):
         strategy, tool, target, _ = scenes.hooking("L")
         poses = [(transforms.make(translation=[-0.1 - 0.28 * k, 0, 0]), "goal", 0.28 / speed) for k in range(2)]
         for thing, found in ((scenes.scooping()[2], offset), (target, 0.002)):  # a ball, and a cylinder
