@@ -17,14 +17,14 @@ CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data" / "rgbd"
 pytestmark = pytest.mark.skipif(not CAPTURES.is_dir(), reason="the shared captures are not here")
 
 #: Of each capture pixels (column, row) of things: what solid each is to become, whether a hole shows in it from the side, and its width in mm
-#: (read from depth).
+#: (read from depth; of the white mug of ``cluttered_0`` from its 81 pixels at 0.84 m, its handle turned away by some 10 degrees).
 SEEN = {
     "realsense_single/red_mug": {(343, 264): ("round with handle", True, 123)},
     "realsense_single/cylinder": {(326, 139): ("cylinder", False, 66)},
     "mugs/blue_mug": {(331, 239): ("round with handle", True, 110)},
     "bowls_boxes/white_bowl": {(371, 280): ("round", False, 147)},
     "mugs/cluttered_0": {
-        (304, 246): ("round with handle", True, 122),
+        (304, 246): ("round with handle", True, 113),
         (233, 372): ("round", False, 155),
         (422, 375): ("round", False, 155),
         # A dark mug whose handle is behind it, a tin with rounded edges (YCB's of 102 mm), a can.

@@ -30,8 +30,11 @@ DARK, WAVES, LEVEL = 8.0, 3, 0.012
 CALM, EVEN = 1e-4, 1e-3
 #: The look is known beside pixels that have it, this many pixels on, and then anew from there, so many times at most.
 ON, TIMES = 2, 12
-#: Depth tells of so many pixels of a patch that lies beyond smear from what is no body.
-TELLING = 12
+#: So many pixels of a patch tell something of it, and of the bar beside it.
+TELLING, BESIDE = 12, 4
+#: A bar beside a patch is off by so many times what a pixel may be in this share of its pixels: there is an edge, where a face that has the body's look by
+#: chance goes over into it.
+EDGE, ALONG = 2.0, 0.7
 
 
 @dataclass(frozen=True)
@@ -64,10 +67,10 @@ def _alone(sight: Sight, body: Body) -> _Alone:
     return _Alone(window, rays, depth, outside, np.arctan2(away[..., 1], away[..., 0]), np.clip(z / top, 0.0, 1.0))
 
 
-def _alike(
+def _unlike(
     alone: _Alone, color: NDArray[np.float32], own: NDArray[np.bool_], may_be: NDArray[np.bool_], height: float
-) -> NDArray[np.bool_] | None:
-    """(h, w): the pixels that look as the body does; ``None`` where that is not known.
+) -> NDArray[np.float64] | None:
+    """(h, w): how far pixels are from the body's look, as a share of what they may be; ``None`` where that is not known.
 
     color (h, w, 3); own (h, w): pixels that are the body's; may_be: those that may be, through which what is known of it goes on; height of the body, m.
     """
@@ -80,26 +83,25 @@ def _alike(
     stiff[: 2 * WAVES, : 2 * WAVES] = CALM * np.diag(np.repeat(np.arange(1.0, WAVES + 1) ** 2, 2))
     stiff[2 * WAVES :, 2 * WAVES :] = EVEN * bends.T @ bends + 1e-6 * np.eye(levels)
     log, around = np.log(color + DARK), np.ones((2 * ON + 1,) * 2, np.uint8)
-    alike = None
+    unlike = None
     for _ in range(TIMES):
         a, b, c = basis[own], log[own], color[own] + DARK
         keep = np.ones(len(a), bool)
         for _ in range(3):
             if np.count_nonzero(keep) < ENOUGH:
-                return alike
+                return unlike
             model = np.linalg.solve(a[keep].T @ a[keep] + len(a) * stiff, a[keep].T @ b[keep])
             off = np.abs(c - np.exp(a @ model))
             sigma = 1.48 * np.median(off, axis=0)
             keep = (off < np.maximum(2.5 * sigma, 1.0)).all(axis=1)
         if sigma.max() > UNEVEN:
-            return alike
-        off = np.abs(color + DARK - np.exp(basis @ model))
-        alike = alone.outside & (off < np.maximum(DEVIATIONS * sigma, LEAST)).all(axis=-1)
-        more = (cv2.dilate(own.view(np.uint8), around) > 0) & may_be & alike & ~own
+            return unlike
+        unlike = (np.abs(color + DARK - np.exp(basis @ model)) / np.maximum(DEVIATIONS * sigma, LEAST)).max(axis=-1)
+        more = (cv2.dilate(own.view(np.uint8), around) > 0) & may_be & (unlike < 1) & ~own
         if not more.any():
             break
         own = own | more
-    return alike
+    return unlike
 
 
 def body_shown(
@@ -114,17 +116,17 @@ def body_shown(
     mask, may = sight.mask[window], handle[window]
     # Pixels at an outline are of two things.
     inner = cv2.erode((alone.outside & mask & ~sight.hidden[window]).view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
-    alike = _alike(alone, sight.color[window].astype(np.float32), inner & ~may, inner, float(body.profile[-1, 1]))
-    if alike is None:
+    unlike = _unlike(alone, sight.color[window].astype(np.float32), inner & ~may, inner, float(body.profile[-1, 1]))
+    if unlike is None:
         return None
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = ((place - sight.eye) @ across) / (alone.rays @ across)
         told = alone.outside & (plane > 0) & (plane < alone.depth - 0.002)
-    shown = told & alike
+    shown = told & (unlike < 1)
     # Between what is the body's and what is beside the thing lies the body's outline, a pixel or two of both.
     closed = cv2.morphologyEx((shown | ~mask).view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
     shown |= closed & (cv2.dilate(shown.view(np.uint8), np.ones((5, 5), np.uint8)) > 0) & mask
-    shown &= ~_denied(sight, alone, plane, shown, told)
+    shown &= ~_doubtful(sight, alone, plane, shown, told, unlike)
     pictures = []
     for part in (shown, told):
         picture = np.zeros(sight.mask.shape, bool)
@@ -133,18 +135,30 @@ def body_shown(
     return pictures[0], pictures[1]
 
 
-def _denied(
-    sight: Sight, alone: _Alone, plane: NDArray[np.float64], shown: NDArray[np.bool_], told: NDArray[np.bool_]
+def _doubtful(
+    sight: Sight,
+    alone: _Alone,
+    plane: NDArray[np.float64],
+    shown: NDArray[np.bool_],
+    told: NDArray[np.bool_],
+    unlike: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Patches (h, w) of what looks as the body where depth, farther from all else than it is carried, lies at the handle: a fin that has the body's look."""
+    """Patches (h, w) of what looks as the body that may be a fin's: small ones, those without an edge to the bar beside them, and those where depth, farther from all
+    else than it is carried, lies at the handle."""
     reach = max(3, round(REACH * sight.intrinsics.fx / 615))
-    deep = shown & (cv2.dilate((told & ~shown).view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) == 0)
+    bars = told & ~shown
+    deep = shown & (cv2.dilate(bars.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) == 0) & np.isfinite(sight.depth[alone.window])
     with np.errstate(invalid="ignore"):
         near = sight.depth[alone.window] < (plane + alone.depth) / 2
     result = np.zeros_like(shown)
-    count, parts = cv2.connectedComponents(shown.view(np.uint8), connectivity=4)
-    for part in range(1, count):
-        tells = deep & (parts == part) & np.isfinite(sight.depth[alone.window])
-        if np.count_nonzero(tells) >= TELLING and float(near[tells].mean()) > 0.5:
-            result |= parts == part
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(shown.view(np.uint8), connectivity=4)
+    for number in range(1, count):
+        part = parts == number
+        # A pixel at the edge is of both.
+        one, three = (cv2.dilate(part.view(np.uint8), np.ones((size, size), np.uint8)) > 0 for size in (3, 7))
+        beside, tells = bars & three & ~one, deep & part
+        blurred = np.count_nonzero(beside) >= BESIDE and float(np.mean(unlike[beside] > EDGE)) < ALONG
+        filled = np.count_nonzero(tells) >= TELLING and float(near[tells].mean()) > 0.5
+        if stats[number, cv2.CC_STAT_AREA] < TELLING or blurred or filled:
+            result |= part
     return result

@@ -118,7 +118,10 @@ def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body) -> Hand
     else:
         field = cv2.morphologyEx(points, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))).astype(np.float32)
     solid = _bars(field > 0.5, near, covered, plane, body)
-    if useful:
+    if not useful:
+        # No camera looks through it: what is missing between points is no hole.
+        solid |= _enclosed(plane, solid, body).view(np.uint8)
+    else:
         # Where the body shows through its handle, what is left of the mask there are the handle's bars.
         field = _carved(plane, _without_body(plane, useful, drawn, near, body), thickness)
         opened = _without_specks(_bars(field > 0.5, near, covered, plane, body, to_the_body=True))
@@ -195,12 +198,17 @@ def _without_specks(solid: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return solid | small[parts].view(np.uint8)
 
 
+def _enclosed(plane: _Plane, solid: NDArray[np.uint8], body: Body) -> NDArray[np.bool_]:
+    """The cells (Z, S) that a handle's cells (Z, S) enclose with the body."""
+    filled = (solid > 0) | ((plane.s < body.radius(plane.z)) & (plane.z < body.profile[-1, 1]))
+    _, holes = cv2.connectedComponents(np.pad(~filled, 1, constant_values=True).view(np.uint8), connectivity=4)
+    return ~filled & (holes != holes[0, 0])[1:-1, 1:-1]
+
+
 def _largest_hole(plane: _Plane, solid: NDArray[np.uint8], body: Body) -> float:
     """The largest area, m^2, that a handle's cells (Z, S) enclose with the body."""
-    filled = (solid > 0) | ((plane.s < body.radius(plane.z)) & (plane.z < body.profile[-1, 1]))
-    _, holes, stats, _ = cv2.connectedComponentsWithStats(np.pad(~filled, 1, constant_values=True).view(np.uint8), connectivity=4)
-    enclosed = np.delete(stats[:, cv2.CC_STAT_AREA], [0, holes[0, 0]])
-    return float(enclosed.max(initial=0)) * CELL**2
+    stats = cv2.connectedComponentsWithStats(_enclosed(plane, solid, body).view(np.uint8), connectivity=4)[2]
+    return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0)) * CELL**2
 
 
 def standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:

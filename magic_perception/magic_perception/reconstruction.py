@@ -86,23 +86,29 @@ def reconstruct(sights: list[Sight], parameters: Parameters) -> Reconstruction:
         if turned is not None:
             standing = turned.mesh
             agreeing += _agreeing(turned, sights, 0.8)
-    for build, least in ((build_vessel, 0.85), (build_lain, 0.9)):
-        if max((score for score, _ in agreeing), default=0.0) < _WELL:
-            found = build(sights, points, eyes, height, noise, parameters)
-            agreeing += _agreeing(found, sights, least)
+    lain: Reconstruction | None = None
+    if max((score for score, _ in agreeing), default=0.0) < _WELL:
+        agreeing += _agreeing(build_vessel(sights, points, eyes, height, noise, parameters), sights, 0.85)
+    if max((score for score, _ in agreeing), default=0.0) < _WELL:
+        lain = build_lain(sights, points, eyes, height, noise, parameters)
+        agreeing += _agreeing(lain, sights, 0.9)
     if agreeing:
         # What stands and may have a handle gives way to another only where that is clearly better.
         return max(agreeing, key=lambda pair: pair[0] + (_CLEARLY if pair[1].mesh is standing else 0.0))[1]
+    # A round thing on its side that agrees less is still better than what is stacked, filled or carved, but no better than a scoop.
+    roughly = [solid for _, solid in _agreeing(lain, sights, 0.85)]
     if stands and height > 0.65 * length:  # a ladle's stem rises, but it lies
-        return _freest([lambda: turned, lambda: build_layers(sights, points, height)], sights, noise)
+        return roughly[0] if roughly else _freest([lambda: turned, lambda: build_layers(sights, points, height)], sights, noise)
     try:
         laid = lay(sights, noise, parameters)
     except MagicError:
-        return _freest([], sights, noise)
+        return roughly[0] if roughly else _freest([], sights, noise)
     scoop = build_scoop(laid.thin or laid, sights, noise, parameters)
     for score, solid in _agreeing(scoop, sights, 0.0):
         if score > _WELL:
             return solid
+    if roughly:
+        return roughly[0]
     return _freest([lambda: scoop, lambda: build_lying(laid)], sights, noise)
 
 

@@ -71,6 +71,8 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
 
 #: What rises so far above a rim, m, is no part of it.
 STICKS = 0.012
+#: A handle goes up to so many times the height of its body at most; a stem rises farther.
+STEM = 1.5
 #: Directions from an axis in which it is asked whether points lie on a body about it.
 SECTORS = 36
 
@@ -159,18 +161,23 @@ def _profile(side: _Side, front: NDArray[np.float64], top: float, band: float) -
 
 
 def seen_into(sights: list[Sight], body: Body, noise: float) -> bool:
-    """Whether most of the rays that meet the top disc of the body go on below it: then it is open."""
+    """Whether most of the rays that meet the top disc of the body from above go on below it: then it is open."""
     radius, top = body.profile[-1]
     steps = np.linspace(-0.6, 0.6, 13)
     x, y = (part.ravel() for part in np.meshgrid(steps, steps))
     disc = np.column_stack([x, y])[np.hypot(x, y) <= 0.6] * radius + body.axis
     lid = np.column_stack([disc, np.full(len(disc), top)])
     through = told = 0
+    margin = max(0.010, 3 * noise)
     for sight in sights:
+        # Of the mouth of a body on its side a camera at the other end sees nothing.
+        if sight.eye[2] < top:
+            continue
         inside, blind, z, measured = sight.sample(lid)
-        known = (inside > 0.5) & ~blind & np.isfinite(measured)
+        with np.errstate(invalid="ignore"):
+            known = (inside > 0.5) & ~blind & (measured > z - margin)
         told += int(known.sum())
-        through += int((measured[known] > z[known] + max(0.010, 3 * noise)).sum())
+        through += int((measured[known] > z[known] + margin).sum())
     return told > 8 and through > 0.5 * told
 
 
@@ -309,6 +316,8 @@ def build_round(
         out = standing_off(out, body)
         reach = np.linalg.norm(out[:, :2] - body.axis, axis=1)
         if len(out) > 0.01 * len(points) and np.percentile(reach - body.radius(out[:, 2]), 95) > 0.010:
+            if np.percentile(out[:, 2], 95) > STEM * body.profile[-1, 1]:
+                return None  # a ladle
             handle = handle_of(sights, out, body)
             if handle is None and len(out) > 0.15 * len(points):
                 return None
