@@ -9,6 +9,7 @@ meshes    Ray-cast captures of scanned and modelled objects by two D435s (:mod:`
 
 views     (``--views N``, needs no data) Surfaces of N procedural scenes by the number of views, and what has moved between them.
 cameras   (``--moved-cameras N``, needs no data) What is said of two cameras on N procedural scenes, right and off by known amounts.
+mugs      (``--mugs N``, needs no data) Whether the handles of N made mugs are there and open, by whether a camera sees through them.
 speed     (``--speed``, needs no data) Seconds by stage for two cameras over four objects, and memory over ``--frames`` scenes.
 
 Writes evaluation.json, evaluation.md and evaluation.png (the meshes part's pictures).
@@ -35,7 +36,7 @@ from magic_core.mesh import Mesh, load
 from magic_core.rendering import Raycaster
 from magic_core.scene import CanonicalView, SceneObject
 from magic_core.views import find_view, holes_of
-from magic_perception import coverage, measures, moved_cameras, speed
+from magic_perception import coverage, made_mugs, measures, moved_cameras, speed
 from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
@@ -462,6 +463,7 @@ TABLES: dict[str, Callable[[dict], list[str]]] = {
     "osd": _osd_table,
     "views": lambda part: [coverage.markdown(part)],
     "moved_cameras": lambda part: [moved_cameras.markdown(part)],
+    "mugs": lambda part: [made_mugs.markdown(part)],
     "speed": lambda part: [speed.markdown(part)],
     "captures": _captures_table,
     "meshes": _meshes_table,
@@ -471,7 +473,9 @@ TABLES: dict[str, Callable[[dict], list[str]]] = {
 def main(args: list[str] | None = None) -> None:
     """Entry point; exit status 1 where no data are found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed, --views or --moved-cameras)")
+    parser.add_argument(
+        "--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed, --views, --moved-cameras or --mugs)"
+    )
     parser.add_argument("--out", type=Path, default=Path("evaluation"), help="folder for the results (default ./evaluation)")
     parser.add_argument("--parts", nargs="+", choices=("osd", "captures", "meshes"), default=["osd", "captures", "meshes"])
     parser.add_argument("--poses", type=int, default=3, help="yaws of each mesh (default 3)")
@@ -485,14 +489,15 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument(
         "--moved-cameras", type=int, default=0, metavar="N", help="measure what is said of cameras that are off instead, on N scenes"
     )
+    parser.add_argument("--mugs", type=int, default=0, metavar="N", help="measure what becomes of handles instead, on N made mugs")
     parser.add_argument("--frames", type=int, default=50, help="scenes of --speed (default 50; 1000 shows whether memory is flat)")
     parser.add_argument("--workers", type=int, default=1, help="threads of --speed (default 1)")
     given = parser.parse_args(args)
-    without_data = given.speed or given.views or given.moved_cameras
+    without_data = given.speed or given.views or given.moved_cameras or given.mugs
     if given.data is None and not without_data:
-        parser.error("--data is needed, or --speed, --views or --moved-cameras")
-    if given.frames < 1 or given.workers < 1 or given.views < 0 or given.moved_cameras < 0:
-        counts = {name: getattr(given, name) for name in ("frames", "workers", "views", "moved_cameras")}
+        parser.error("--data is needed, or --speed, --views, --moved-cameras or --mugs")
+    if given.frames < 1 or given.workers < 1 or min(given.views, given.moved_cameras, given.mugs) < 0:
+        counts = {name: getattr(given, name) for name in ("frames", "workers", "views", "moved_cameras", "mugs")}
         parser.error(f"{counts}: frames and workers at least 1, the others at least 0")
 
     def said(text: str) -> None:
@@ -508,6 +513,8 @@ def main(args: list[str] | None = None) -> None:
             result["views"] = coverage.measure(given.views, given.seed, said=said)
         if given.moved_cameras:
             result["moved_cameras"] = moved_cameras.measure(given.moved_cameras, given.seed, said=said)
+        if given.mugs:
+            result["mugs"] = made_mugs.measure(given.mugs, given.seed, said)
         for part, folder in (
             () if without_data else (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes"))
         ):

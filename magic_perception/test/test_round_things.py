@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import scenes
@@ -9,9 +11,10 @@ import shapely
 import trimesh
 
 from magic_core import sensor, shapes, transforms
+from magic_core.loops import Opening
 from magic_core.mesh import Mesh, concatenate
 from magic_core.views import find_view, holes_of
-from magic_perception import handles, scoops
+from magic_perception import evaluate, handles, made_mugs, scoops
 from magic_perception.averaging import average
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
@@ -352,3 +355,23 @@ def test_specks_about_a_stick_are_no_handle():
         for i, (name, pose) in enumerate(sensor.STATION.items())
     ]
     assert len(perceive(frames, parameters=Parameters(region_low=(0.0, -0.7, -0.05))).objects) == 2
+
+
+def test_what_becomes_of_handles_is_measured(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        evaluate.main(["--mugs", "3", "--seed", "901", "--out", str(tmp_path)])
+    assert ended.value.code == 0
+    rows = json.loads((tmp_path / "evaluation.json").read_text())["mugs"]["rows"]
+    assert [row["attitude"] for row in rows] == ["upright", "upright", "on its side"]
+    assert all(row["objects"] == 1 and row["error_mm"] < 6 for row in rows)
+    assert any(row["in_sight"] > made_mugs.IN_SIGHT and row["open"] and row["barred"] for row in rows)
+    assert "| upright | in sight |" in capsys.readouterr().out
+
+
+def test_an_open_handle_is_told_from_a_filled_and_from_a_lost_one():
+    mug = shapes.make("mug", 8)
+    opening = Opening.within(mug.region("handle_loop").points)
+    fin = mug.mesh.convex_hull()
+    body = mug.mesh.to_trimesh().slice_plane([mug.mesh.bounds[1, 0] - 0.04, 0, 0], [-1, 0, 0], cap=True)
+    told = [made_mugs._handle(opening, mug.mesh, mesh) for mesh in (mug.mesh, fin, Mesh(body.vertices, body.faces))]
+    assert [(t["open"], t["barred"]) for t in told] == [(True, True), (False, True), (True, False)]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_core.loops import Opening
 from magic_core.motion import Phase
 from magic_core.rendering import Raycaster
 from magic_core.sensor import STATION
@@ -31,8 +32,8 @@ Array = NDArray[np.float64]
 MOVED, MOVING = 0.01, 0.02
 #: The tool has left the hand when it is farther (m) from where it was in it than this.
 LEFT = 0.03
-#: The region of a shape that goes round the opening of its loop; points in the opening are looked at so far apart, m.
-LOOP, APART = "handle_loop", 0.001
+#: The region of a shape that goes round the opening of its loop.
+LOOP = "handle_loop"
 #: The truth's name for where an event has put a thing: the thing's, and this.
 PUT = "/put"
 
@@ -195,27 +196,9 @@ def loop_in_sight(scene: Scene, tool: str) -> float | None:
 
     Where hardly any is in sight of a camera it is right that nobody finds a handle.
     """
-    import shapely
-
     shape = load_object(scene.case.tools[scene.tools.index(tool)], None)[2]
     if shape is None or LOOP not in shape.regions:
         return None
-    rim = shape.region(LOOP).points
-    middle = rim.mean(axis=0)
-    plane = np.linalg.svd(rim - middle)[2]  # two directions in the opening, and the one through it
-    flat = (rim - middle) @ plane[:2].T
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    grid = np.stack(np.meshgrid(*(np.arange(a, b, APART) for a, b in zip(low, high, strict=True))), axis=-1).reshape(-1, 2)
-    opening = shapely.Polygon(flat)
-    inside = grid[shapely.contains_xy(opening, grid)]
-    pose = scene.thing(tool).item.world_from_object
-    points, through = transforms.apply(pose, middle + inside @ plane[:2]), pose[:3, :3] @ plane[2]
+    opening = Opening.within(shape.region(LOOP).points).moved(scene.thing(tool).item.world_from_object)
     everything = Raycaster([thing.item.mesh.transformed(thing.item.world_from_object) for thing in scene.things])
-    shares = []
-    for world_from_camera in STATION.values():
-        eye = world_from_camera[:3, 3]
-        away = np.linalg.norm(points - eye, axis=1)
-        ways = (points - eye) / away[:, None]
-        free = everything.cast(np.broadcast_to(eye, ways.shape)[None], ways[None]).distance[0] > away
-        shares.append(float(np.mean(free * np.abs(ways @ through))))
-    return max(shares)
+    return max(opening.in_sight(world_from_camera[:3, 3], everything) for world_from_camera in STATION.values())
