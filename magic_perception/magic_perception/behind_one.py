@@ -11,6 +11,7 @@ from magic_perception import convexity
 from magic_perception.labels import sizeable
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
+from magic_perception.pixels import where
 
 #: Two parts on both sides of what hides the middle of one thing: how much nearer that is, and how far the tops may differ in height, m; least
 #: common share of their histograms of colour; and so many pixels are between what is compared across an edge, of which there are so many at least.
@@ -96,7 +97,7 @@ def _hides(image: NDArray[np.int32], depth: NDArray[np.float32]) -> list[tuple[i
     found: dict[tuple[int, int], int] = {}
     for axis, across in ((axis, across) for axis in range(2) for across in ACROSS):
         first, second = (np.moveaxis(image, axis, 0)[part] for part in (slice(None, -across), slice(across, None)))
-        rows, columns = np.nonzero((first != second) & (first > 0) & (second > 0))
+        rows, columns = where((first != second) & (first > 0) & (second > 0))
         if len(rows) == 0:
             continue
         z = np.moveaxis(depth, axis, 0)
@@ -111,7 +112,7 @@ def _hides(image: NDArray[np.int32], depth: NDArray[np.float32]) -> list[tuple[i
 
 def _part(look: Looked, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float, NDArray[np.float64]]:
     """Points (N, 3) of a mask, the height of its top and its histogram of the two colour axes, which sums to 1."""
-    rows, columns = np.nonzero(mask & np.isfinite(look.heights))
+    rows, columns = where(mask & np.isfinite(look.heights))
     if len(rows) == 0:
         return np.zeros((0, 3), np.float32), 0.0, np.zeros(256)
     step = max(1, len(rows) // 1500)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_perception import convexity
 from magic_perception.looks import Looked
+from magic_perception.pixels import where
 
 #: Metres and radians up to which cameras are brought together: half of it is how far either may be from the truth.
 MOST_OFFSET, MOST_ANGLE = 0.010, float(np.radians(1.5))
@@ -116,7 +117,7 @@ def _witness(look: Looked, labels: NDArray[np.int32], count: int, rng: np.random
     window = look.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
     field = convexity.normals(window, look.frame.world_from_camera[:3, 3])
     # Depth at the very edge of a mask may be that of what lies behind.
-    rows, columns = np.nonzero(mask & np.isfinite(look.heights) & (look.heights > 0))
+    rows, columns = where(mask & np.isfinite(look.heights) & (look.heights > 0))
     if len(rows) < 60:
         return None
     keep = rng.permutation(len(rows))[:count]

@@ -14,6 +14,7 @@ from magic_perception import clusters, convexity, smear
 from magic_perception.foreground import foreground, near_known
 from magic_perception.looks import Looked, each
 from magic_perception.parameters import Parameters
+from magic_perception.pixels import where
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,7 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
     fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
     masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
     spots = [
-        np.nonzero(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights))
-        for mask, looked in zip(masks, looks, strict=True)
+        where(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights)) for mask, looked in zip(masks, looks, strict=True)
     ]
     cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
     between = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]

@@ -173,14 +173,15 @@ def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_
         x, y, w, h, area = stats[i]
         window = (slice(y, y + h), slice(x, x + w))
         part = labels[window] == i
+        if area < 12 or other[window][part].mean() > 0.7:
+            result[window] |= part
+            continue
         heights = looked.raw[window][part]
         heights = heights[np.isfinite(heights)]
         # The fewer that are raised one by one are smear of the hole's rim: they tell nothing of its floor.
         high = heights > max(parameters.min_height, 4.0 * float(np.median(looked.sigma[window][part])))
         heights = heights[~high] if 2 * np.count_nonzero(high) <= len(heights) else heights
-        if area < 12 or other[window][part].mean() > 0.7:
-            result[window] |= part
-        elif len(heights) > 15:
+        if len(heights) > 15:
             # Standard error of the middle of a hole, for noise that is correlated over some 5 pixels.
             error = float(np.median(looked.sigma[window][part])) * 3.0 / np.sqrt(len(heights) / 5)
             if np.median(heights) > max(0.0012, 3 * error):

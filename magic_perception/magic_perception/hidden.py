@@ -10,6 +10,7 @@ from magic_core import transforms
 from magic_core.camera import SURELY
 from magic_core.mesh import Mesh
 from magic_perception.looks import Looked
+from magic_perception.pixels import where
 
 #: In images of labels: the robot, or what else of no interest stands before the scene (``RgbdFrame.blind``).
 ROBOT = -2
@@ -198,7 +199,7 @@ def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixt
     """
     clouds, heights = [], []
     for look, image in zip(looks, labels, strict=True):
-        rows, columns = np.nonzero((image == label) & np.isfinite(look.heights))
+        rows, columns = where((image == label) & np.isfinite(look.heights))
         clouds.append(look.points(rows, columns).astype(float))
         heights.append(look.heights[rows, columns])
     points, height = np.concatenate(clouds), np.concatenate(heights)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from magic_perception import smear
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
+from magic_perception.pixels import where
 
 #: Least share of a thing's pixels that has depth of its own in one camera at least.
 MEASURED = 0.2
@@ -65,8 +66,8 @@ def beside(fixed: NDArray[np.bool_], blank: NDArray[np.bool_]) -> NDArray[np.boo
 
 def sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
     """Drop what is too small, and number the rest from 1, by their pixels, most first."""
-    spots = [np.nonzero(image > 0) for image in labels]
-    values = [image[where] for image, where in zip(labels, spots, strict=True)]
+    spots = [where(image > 0) for image in labels]
+    values = [image[spot] for image, spot in zip(labels, spots, strict=True)]
     top = max((int(v.max(initial=0)) for v in values), default=0)
     pixels = np.stack([np.bincount(v, minlength=top + 1) for v in values])
     order = [np.argsort(v, kind="stable") for v in values]
@@ -76,10 +77,10 @@ def sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: P
         if pixels[:, label].max() < parameters.min_pixels:
             continue
         clouds = []
-        for looked, where, turn, start in zip(looks, spots, order, starts, strict=True):
+        for looked, spot, turn, start in zip(looks, spots, order, starts, strict=True):
             mine = turn[start[label] : start[label + 1]]
             mine = mine[:: max(1, len(mine) // 2000)]
-            clouds.append(looked.points(where[0][mine], where[1][mine]))
+            clouds.append(looked.points(spot[0][mine], spot[1][mine]))
         points = np.concatenate(clouds)
         points = points[np.isfinite(points[:, 0])]
         if len(points) < 20:

@@ -15,6 +15,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_perception.parameters import Parameters
+from magic_perception.pixels import where
 from magic_perception.table import Plane, fit_plane, supports
 
 T, R = TypeVar("T"), TypeVar("R")
@@ -77,7 +78,7 @@ def find_table(frames: list[RgbdFrame], parameters: Parameters, notes: list[str]
     for frame in frames:
         k = frame.intrinsics
         z = frame.depth[::4, ::4]
-        v, u = np.nonzero(np.isfinite(z))
+        v, u = where(np.isfinite(z))
         z = z[v, u].astype(float)
         points = transforms.apply(frame.world_from_camera, np.column_stack([(4 * u - k.cx) / k.fx * z, (4 * v - k.cy) / k.fy * z, z]))
         keep = np.ones(len(points), bool)

@@ -396,6 +396,16 @@ class _Built:
     departed: Departure
     hanging: bool
 
+    @cached_property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The lowest and the highest coordinates (3,) of its points."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
+    @cached_property
+    def shade(self) -> NDArray[np.float32]:
+        """Of all that was seen of it (:func:`magic_perception.attached.shade`)."""
+        return attached.shade(self.colors)
+
 
 def _solids(views: _Views, apart: float, parameters: Parameters) -> tuple[list[_Built], dict[int, MagicError]]:
     """The things that are built, in the order of their labels, and why others are not; apart: how far the cameras disagree, m."""
@@ -509,7 +519,7 @@ def _hidden(built: _Built, solids: list[_Built], views: _Views) -> list[int | st
 
 def _one_thing(one: _Built, other: _Built) -> bool:
     """Whether two things may be parts of one: of one colour, and near each other."""
-    if np.linalg.norm(attached.shade(one.colors) - attached.shade(other.colors)) > attached.COLOR:
+    if np.linalg.norm(one.shade - other.shade) > attached.COLOR:
         return False
     return _nearest(one, other, attached.GAP, 2000) is not None
 
@@ -533,7 +543,8 @@ def _nearest(one: _Built, other: _Built, reach: float, most: int) -> tuple[NDArr
     from scipy.spatial import cKDTree
 
     few, many = (built.points[:: max(1, len(built.points) // most)] for built in (one, other))
-    if np.any(few.min(axis=0) > many.max(axis=0) + reach) or np.any(many.min(axis=0) > few.max(axis=0) + reach):
+    (low, high), (bottom, top) = one.bounds, other.bounds
+    if np.any(low > top + reach) or np.any(bottom > high + reach):
         return None
     distance, index = cKDTree(many).query(few, distance_upper_bound=reach)
     best = int(np.argmin(distance))

@@ -76,8 +76,9 @@ def room(
     shape, points = cells.shape[:3], cells.reshape(-1, 3)
     possible, others_before, itself_before = np.ones(len(points), bool), np.zeros(len(points), bool), np.zeros(len(points), bool)
     seen_as = []
+    places = transforms.apply(world_from_table, points)
     for look, image in zip(looks, labels, strict=True):
-        there, empty = _looked_at(look, image, transforms.apply(world_from_table, points))
+        there, empty = _looked_at(look, image, places)
         possible &= ~empty
         others_before |= ~empty & (there != 0) & (there != label) & (there != ROBOT)
         itself_before |= ~empty & (there == label)

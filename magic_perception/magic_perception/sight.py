@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh
+from magic_perception.pixels import where
 from magic_perception.smear import LOW, REACH
 
 
@@ -134,7 +135,7 @@ def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
         size = (mask.shape[1] * upsample, mask.shape[0] * upsample)
         mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
         filled = cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR)
-    v, u = np.nonzero(mask)
+    v, u = where(mask)
     h = filled[v, u]
     u = (u + 0.5) / upsample - 0.5 + c0
     v = (v + 0.5) / upsample - 0.5 + r0
@@ -150,7 +151,7 @@ def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
 def measured(sight: Sight) -> NDArray[np.float64]:
     """Points (N, 3) of the thing where depth was measured, a pixel within the mask's edge, above the table."""
     inner = cv2.erode(sight.mask.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
-    rows, columns = np.nonzero(inner & np.isfinite(sight.depth))
+    rows, columns = where(inner & np.isfinite(sight.depth))
     z, k = sight.depth[rows, columns].astype(float), sight.intrinsics
     local = np.column_stack([(columns - k.cx) / k.fx * z, (rows - k.cy) / k.fy * z, z])
     points = transforms.apply(sight.table_from_camera, local)

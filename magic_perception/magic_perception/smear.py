@@ -60,9 +60,8 @@ def _density(index: NDArray[np.int32]) -> NDArray[np.float32]:
     from scipy.ndimage import gaussian_filter
 
     counts = np.bincount(index, minlength=int(np.prod(_SHAPE))).reshape(_SHAPE).astype(np.float32)
-    used = np.argwhere(counts)
-    low, high = np.maximum(used.min(axis=0) - 3, 0), used.max(axis=0) + 4
-    cut = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    used = np.unravel_index(np.flatnonzero(counts), _SHAPE)
+    cut = tuple(slice(max(int(along.min()) - 3, 0), int(along.max()) + 4) for along in used)
     counts[cut] = gaussian_filter(counts[cut], 0.9, mode="constant")
     return (counts / counts.sum()).ravel()
 

@@ -15,7 +15,7 @@ from magic_core import sensor, shapes, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
-from magic_perception import clusters, polygons, primitives
+from magic_perception import clusters, pixels, polygons, primitives
 from magic_perception.averaging import average, unchanged
 from magic_perception.evaluate import overlap
 from magic_perception.parameters import Parameters
@@ -900,3 +900,11 @@ def test_speed_is_measured(tmp_path):
     seconds = found["seconds"]
     assert seconds["masks to meshes"]["cpu_median"] == seconds["meshes"]["cpu_median"] > 0
     assert seconds["all"]["wall_least"] >= seconds["images to meshes"]["wall_least"] > seconds["meshes"]["wall_least"]
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (1, 7), (5, 0)])
+def test_the_pixels_of_a_mask_come_row_by_row_as_numpy_has_them(shape):
+    mask = np.random.default_rng(0).random(shape) < 0.1
+    for turned in (mask, mask.T, mask.astype(np.float32)):
+        for found, wanted in zip(pixels.where(turned), np.nonzero(turned), strict=True):
+            np.testing.assert_array_equal(found, wanted)
