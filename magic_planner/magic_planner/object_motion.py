@@ -35,7 +35,7 @@ from magic_core.placement import Pairs, pairs_of, relative, together, waypoint_p
 from magic_core.rendering import Raycaster
 from magic_core.scene import SceneObject
 from magic_core.strategy import MODES, REFLECTIONS, Strategy, Waypoint
-from magic_planner.collision import Body, grown, hull, outer_points, solid_pieces
+from magic_planner.collision import Body, grown, hull, mass_centre, outer_points, solid_pieces
 from magic_planner.giving_way import GAP, give_way
 from magic_planner.proportion import in_measure
 from magic_planner.sliding import lowest, slid_contacts
@@ -43,9 +43,12 @@ from magic_planner.sliding import lowest, slid_contacts
 #: Largest step between two samples: metres, radians.
 STEP_LENGTH = 0.005
 STEP_ANGLE = np.deg2rad(2.0)
-#: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up; and of a target that the
-#: tool is to go beneath: gap and lip together have to stay well below its middle, or it is driven along before the lip.
-TABLE_CLEARANCE, LOW_SHARE, BENEATH_SHARE = 0.001, 0.2, 0.05
+#: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up.
+TABLE_CLEARANCE, LOW_SHARE = 0.001, 0.2
+#: A tool that goes beneath its target does so along what it goes up; on the table it only pushes.  The share of the target's height that the room for
+#: the contact may take up there: gap and lip together have to stay well below the target's middle, or it is driven along before the lip.  But a tool turns
+#: in the hand, which holds it about its middle: as much room as its contact is off then, in metres for each metre from there, a long one needs.
+BENEATH_SHARE, TURNED_IN_HAND = 0.05, 0.01
 #: A tool is beneath its target where its side at the contact faces up by at least so much (cosine).
 BENEATH = 0.7
 #: What comes so near (m) to the sides of a target that is met is to be beside it; into how many sectors about it that is parted; how far (m) within
@@ -120,7 +123,7 @@ def plan_tool_motion(
     world_from_contact = world_from_target @ target_from_contact
     shown = demonstrated_motion(strategy) if strategy.mode == "retarget" else None
     beneath = shown is not None and _ends_beneath(world_from_contact @ shown[1], plane)
-    clearance = _above_table(target, plane, gap, BENEATH_SHARE if beneath else LOW_SHARE)
+    clearance = _share_of_height(target, plane, gap, LOW_SHARE)
     if not beneath:
         clearance = _beside(tool, tool_from_contact, target, world_from_contact, plane, clearance)
     if not candidate.companions:
@@ -138,7 +141,7 @@ def plan_tool_motion(
     world_from_meeting = world_from_contact @ contacts
     if beneath:
         world_from_meeting = in_measure(strategy, target, target_from_contact, contacts, obstacles, plane)
-    room = min(gap, clearance) if beneath else gap
+    room = _room_beneath(tool, tool_from_contact, target, plane, gap) if beneath else gap
     frames = slid_contacts(tool, tool_from_contact, world_from_meeting, obstacles, plane, clearance, room)
     world_from_tool = world_from_meeting @ transforms.inverse(frames)
     world_from_tool[:, 2, 3] += lift_above(plane, world_from_tool, outer_points(tool), clearance)
@@ -184,12 +187,20 @@ def _ends_beneath(world_from_meeting: NDArray[np.float64], plane: NDArray[np.flo
     return bool(up[0] < BENEATH < up[1])
 
 
-def _above_table(target: SceneObject, plane: NDArray[np.float64], gap: float, share: float) -> float:
-    """The gap (m) that a tool keeps to the table: as to obstacles, for a tool that has turned a little in the gripper would scrape along it
-    with the far end of a long handle, but no more than a share of the target's height, so that a low target is met all the same."""
+def _share_of_height(target: SceneObject, plane: NDArray[np.float64], gap: float, share: float) -> float:
+    """``gap`` (m), as to obstacles, for a tool that has turned a little in the gripper would scrape along the table with the far end of a long
+    handle; but no more than a share of the target's height, so that a low target is met all the same."""
     pieces = np.concatenate([piece.vertices for piece in solid_pieces(target)])
     height = float((transforms.apply(target.world_from_object, pieces) @ plane[:3] + plane[3]).max())
     return max(TABLE_CLEARANCE, min(gap, share * height))
+
+
+def _room_beneath(
+    tool: SceneObject, tool_from_contact: NDArray[np.float64], target: SceneObject, plane: NDArray[np.float64], gap: float
+) -> float:
+    """The room (m), ``gap`` or less, to what a tool goes up along that goes beneath its target (:data:`BENEATH_SHARE`, :data:`TURNED_IN_HAND`)."""
+    off = TURNED_IN_HAND * float(np.linalg.norm(tool_from_contact[:3, 3] - mass_centre(solid_pieces(tool))[1]))
+    return max(_share_of_height(target, plane, gap, BENEATH_SHARE), min(gap, off))
 
 
 def _beside(
