@@ -316,7 +316,9 @@ def steadied(
         # Too shallow for such pulls: the middle of those that it bears.
         bears = [_around(held > TOLERANCE, side + k, side) for k in range(len(steady))]
         best = int(np.lexsort((np.abs(turns[side:-side]), -np.array(bears)))[0])
-        if bears[best] <= bears[count]:
+        # Of a disc for which the tolerance is less than a pixel the outline tells no single step, as in a wide bowl.
+        unsure = bears[count] >= 0 and TOLERANCE * radius < 1.0
+        if bears[best] <= bears[count] + unsure:
             return None
     direction, centre = directions[side + best], curve[rest[side + best]]
     way = np.arange(0.0, 3 * radius, 0.25)

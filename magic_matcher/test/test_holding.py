@@ -211,3 +211,15 @@ def test_shapes_and_folders_of_meshes(tmp_path, capsys):
         with pytest.raises(SystemExit) as caught:
             match_meshes.main([*shown, *change, "--out", str(tmp_path)])
         assert caught.value.code == 2 and "BAD_REQUEST" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("off", [0.2, 0.4, 0.6])
+def test_in_a_wide_bowl_of_few_pixels_the_pull_stays(off):
+    # A wide flat bowl, a little askew, and a disc of 17 pixels that it holds when pulled straight: 5 degrees more or less are a matter of its pixels.
+    column = np.arange(200)
+    floor = 70 - 0.0024 * (column - 100 - off) ** 2 + 0.06 * (column - 100)
+    floor[(column <= 20) | (column >= 180)] = 40
+    edge = contour.extract((np.arange(120)[:, None] >= np.round(floor)) & (np.arange(120)[:, None] < 95))
+    place, radius = edge.points[edge.nearest((100.0, 70.0))], 17.0
+    curves = holding.centres(holding.room(edge, radius), radius)
+    assert holding.steadied(edge, place, np.array([0.0, -1.0]), radius, curves, 0.2) is None
