@@ -146,7 +146,7 @@ def _fit(
 
 
 def _profile(side: _Side, front: NDArray[np.float64], top: float, band: float) -> NDArray[np.float64]:
-    """Radius and z (K, 2) from the table to the top: half the parabola's, half what the points of each level say."""
+    """Radius and z (K, 2) from the table to the top: half the fitted side's, half what the points of each level say."""
     levels = np.linspace(0, top, max(4, int(top / 0.008)) + 1)
     radii = side.radius(levels)
     front = front[np.argsort(front[:, 2])]
