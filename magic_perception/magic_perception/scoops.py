@@ -293,7 +293,10 @@ def _first(laid: Laid, wall: float) -> Bowl | None:
         ring = ring[off <= max(0.003, float(np.percentile(off, 85)))]
     z = transforms.unit(np.array([-plane[0], -plane[1], 1.0]))
     x = transforms.unit(x - z * (z @ x))
-    depth = plane[2] - float(np.nanpercentile(laid.grid.top[np.linalg.norm(centres - middle, axis=-1) < 0.5 * radius], 20))
+    floor = laid.grid.top[np.linalg.norm(centres - middle, axis=-1) < 0.5 * radius]
+    if not np.isfinite(floor).any():
+        return None  # an eye, through which the table shows
+    depth = plane[2] - float(np.nanpercentile(floor, 20))
     if depth < SHALLOW / 2:
         return None
     pose = transforms.make(np.column_stack([x, np.cross(z, x), z]), [*middle, plane[2]])

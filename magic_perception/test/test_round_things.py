@@ -243,6 +243,16 @@ def test_a_handle_stands_where_it_stands_off_farthest_whatever_lies_at_the_foot(
     assert thickness == pytest.approx(0.01, abs=0.001)
 
 
+@pytest.mark.parametrize("yaw", [0.4, 3.5])
+def test_an_eye_on_a_stem_is_no_scoop(yaw):
+    # Nothing is seen of a floor in it: the table shows through.
+    eye, stem = trimesh.creation.torus(0.02, 0.004), trimesh.creation.cylinder(0.004, 0.06)
+    stem.apply_transform(transforms.from_rpy(0, np.pi / 2, 0, [0.05, 0, 0]))
+    hook = concatenate([Mesh(part.vertices, part.faces) for part in (eye, stem)]).transformed(transforms.from_rpy(0, 0.1, 0))
+    _, shape = seen(scenes.placed(hook, 0.5, 0.0, yaw).painted((70, 90, 160)), ("left", "right"), poses=sensor.STATION)
+    assert shape != "scoop"
+
+
 def laid_down(mesh: Mesh) -> Mesh:
     """A scoop on its bowl and the end of its handle, which goes to -x."""
     low, high = -0.6, 0.6
