@@ -333,6 +333,13 @@ class FloatingRun:
         table where that itself is harmless, as a tool that is off is raised to go no deeper into it.
         """
         setup, motion = self.setup, self._motion
+        others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}
+        if setup.target_kind == STATIC:
+            others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
+        elif planned + self._off <= harmless:
+            others = {}
+        if not others and planned <= harmless:
+            return ()
         end = min((t for t in (self.release_time, self.strike_time) if t is not None), default=self.duration)
         times = np.append(np.arange(0.0, end, interval), end)
         poses = transforms.interpolate(motion.times, motion.world_from_tool, motion.times[0] + times)
@@ -347,11 +354,6 @@ class FloatingRun:
             below = -_heights(poses, setup.tool.outermost, setup.table)
             for time, depth in zip(times, below, strict=True):
                 note(TABLE, float(depth), float(time))
-        others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}
-        if setup.target_kind == STATIC:
-            others[TARGET] = (list(setup.target.hulls), setup.target.world_from_object)
-        elif planned + self._off <= harmless:
-            others = {}
         near = _near(setup.tool, poses, others)
         if near.any():
             probe = Probe(setup.settings, list(setup.tool.hulls), others)
