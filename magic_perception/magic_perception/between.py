@@ -93,9 +93,9 @@ def _table_between(
     one, other = (regions == number for number in pair)
     x, y, w, h = cv2.boundingRect((one | other).view(np.uint8))
     cut = (slice(y, y + h), slice(x, x + w))
-    color = look.frame.color.astype(np.float32)
-    first, second = (np.median(color[region], axis=0) for region in (one, other))
+    color = look.frame.color[cut].astype(np.float32)
     one, other = one[cut], other[cut]
+    first, second = (np.median(color[region], axis=0) for region in (one, other))
     distance, index = cv2.distanceTransformWithLabels((~one).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     source = np.zeros(int(index.max()) + 1, np.int64)
     source[index[one]] = np.flatnonzero(one)
@@ -105,7 +105,7 @@ def _table_between(
     t = np.linspace(0, 1, 16)[:, None]
     v, u = (np.rint((1 - t) * a + t * b).astype(int) for a, b in ((v0, v1), (u0, u1)))
     inner = ~(one[v, u] | other[v, u])
-    met = color[cut][v, u]
+    met = color[v, u]
     way = second - first
     share = np.clip((met - first) @ way / max(float(way @ way), 1.0), 0, 1)
     mixed = mask[cut][v, u] & (np.linalg.norm(met - first - share[..., None] * way, axis=-1) < MIXED)

@@ -32,8 +32,10 @@ STEP = 3e-3
 OBLONG, ROUNDER = 1.5, 0.85
 #: Of half its box's width a cylinder's side lies so deep in that at most, 1 - cos 45 degrees.
 HOLLOW = 0.3
-#: So many corners has a quarter of a rounded edge.
+#: So many corners has a quarter of a rounded edge; which way they are from its middle, quarter by quarter, and the signs of the quarters.
 QUARTER = 6
+ROUNDED = np.array([(np.cos(a), np.sin(a)) for q in range(4) for a in np.linspace(0, np.pi / 2, QUARTER + 1) + q * np.pi / 2])
+QUARTERS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
 
 
 @dataclass(frozen=True)
@@ -64,25 +66,18 @@ class Box:
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N,): signed distance of points (N, 3) to the sides and the top, positive outside."""
-        out = self.beyond(points)
-        side = out[:, :2] + self.corner
-        out = np.column_stack([np.linalg.norm(np.maximum(side, 0), axis=1) + np.minimum(side.max(axis=1), 0) - self.corner, out[:, 2]])
-        return np.linalg.norm(np.maximum(out, 0), axis=1) + np.minimum(out.max(axis=1), 0)
+        x, y, above = self.beyond(points).T
+        x, y = x + self.corner, y + self.corner
+        beside = np.hypot(np.maximum(x, 0), np.maximum(y, 0)) + np.minimum(np.maximum(x, y), 0) - self.corner
+        return np.hypot(np.maximum(beside, 0), np.maximum(above, 0)) + np.minimum(np.maximum(beside, above), 0)
 
     def corners(self) -> NDArray[np.float64]:
         """(K, 3): of the bottom, then of the top; 8 of a box with sharp edges."""
-        turn = np.linspace(0, np.pi / 2, QUARTER + 1) if self.corner > 0 else np.array([np.pi / 4])
-        inner = self.size[:2] / 2 - self.corner
-        local = np.concatenate(
-            [
-                np.sign([np.cos(quarter + np.pi / 4), np.sin(quarter + np.pi / 4)]) * inner
-                + self.corner * np.column_stack([np.cos(turn + quarter), np.sin(turn + quarter)])
-                for quarter in np.arange(4) * np.pi / 2
-            ]
-        )
+        turns, quarters = (ROUNDED, np.repeat(QUARTERS, QUARTER + 1, axis=0)) if self.corner > 0 else (QUARTERS, QUARTERS)
+        local = quarters * (self.size[:2] / 2 - self.corner) + self.corner * turns
         c, s = np.cos(self.yaw), np.sin(self.yaw)
-        ring = self.middle + np.column_stack([local @ [c, -s], local @ [s, c]])
-        return np.concatenate([np.column_stack([ring, np.full(len(ring), z)]) for z in (0.0, self.size[2])])
+        ring = self.middle + local @ np.array([[c, s], [-s, c]])
+        return np.column_stack([np.concatenate([ring, ring]), np.repeat([0.0, self.size[2]], len(ring))])
 
 
 def recognise_box(sights: list[Sight], height: float, noise: float) -> Reconstruction | None:

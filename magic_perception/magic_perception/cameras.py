@@ -163,27 +163,29 @@ def _compared(
     """What points ``moved`` (N, 3) with normals ``turned`` (N, 3) that one camera saw cost (N,) by what another camera sees there, and which of them (N,) it sees too, within ``gate``;
     unseen: what it costs that it neither sees a point nor speaks against it."""
     k, pose = other.look.frame.intrinsics, other.camera_from_world
-    local = moved @ pose[:3, :3].T + pose[:3, 3]
-    z = np.maximum(local[:, 2], 1e-6)
-    column = np.round(k.fx * local[:, 0] / z + k.cx).astype(int)
-    row = np.round(k.fy * local[:, 1] / z + k.cy).astype(int)
-    inside = (local[:, 2] > 0.05) & (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    depth = other.look.frame.depth[row, column]
-    outside = other.outside[row, column]
+    x, y, deep = pose[:3, :3] @ moved.T + pose[:3, 3:]
+    z = np.maximum(deep, 1e-6)
+    column, row = np.rint(k.fx * x / z + k.cx), np.rint(k.fy * y / z + k.cy)
+    inside = (deep > 0.05) & (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
+    column, row = (np.where(inside, pixel, 0).astype(int) for pixel in (column, row))
+    flat = row * k.width + column
+    depth, outside = other.look.frame.depth.ravel()[flat], other.outside.ravel()[flat]
     # Something nearer hides the point: nothing is told.
     with np.errstate(invalid="ignore"):
-        hidden = depth < local[:, 2] - gate
+        hidden = depth < deep - gate
     beside = np.where(inside & ~hidden, np.minimum(outside * z, MOST), 0.0)
     r, c = row - other.corner[0], column - other.corner[1]
-    on = inside & (outside == 0) & np.isfinite(depth) & (r >= 0) & (c >= 0) & (r < other.field.shape[0]) & (c < other.field.shape[1])
-    normal = other.field[np.where(on, r, 0), np.where(on, c, 0)].astype(float)
-    there = other.look.points(row, column).astype(float)
-    gap = np.sum((moved - there) * normal, axis=1)
+    on = np.flatnonzero(
+        inside & (outside == 0) & np.isfinite(depth) & (r >= 0) & (c >= 0) & (r < other.field.shape[0]) & (c < other.field.shape[1])
+    )
+    normal = other.field[r[on], c[on]].astype(float)
+    away = moved[on] - other.look.points(row[on], column[on])
+    gap = np.einsum("ij,ij->i", away, normal)
+    alike, off = np.zeros(len(moved), bool), np.full(len(moved), unseen)
     with np.errstate(invalid="ignore"):
-        alike = on & (np.sum(normal * turned, axis=1) > 0.8) & (np.abs(gap) < gate) & (np.linalg.norm(moved - there, axis=1) < 2 * gate)
-        through = on & ~alike & (depth > local[:, 2] + gate)
-        off = np.where(alike, np.minimum((gap / SURFACE) ** 2, DEAREST), np.where(through, DEAREST, unseen))
+        near = (np.abs(gap) < gate) & (np.einsum("ij,ij->i", away, away) < (2 * gate) ** 2)
+        alike[on] = near & (np.einsum("ij,ij->i", normal, turned[on]) > 0.8)
+        off[on] = np.where(alike[on], np.minimum((gap / SURFACE) ** 2, DEAREST), np.where(depth[on] > deep[on] + gate, DEAREST, unseen))
     return off + np.minimum((beside / EDGE) ** 2, DEAREST), alike
 
 

@@ -37,10 +37,12 @@ def fit_circle(points: NDArray[np.float64], rounds: int = 4, band: float | None 
     for _ in range(rounds):
         mean = kept.mean(axis=0)
         local = kept - mean
-        solution = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), np.sum(local**2, axis=1), rcond=None)[0]
-        centre = mean + solution[:2]
-        radius = float(np.sqrt(max(solution[2] + solution[:2] @ solution[:2], 0)))
-        residual = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        # From their middle the centre is told without the radius.
+        squared = np.einsum("ij,ij->i", local, local)
+        offset = np.linalg.lstsq(local.T @ local, 0.5 * (local.T @ squared), rcond=None)[0]
+        centre = mean + offset
+        radius = float(np.sqrt(squared.mean() + offset @ offset))
+        residual = np.abs(np.hypot(*(points - centre).T) - radius)
         kept = points[residual <= max(np.percentile(residual, 80), 1e-4 if band is None else band)]
     return centre, radius
 
@@ -73,8 +75,10 @@ def likeliest_circle(
     if len(radii) == 0:
         return None
     few = sample[:1200]
-    rho = np.hypot(few[:, 0] - centres[:, :1], few[:, 1] - centres[:, 1:])
-    i = int(np.argmax(np.count_nonzero(np.abs(rho - radii[:, None]) < band * 1.5, axis=1)))
+    squared = (few[:, 0] - centres[:, :1]) ** 2 + (few[:, 1] - centres[:, 1:]) ** 2
+    # No radius is as small as a band is wide.
+    on = (squared < ((radii + 1.5 * band) ** 2)[:, None]) & (squared > (np.maximum(radii - 1.5 * band, 0.0) ** 2)[:, None])
+    i = int(np.argmax(np.count_nonzero(on, axis=1)))
     return centres[i], float(radii[i])
 
 

@@ -74,25 +74,30 @@ def room(
     x, y = (np.arange(low[i] - MARGIN, high[i] + MARGIN, cell) for i in range(2))
     cells = np.stack(np.meshgrid(x, y, np.arange(cell / 2, high[2] + cell, cell), indexing="ij"), axis=-1)
     shape, points = cells.shape[:3], cells.reshape(-1, 3)
-    possible, others_before, itself_before = np.ones(len(points), bool), np.zeros(len(points), bool), np.zeros(len(points), bool)
-    seen_as = []
-    places = transforms.apply(world_from_table, points)
+    # Most cells are empty to the first camera: the others are asked for what is left.
+    possible = np.arange(len(points))
+    seen_as: list[NDArray[np.int32]] = []
     for look, image in zip(looks, labels, strict=True):
-        there, empty = _looked_at(look, image, places)
-        possible &= ~empty
-        others_before |= ~empty & (there != 0) & (there != label) & (there != ROBOT)
-        itself_before |= ~empty & (there == label)
-        seen_as.append(there)
-    hidden = possible & others_before
+        there, empty = _looked_at(look, image, transforms.apply(world_from_table, points[possible]))
+        possible, seen_as = possible[~empty], [before[~empty] for before in (*seen_as, there)]
+    seen = np.stack(seen_as)
+    hidden = np.any((seen != 0) & (seen != label) & (seen != ROBOT), axis=0)
     for other in others:
         bottom, top = other.bounds
-        near = np.nonzero(hidden & np.all((points > bottom - OWN) & (points < top + OWN), axis=1))[0]
+        near = np.nonzero(hidden & np.all((points[possible] > bottom - OWN) & (points[possible] < top + OWN), axis=1))[0]
         if len(near):
-            hidden[near[_distances(other, points[near]) < OWN]] = False
-    around, _ = _reach(hidden.reshape(shape), points, mesh, cell)
-    behind, away = _reach((hidden & ~itself_before).reshape(shape), points, mesh, cell)
+            hidden[near[_distances(other, points[possible[near]]) < OWN]] = False
+
+    def reach(open_: NDArray[np.bool_]) -> tuple[float, NDArray[np.float32]]:
+        field = np.zeros(len(points), bool)
+        field[possible[open_]] = True
+        farthest, away = _reach(field.reshape(shape), points, mesh, cell)
+        return farthest, away[possible]
+
+    around, _ = reach(hidden)
+    behind, away = reach(hidden & ~np.any(seen == label, axis=0))
     by: set[int] = set()
-    for there in seen_as if behind > far else ():
+    for there in seen if behind > far else ():
         before = there[away > far]
         before = before[(before != 0) & (before != label) & (before != ROBOT)]
         if len(before):
@@ -119,9 +124,11 @@ def _reach(open_: NDArray[np.bool_], points: NDArray[np.float64], mesh: Mesh, ce
     """How far from the solid the open cells reach that hang together with it, m, and how far each of the points (N, 3) of all cells does, 0 where it is none of them."""
     from scipy import ndimage
 
+    away = np.zeros(len(points), np.float32)
+    if not open_.any():
+        return 0.0, away
     wide = ndimage.binary_opening(np.pad(open_, ((0, 0), (0, 0), (WIDE, 0)), mode="edge"), np.ones((WIDE,) * 3))[..., WIDE:]
     pieces, count = ndimage.label(wide, np.ones((3, 3, 3)))
-    away = np.zeros(len(points), np.float32)
     if count == 0:
         return 0.0, away
     index = np.nonzero(pieces.ravel())[0]

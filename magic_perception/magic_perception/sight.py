@@ -117,8 +117,10 @@ class Sight:
         """u and v of points (..., 3) in the shape that OpenCV's remap takes (less than 32768 rows and columns), depths (N,) and N."""
         pose, k = self._camera_from_table, self.intrinsics
         camera = points.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-        z = np.where(camera[:, 2] > 1e-9, camera[:, 2], np.nan)
-        u, v = (np.nan_to_num(f * camera[:, i] / z + c, nan=-1e4).astype(np.float32) for i, f, c in ((0, k.fx, k.cx), (1, k.fy, k.cy)))
+        before = camera[:, 2] > 1e-9
+        z = np.where(before, camera[:, 2], 1.0)
+        u, v = ((f * camera[:, i] / z + c).astype(np.float32) for i, f, c in ((0, k.fx, k.cx), (1, k.fy, k.cy)))
+        u[~before] = v[~before] = -1e4
         count = len(u)
         rows = -(-count // 8192)
         u, v = (np.resize(x, (rows, 8192)) if rows > 1 else x.reshape(1, -1) for x in (u, v))

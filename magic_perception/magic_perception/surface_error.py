@@ -29,6 +29,8 @@ SHARE = 5 / 6
 LEAST, MOST = 0.0003, 0.03
 #: So many pixels are farther from the other than what counts as astray: a few at a mask's edge are anywhere.
 PIXELS = 20
+#: So many measured points of each camera, or up to twice as many, tell how far they are from the solid.
+POINTS = 800
 #: A measured point that is farther from the solid than this, m, is as far: it may be none of its.
 FARTHEST = 0.020
 #: The numbers that speak for or against a surface: what they are, and 1 or -1 where more of them is known to be worse or better.
@@ -97,6 +99,7 @@ def departure(mesh: Mesh, sights: list[Sight]) -> Departure:
                 if len(away) > PIXELS:
                     astray.append(pixel * float(np.partition(away, -PIXELS)[-PIXELS]))
         points = measured(sight)
+        points = points[:: max(1, len(points) // POINTS)]
         if len(points):
             gaps.append(scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy())
     gap = float(np.sqrt(np.mean(np.minimum(np.concatenate(gaps), FARTHEST) ** 2))) if gaps else FARTHEST
