@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.mesh import Mesh
+from magic_core.workers import Workers
 from magic_perception import clusters, convexity, smear
 from magic_perception.foreground import foreground, near_known
-from magic_perception.looks import Looked, each
+from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pixels import where
+from magic_perception.shared_out import shared_out
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,10 @@ class Clusters:
     instance: NDArray[np.int64]
 
 
-def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> Clusters:
+def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters, workers: Workers | None = None) -> Clusters:
     """The clusters in all looks together; known: meshes (world) that are left out."""
-    masks, tables = zip(*each(lambda looked: foreground(looked, parameters), looks, parameters.workers), strict=True)
+    pixels = [looked.heights.size for looked in looks]
+    masks, tables = zip(*shared_out(_foreground, (looks, parameters), range(len(looks)), pixels, workers), strict=True)
     fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
     masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
     spots = [
@@ -48,6 +51,11 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
     instance = instance[: len(cloud)]
     instance[instance >= 0] = np.unique(instance[instance >= 0], return_inverse=True)[1]
     return Clusters(masks, fixed, list(tables), spots, cloud, instance)
+
+
+def _foreground(given: tuple[list[Looked], Parameters], number: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    looks, parameters = given
+    return foreground(looks[number], parameters)
 
 
 #: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise, m.

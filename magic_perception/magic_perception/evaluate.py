@@ -42,6 +42,7 @@ from magic_perception.parameters import METHODS, Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmentation import Segmenter
 from magic_perception.segmenters import make_segmenter
+from magic_perception.shared_out import perceiving
 from magic_perception.table import camera_over_table
 
 #: Longest, middle and shortest side in mm, read from the images: silhouette edges carried to the tangent planes, highest
@@ -491,7 +492,7 @@ def main(args: list[str] | None = None) -> None:
     )
     parser.add_argument("--mugs", type=int, default=0, metavar="N", help="measure what becomes of handles instead, on N made mugs")
     parser.add_argument("--frames", type=int, default=50, help="scenes of --speed (default 50; 1000 shows whether memory is flat)")
-    parser.add_argument("--workers", type=int, default=1, help="threads of --speed (default 1)")
+    parser.add_argument("--workers", type=int, default=2, help="processes of --speed, this one among them (default 2, as the node has)")
     given = parser.parse_args(args)
     without_data = given.speed or given.views or given.moved_cameras or given.mugs
     if given.data is None and not without_data:
@@ -504,11 +505,13 @@ def main(args: list[str] | None = None) -> None:
         print(text, file=sys.stderr, flush=True)
 
     try:
-        segmenter = make_segmenter(given.segmenter, given.weights)
+        workers = perceiving(given.workers - 1 if given.speed else 0)
+        segmenter = make_segmenter(given.segmenter, given.weights, workers=workers)
         result: dict = {}
         given.out.mkdir(parents=True, exist_ok=True)
         if given.speed:
-            result["speed"] = speed.measure(given.frames, segmenter, given.seed, given.workers)
+            result["speed"] = speed.measure(given.frames, segmenter, given.seed, workers)
+            workers.close()
         if given.views:
             result["views"] = coverage.measure(given.views, given.seed, said=said)
         if given.moved_cameras:

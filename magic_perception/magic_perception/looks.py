@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,8 +14,6 @@ from magic_core.errors import MagicError
 from magic_perception.parameters import Parameters
 from magic_perception.pixels import where
 from magic_perception.table import Plane, fit_plane, supports
-
-T, R = TypeVar("T"), TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -52,14 +47,6 @@ class Looked:
         np.multiply((rows.astype(np.float32) - np.float32(k.cy)) / np.float32(k.fy), z, out=local[..., 1])
         local[..., 2] = z
         return local @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
-
-
-def each(function: Callable[[T], R], items: list[T], workers: int) -> list[R]:
-    """``function`` of each item, in their order, by several threads: OpenCV, NumPy and Open3D work outside of Python's lock."""
-    if workers < 2 or len(items) < 2:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(min(workers, len(items))) as pool:
-        return list(pool.map(function, items))
 
 
 #: Metres and degrees within which a camera's own plane is looked for around the common one.

@@ -31,6 +31,7 @@ from magic_core.node import describe, run
 from magic_core.qos import LATCHED, SENSOR, STATES
 from magic_core.scene import Scene, SceneObject
 from magic_core.tf_listener import TransformListener
+from magic_core.threads import one_thread
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception import node_parameters
@@ -41,6 +42,7 @@ from magic_perception.pipeline import Report, perceive
 from magic_perception.registration import register_depth
 from magic_perception.robot_in_view import Held, RobotInView
 from magic_perception.segmenters import make_segmenter
+from magic_perception.shared_out import perceiving
 from magic_perception.stream import WAITING, Pair, Stream, next_scene
 from magic_perception.tracking import Tracker
 
@@ -88,10 +90,12 @@ class Perception(Node):
     def __init__(self) -> None:
         super().__init__("perception")
         self.settings = node_parameters.read(self)
-        self.segmenter = make_segmenter(self.settings.segmenter, self.settings.weights, self.settings.device)
+        self.workers = perceiving(self.settings.workers - 1)
+        self.segmenter = make_segmenter(self.settings.segmenter, self.settings.weights, self.settings.device, self.workers)
         self.robot = node_parameters.read_robot(self, self.settings.tolerance)
         self.keyframes = Keyframes(self.settings.keyframes, self.settings.keyframe_age)
         self.warm_up()
+        self.threads = one_thread()
 
         self.streams = {camera: Stream(camera, self.settings.tolerance, self.settings.count + WAITING) for camera in self.settings.cameras}
         self.tracker = Tracker()
@@ -177,6 +181,11 @@ class Perception(Node):
         found = sorted(name for name, types in self.get_topic_names_and_types() if kinds & set(types) and name not in own)
         found = [name for name in found if self.count_publishers(name)]
         return f"; images come on {', '.join(found[:8])}: remap them, or name the cameras" if found else ""
+
+    def destroy_node(self) -> None:
+        """End the processes beside this one with the node."""
+        self.workers.close()
+        super().destroy_node()
 
     def warm_up(self) -> None:
         """Look at a small made-up scene, so that the first real one does not pay for loading the libraries."""
@@ -340,7 +349,7 @@ class Perception(Node):
                     looks, frames = made.looks, made.mean()
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
-            scene = perceive(frames, known, self.settings.algorithm, self.segmenter, report, earlier)
+            scene = perceive(frames, known, self.settings.algorithm, self.segmenter, report, earlier, self.workers)
             scene, masks, carried = self.remember(scene, frames, report, still)
             self.made = Made(scene, frames, known, held, masks, carried, looks, len(looks))
             self.publish(scene)

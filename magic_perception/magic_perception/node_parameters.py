@@ -31,7 +31,7 @@ class Settings:
     transform_timeout: the transform at an image's stamp is waited for so long.  tolerance: the stamps of colour and depth differ by no more.  period: between two
     scenes, at least.  depth_unit: what 1 in a depth image is, empty: what its encoding says.  segmenter, weights, device: what finds masks, and where it runs.
     algorithm: what :func:`magic_perception.pipeline.perceive` is told.  extrinsics: world_from_camera (4, 4) of the cameras whose pose does not come from TF.
-    keyframes: earlier views that are kept at most; keyframe_age: for how long.
+    keyframes: earlier views that are kept at most; keyframe_age: for how long.  workers: processes that perceive, this one among them.
     """
 
     cameras: tuple[str, ...]
@@ -52,6 +52,7 @@ class Settings:
     extrinsics: Mapping[str, NDArray[np.float64]]
     keyframes: int
     keyframe_age: float
+    workers: int
 
 
 def read(node: Node) -> Settings:
@@ -93,6 +94,7 @@ def read(node: Node) -> Settings:
         algorithm=_algorithm(node),
         extrinsics={camera: pose for camera in cameras if (pose := _extrinsics(node, camera)) is not None},
         keyframes=p("keyframes", 4, "earlier views that are looked at together with the newest frames, at most; 0: none", low=0, high=16),
+        workers=p("workers", 2, "processes that perceive, this one among them", low=1, high=16),
         keyframe_age=p("keyframe_age", 60.0, "an earlier view is forgotten after this, s", low=0.1, high=3600.0),
     )
 

@@ -35,8 +35,7 @@ class Parameters:
     arm_offset: cameras that see the arm farther than this from where its joints put it are refused, and by less what they see is moved; 0: neither.
     split: part touching objects where what is measured at a concave seam, or at an upright plane between colours, says that they are two
     (:mod:`magic_perception.seams`, :mod:`magic_perception.cuts`).
-    max_objects: the largest ones are kept.  workers: threads for cameras and objects; most of the
-    work holds Python's lock, so that one is the quickest and needs the least memory.
+    max_objects: the largest ones are kept.
     method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
     """
 
@@ -60,7 +59,6 @@ class Parameters:
     split: bool = True
     method: str = "completed"
     max_objects: int = 24
-    workers: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:

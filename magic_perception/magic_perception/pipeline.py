@@ -19,16 +19,18 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_core.scene import FIXTURE, PICTURE, REGION, UNSEEN, Scene, SceneObject
 from magic_core.views import find_view
+from magic_core.workers import Workers
 from magic_perception import attached, cameras, clusters, keyframes
 from magic_perception.confidence import Evidence, chance
 from magic_perception.glass import once, unmeasured
 from magic_perception.hidden import ROBOT, hangs, mostly_held, parted, veil
-from magic_perception.looks import Looked, each, find_table, frame_on, look
+from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import Parameters
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.room import bordered, room
 from magic_perception.seen import cut_off, joined, witnessed
 from magic_perception.segmentation import DepthSegmenter, Segmenter
+from magic_perception.shared_out import shared_out
 from magic_perception.sight import agreement
 from magic_perception.smear import before, behind
 from magic_perception.solids import hangs_together, hull_of
@@ -51,7 +53,7 @@ TOUCHING, THERE, LEVEL, SHADE = 0.003, 0.02, 0.005, 0.02
 
 @dataclass
 class Report:
-    """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of all processors.
+    """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of this process on any processor.
 
     labels (H, W): of the frames; by id in the scene: numbers, the label of each object, shapes, pixels in the camera that saw most of it, evidence and departures.
     cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer ones contradict it.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
@@ -84,6 +86,7 @@ def perceive(
     segmenter: Segmenter | None = None,
     report: Report | None = None,
     earlier: Sequence[RgbdFrame] = (),
+    workers: Workers | None = None,
 ) -> Scene:
     """What stands and lies on the table.
 
@@ -92,6 +95,7 @@ def perceive(
     (``object_1``, ...); :class:`magic_perception.tracking.Tracker` makes the numbers stable from call to call.
     earlier: frames of the same scene from before (:class:`magic_perception.keyframes.Keyframes`), oldest first: they show what the frames do not,
     as far as no newer one contradicts them.  What they alone show is told, and marked ``unseen``.
+    workers: processes that build a part of the things (:func:`magic_perception.shared_out.perceiving`); a segmenter has its own use for them.
 
     What the robot holds (``RgbdFrame.held``) is an object of its own.
 
@@ -113,7 +117,7 @@ def perceive(
         table, own = find_table(used, parameters, notes)
         world_from_table = _table_frame(table, parameters)
         pairs = list(zip(used, own, strict=True))
-        return own, world_from_table, each(lambda pair: look(*pair, world_from_table, parameters), pairs, parameters.workers)
+        return own, world_from_table, [look(*pair, world_from_table, parameters) for pair in pairs]
 
     with report.stage("table"):
         own, world_from_table, looks = looked(about_table := [])
@@ -151,18 +155,18 @@ def perceive(
         report.notes += _about_glass(views)
 
     with report.stage("meshes"):
-        solids, refused = _solids(views, apart, parameters)
+        solids, refused = _solids(views, apart, parameters, workers)
         report.notes += [f"cluster {label} left out: {error.message}" for label, error in refused.items()]
         ids = {built.label: f"object_{number}" for number, built in enumerate(solids, 1)}
         report.numbers = {name: label for label, name in ids.items()}
         told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[:now])
         report.labels = [next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)]
-        hidden = each(lambda built: _hidden(built, solids, views), solids, parameters.workers)
+        hidden = [_hidden(built, solids, views) for built in solids]
 
     with report.stage("views"):
         objects = []
-        made = each(lambda built: _as_object(built, world_from_table), solids, parameters.workers)
-        for built, by, item in zip(solids, hidden, made, strict=True):
+        for built, by in zip(solids, hidden, strict=True):
+            item = _as_object(built, world_from_table)
             # What hides a thing and was left out itself is as nameless as a fixture.
             names = dict.fromkeys(name if isinstance(name, str) else ids.get(name, FIXTURE) for name in by)
             objects.append(replace(item, id=ids[built.label], cut_off=tuple(names)))
@@ -407,18 +411,21 @@ class _Built:
         return attached.shade(self.colors)
 
 
-def _solids(views: _Views, apart: float, parameters: Parameters) -> tuple[list[_Built], dict[int, MagicError]]:
+def _solids(views: _Views, apart: float, parameters: Parameters, workers: Workers | None) -> tuple[list[_Built], dict[int, MagicError]]:
     """The things that are built, in the order of their labels, and why others are not; apart: how far the cameras disagree, m."""
-
-    def attempt(label: int) -> _Built | MagicError:
-        try:
-            return _build(label, views, apart, parameters)
-        except MagicError as error:
-            return error
-
-    found = dict(zip(views.numbers, each(attempt, views.numbers, parameters.workers), strict=True))
+    pixels = np.sum([np.bincount(image[image > 0], minlength=len(views.numbers) + 1) for image in views.labels], axis=0)
+    costs = [int(pixels[label]) for label in views.numbers]
+    found = dict(zip(views.numbers, shared_out(_attempt, (views, apart, parameters), views.numbers, costs, workers), strict=True))
     refused = {label: built for label, built in found.items() if isinstance(built, MagicError)}
     return [built for built in found.values() if not isinstance(built, MagicError)], refused
+
+
+def _attempt(given: tuple[_Views, float, Parameters], label: int) -> _Built | MagicError:
+    """The thing with that label, or why it cannot be built."""
+    try:
+        return _build(label, *given)
+    except MagicError as error:
+        return error
 
 
 def _build(label: int, views: _Views, apart: float, parameters: Parameters) -> _Built:
@@ -542,9 +549,12 @@ def _nearest(one: _Built, other: _Built, reach: float, most: int) -> tuple[NDArr
     """The points (3,) of two things, at most so many looked at of each, that are nearest to each other; ``None`` where they are farther apart than ``reach``, m."""
     from scipy.spatial import cKDTree
 
+    low, high = np.maximum(one.bounds[0], other.bounds[0]) - reach, np.minimum(one.bounds[1], other.bounds[1]) + reach
+    if np.any(low > high):
+        return None
     few, many = (built.points[:: max(1, len(built.points) // most)] for built in (one, other))
-    (low, high), (bottom, top) = one.bounds, other.bounds
-    if np.any(low > top + reach) or np.any(bottom > high + reach):
+    few, many = (points[np.all((points >= low) & (points <= high), axis=1)] for points in (few, many))
+    if not (len(few) and len(many)):
         return None
     distance, index = cKDTree(many).query(few, distance_upper_bound=reach)
     best = int(np.argmin(distance))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from magic_core import devices
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
+from magic_core.workers import Workers
 from magic_perception import clusters
 from magic_perception.foreground import foreground
 from magic_perception.labels import sizeable
@@ -38,8 +39,11 @@ class SamSegmenter:
     Raises ``SEGMENTER_WEIGHTS`` where the weights cannot be loaded.
     """
 
-    def __init__(self, name: str, weights: str = "", device: str = devices.AUTO, agree: float = 0.5) -> None:
+    def __init__(
+        self, name: str, weights: str = "", device: str = devices.AUTO, workers: Workers | None = None, agree: float = 0.5
+    ) -> None:
         self.name = name
+        self._coarse = DepthSegmenter(workers=workers)
         self.agree = agree
         source = weights or DEFAULTS[name]
         try:
@@ -64,7 +68,7 @@ class SamSegmenter:
 
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`magic_perception.segmentation.Segmenter`."""
-        labels = DepthSegmenter().segment(looks, known, parameters)
+        labels = self._coarse.segment(looks, known, parameters)
         return sizeable([self._refine(looked, image, parameters) for looked, image in zip(looks, labels, strict=True)], looks, parameters)
 
     def _refine(self, looked: Looked, labels: NDArray[np.int32], parameters: Parameters) -> NDArray[np.int32]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.mesh import Mesh
+from magic_core.workers import Workers
 from magic_perception import attached, between, convexity, cuts
 from magic_perception.behind_one import behind_one
 from magic_perception.clustered import Clusters, clustered, surfaces
@@ -36,17 +37,19 @@ class DepthSegmenter:
     """Table plane, table colour, clusters: no weights but those of a few criteria of seams and of upright planes.
 
     judge, cut: what tells whether a seam parts two things, and whether an upright plane does, instead of the weights that ship with the package.
+    workers: processes that look at a part of the pictures.
     """
 
     name = "depth"
 
-    def __init__(self, judge: Judge | None = None, cut: cuts.Judge | None = None) -> None:
+    def __init__(self, judge: Judge | None = None, cut: cuts.Judge | None = None, workers: Workers | None = None) -> None:
         self._judge = judge or learned()
         self._cut = cut or cuts.learned()
+        self._workers = workers
 
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`Segmenter`."""
-        found = clustered(looks, known, parameters)
+        found = clustered(looks, known, parameters, self._workers)
         instance = (
             cuts.parted(looks, found, uncut(looks, found, self._judge, parameters), self._cut) if parameters.split else found.instance
         )

@@ -11,6 +11,8 @@ import numpy as np
 
 from magic_core import sensor, shapes, transforms
 from magic_core.camera import RgbdFrame
+from magic_core.threads import one_thread
+from magic_core.workers import Workers
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.segmentation import Segmenter
@@ -83,18 +85,22 @@ def resident() -> float:
         return float("nan")
 
 
-def measure(frames: int, segmenter: Segmenter, seed: int = 0, workers: int = 1, pairs: int = 8) -> dict:
+def measure(frames: int, segmenter: Segmenter, seed: int = 0, workers: Workers | None = None, pairs: int = 8) -> dict:
     """Seconds by stage and resident memory over ``frames`` scenes, made of ``pairs`` captures over and over, ids tracked as the node does."""
     captured = frame_pairs(min(pairs, frames), seed)
-    parameters = Parameters(workers=workers, seed=seed)
+    parameters = Parameters(seed=seed)
     tracker = Tracker()
-    perceive(captured[0], parameters=parameters, segmenter=segmenter)  # loads libraries
+    one_thread()  # as the node
+    while workers is not None and workers.count and not workers.ready:
+        time.sleep(0.05)
+    perceive(captured[0], parameters=parameters, segmenter=segmenter, workers=workers)  # loads libraries
     reports, memory = [], []
     begin = time.perf_counter()
     scene = None
     for number in range(frames):
         report = Report()
-        scene = tracker.update(perceive(captured[number % len(captured)], parameters=parameters, segmenter=segmenter, report=report))
+        frames_now = captured[number % len(captured)]
+        scene = tracker.update(perceive(frames_now, parameters=parameters, segmenter=segmenter, report=report, workers=workers))
         report.labels = []
         reports.append(report)
         if (number + 1) % max(1, frames // 20) == 0:
@@ -117,7 +123,7 @@ def measure(frames: int, segmenter: Segmenter, seed: int = 0, workers: int = 1, 
     half = np.array(memory[len(memory) // 2 :])
     return {
         "frames": frames,
-        "workers": workers,
+        "processes": 1 if workers is None else 1 + workers.count,
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "machine": platform.processor() or platform.machine(),
         "load": round(os.getloadavg()[0], 1),
@@ -134,7 +140,7 @@ def markdown(result: dict) -> str:
     """The measurement as a table."""
     lines = [
         f"{result['frames']} scenes of {len(result['shapes'])} objects ({', '.join(result['shapes'])}; {sum(result['pieces'])} convex pieces), "
-        f"two 640x480 cameras, {result['cores']} cores, {result['workers']} threads, load {result['load']}:",
+        f"two 640x480 cameras, {result['cores']} cores, {result['processes']} processes, load {result['load']}:",
         "",
         "| stage | wall, least s | wall, median s | CPU, least s | CPU, median s |",
         "| --- | --- | --- | --- | --- |",

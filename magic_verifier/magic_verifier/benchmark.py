@@ -19,6 +19,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.motion import MotionPlan
 from magic_core.strategy import Strategy, find
 from magic_core.threads import one_thread
+from magic_core.workers import Workers
 from magic_planner.arm import ArmPlanner
 from magic_planner.benchmark import TASKS, Case, make_case
 from magic_planner.budget import Budget
@@ -29,7 +30,7 @@ from magic_planner.robot import Robot
 from magic_verifier import verification
 from magic_verifier.rollout import Task, rollout
 from magic_verifier.verification import Proposal
-from magic_verifier.workers import Workers
+from magic_verifier.workers import simulating
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 
@@ -98,7 +99,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     one_thread()
     planner = ArmPlanner(Robot()) if "arm" in options.variant else None
-    pool = Workers(options.workers)
+    pool = simulating(options.workers)
     try:
         print(f"load of the machine before: {os.getloadavg()[0]:.1f} of {os.cpu_count()} cores")
         for task in options.task:

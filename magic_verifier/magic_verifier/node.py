@@ -25,7 +25,7 @@ from magic_verifier.articulation import Articulation
 from magic_verifier.node_parameters import MAX_REPETITIONS
 from magic_verifier.simulation import DYNAMIC, World, usable_pieces
 from magic_verifier.verification import Proposal, Verdict, verify_proposal
-from magic_verifier.workers import Workers
+from magic_verifier.workers import simulating
 
 NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
 #: Feedback is for people: each phase once, and else no more often than so, s.  A rollout takes a fraction of the time that the motion itself takes.
@@ -66,7 +66,7 @@ class VerifierNode(Node):
             # A verdict is an answer, whatever it says; only what could not be judged aborts.
             lambda code: code in UNJUDGED,
         )
-        self._pool = Workers(self._given.workers - 1)
+        self._pool = simulating(self._given.workers - 1)
         self._warm_up()
         self._threads = one_thread()
         self.get_logger().info("ready: waiting for goals of verify_motion")
