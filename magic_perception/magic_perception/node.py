@@ -31,7 +31,6 @@ from magic_core.node import describe, run
 from magic_core.qos import LATCHED, SENSOR, STATES
 from magic_core.scene import Scene, SceneObject
 from magic_core.tf_listener import TransformListener
-from magic_core.threads import one_thread
 from magic_interfaces.msg import SceneObjectArray
 from magic_perception import conversions as pc
 from magic_perception import node_parameters
@@ -95,7 +94,6 @@ class Perception(Node):
         self.robot = node_parameters.read_robot(self, self.settings.tolerance)
         self.keyframes = Keyframes(self.settings.keyframes, self.settings.keyframe_age)
         self.warm_up()
-        self.threads = one_thread()
 
         self.streams = {camera: Stream(camera, self.settings.tolerance, self.settings.count + WAITING) for camera in self.settings.cameras}
         self.tracker = Tracker()

@@ -18,7 +18,6 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, check_solid
 from magic_core.node import OneGoalServer, describe, robot_parameters, run
 from magic_core.robot import Description, RobotConfig
-from magic_core.threads import one_thread
 from magic_interfaces.action import VerifyMotion
 from magic_verifier import motion_check, node_parameters
 from magic_verifier.articulation import Articulation
@@ -68,7 +67,6 @@ class VerifierNode(Node):
         )
         self._pool = simulating(self._given.workers - 1)
         self._warm_up()
-        self._threads = one_thread()
         self.get_logger().info("ready: waiting for goals of verify_motion")
 
     def destroy_node(self) -> None:

@@ -30,6 +30,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
 from magic_core.listening import join_all
 from magic_core.robot_description import file_of
+from magic_core.threads import one_thread
 
 #: What a node is given to wind down while messages still flow, and then its callbacks to end, s.
 WINDING_DOWN, ENDING = 5.0, 2.0
@@ -80,6 +81,7 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         node = node_type()
         refuse_unknown_parameters(node)
         executor.add_node(node)
+        one_thread()
         # What was imported and built is there to stay: the collector would walk through all of it, 0.15 s each time, in the middle of goals.
         gc.collect()
         gc.freeze()

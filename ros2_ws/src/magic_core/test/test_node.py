@@ -27,7 +27,7 @@ class Process:
     """A node as a program; ``said(text)`` waits until it has printed that."""
 
     def __init__(self, body):
-        env = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}
+        env = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "OPENBLAS_NUM_THREADS": "2"}
         self.popen = subprocess.Popen(
             [sys.executable, "-c", HEAD + body], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
         )
@@ -99,6 +99,21 @@ def test_what_a_node_has_begun_is_wound_down_while_it_still_spins(start, number)
     assert process.wait() == 0, process.lines
     assert "ticked on\n" in process.lines
     assert not any("Traceback" in line for line in process.lines), process.lines
+
+
+def test_linear_algebra_takes_one_thread(start):
+    pytest.importorskip("threadpoolctl")
+    process = start(
+        """
+            self.create_timer(0.05, self.tell)
+        """,
+        """
+        def tell(self):
+            from threadpoolctl import threadpool_info
+            print("threads:", {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"})
+        """,
+    )
+    process.said("threads: {1}")
 
 
 def test_a_node_that_cannot_wind_down_ends_all_the_same(start):
