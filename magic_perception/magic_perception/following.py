@@ -3,7 +3,8 @@
 The tool lies and is seen whole first; its mesh and pose there are known.  From frame to frame the pose is predicted (constant
 velocity, disturbed as a hand disturbs it) and corrected by what the frame shows of the tool:
 
-* measured points near the surface lie on it: their signed distance s(p) is a residual, its gradient the direction;
+* measured points lie on the surface that is in sight along their rays: how far they are from it along its normal is a residual; while the
+  tool is sought from farther off, their signed distance s(p) is, and its gradient the direction;
 * where the model should be seen and the camera looks through to what is behind, the model's point is moved to the nearest pixel
   that is not background: a flat tool that slides in its own plane is held by its outline;
 * the outline is moved to where the colours change from the tool's own to those of what is about it, which depth, smeared past every edge,
@@ -15,7 +16,7 @@ well unless it is seen to be behind.  What else is of the tool's colour is given
 Pictures are taken in the order of their stamps, those of one moment together, so that cameras need not be in step.  What they say is
 filtered as they come, and smoothed when all have been seen (:mod:`magic_perception.paths`), where they are doubted as far as they
 contradict each other.  With that path the mesh is mended, of which the first look showed only one side
-(:mod:`magic_perception.reshaped`), and the pictures are asked again.
+(:mod:`magic_perception.reshaped`), twice, as what meets which ray changes with it, and the pictures are asked again.
 
 The track is lost, and refused, where too much of the model is looked through, or where what is seen leaves it as uncertain as
 :data:`UNSURE`.
@@ -38,7 +39,7 @@ from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 from magic_perception.color_edges import parted
 from magic_perception.paths import CLEAR, Seen, State, changed, likeliest, moved, predicted
-from magic_perception.reshaped import Aside, Picture, Reshaping, raycaster
+from magic_perception.reshaped import CLOSE, Aside, Picture, Reshaping, met, raycaster
 from magic_perception.tool_colors import Said, ToolColors, lab
 
 Array = NDArray[np.float64]
@@ -50,8 +51,8 @@ START = (0.001, 0.03, 0.01, 0.05)
 #: Standard deviation (m) of a measured point from the reconstructed surface, and of an outline; errors hold together over a patch, so
 #: that the points of a frame count as so many at most.
 NOISE, OUTLINE, WORTH = 0.004, 0.005, 60.0
-#: Points farther from the surface than this are not the tool's (m): when the search begins, and when it ends.
-REACH, CLOSE = 0.030, 0.010
+#: Points farther from the surface than this are not the tool's (m), when the search begins; when it ends, those farther than CLOSE.
+REACH = 0.030
 #: ... and where it begins from where the tool is expected: what lies farther off is mostly another thing, even of the tool's own colour.
 EXPECTED = 0.015
 ROUNDS = 16
@@ -145,6 +146,12 @@ class Follower:
         """Points (N, 3) on the surface and its normals there (N, 3), in the tool's frame."""
         return self._points, self._normals
 
+    def mended(self, mesh: Mesh) -> Follower:
+        """The same tool by another mesh, with what was learned of its colours."""
+        other = Follower(mesh, self._lying, self._table, self._others)
+        other.colors, other._before = self.colors, self._before
+        return other
+
     # ------------------------------------------------------------ one frame
 
     def learn_colors(self, frames: Sequence[RgbdFrame]) -> None:
@@ -229,6 +236,14 @@ class Follower:
             length[:, None] > 2e-4, side[:, None] * away / np.maximum(length, 1e-9)[:, None], closest["primitive_normals"].numpy()[near]
         )
         return points, side * length, gradient @ pose[:3, :3].T
+
+    def _met(self, frame: RgbdFrame, points: Array, pose: Array) -> tuple[Array, Array, Array]:
+        """As :meth:`_near`, by the surface that the camera sees along the rays to the points."""
+        tool_from_world = transforms.inverse(pose)
+        off, normals, _, which = met(
+            self._scene, transforms.apply(tool_from_world, points), transforms.apply(tool_from_world, frame.world_from_camera[:3, 3])
+        )
+        return points[which], off, normals @ pose[:3, :3].T
 
     def _measured(self, frame: RgbdFrame, pose: Array) -> tuple[Array, NDArray[np.int64]]:
         """World points (N, 3) above the table about the tool, and their pixels (N, 2)."""
@@ -357,7 +372,7 @@ class Follower:
         middle = transforms.apply(pose, self.middle)
         points, own = measured
         matrix, vector = np.zeros((6, 6)), np.zeros(6)
-        points, signed, gradient = self._near(points[own], pose, reach)
+        points, signed, gradient = self._near(points[own], pose, reach) if reach > CLOSE else self._met(frame, points[own], pose)
         if len(points) >= 6:
             # Points move with the tool's frame the other way: a shift of the tool by d lowers the distance by gradient . d.
             jacobian = np.concatenate([gradient, np.cross(points - middle, gradient)], axis=1)
@@ -560,7 +575,7 @@ def _plane_depth(frame: RgbdFrame, plane: Array, crop: tuple[int, int, int, int]
 
 def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame], others: Sequence[Mesh] = ()) -> Followed:
     """The tool's track through frames in the order of their stamps, of the first of which it is known that it lies at ``world_from_tool``;
-    others: what else is there then, in the world.  The frames are gone through three times.
+    others: what else is there then, in the world.  The frames are gone through four times.
 
     Raises BAD_MOTION where it is lost, with the moment and what was seen; NO_FRAMES without two frames.
     """
@@ -568,7 +583,11 @@ def follow(mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[Rg
     start = State(np.asarray(world_from_tool, dtype=float), np.zeros(6), np.diag(np.repeat(START, 3) ** 2))
     times, told = _found(follower, start, frames)
     smooth = likeliest(start, times, told, follower.middle)
-    surface, _ = _mended(mesh, follower, _moments(frames), {now: state.pose for now, state in zip(times, smooth, strict=True)}.get)
+    path = {now: state.pose for now, state in zip(times, smooth, strict=True)}
+    first, _ = _mended(Reshaping(mesh, *follower.surface), follower, _moments(frames), path.get)
+    shape = first.mended()[0]
+    follower = follower.mended(shape)
+    surface, _ = _mended(Reshaping(shape, *follower.surface, first), follower, _moments(frames), path.get)
     mended = Follower(surface.mended()[0], world_from_tool, table, others)
     told = _again(mended, told, smooth, frames)
     smooth = likeliest(start, times, told, mended.middle)
@@ -645,21 +664,21 @@ def reshaped_along(
             if (pose := pose_at(moment[-1].stamp)) is not None:
                 follower.see_around(moment, pose)
 
-    return _mended(mesh, follower, moments(), pose_at, sought)
+    return _mended(Reshaping(mesh, *follower.surface), follower, moments(), pose_at, sought)
 
 
 def _mended(
-    mesh: Mesh,
+    reshaping: Reshaping,
     follower: Follower,
     moments: Iterable[list[RgbdFrame]],
     pose_at: Callable[[float], Array | None],
     sought: Callable[[list[RgbdFrame], Array], Array | None] = lambda _, pose: pose,
 ) -> tuple[Reshaping, int]:
-    """The surface as all pictures show it, most of all those in which it has not moved yet, and how many later moments there were.
+    """What is said of the surface, with what all pictures show of it, most of all those in which it has not moved yet, and how many later moments
+    there were.
 
     pose_at: the pose (4, 4) at a time, None from the end of what is known on; sought: where exactly it is in the frames of a moment, if that is seen.
     """
-    reshaping = Reshaping(mesh, *follower.surface)
     lying, moves, told, shown = None, False, -math.inf, 0
     for moment in moments:
         now = moment[-1].stamp

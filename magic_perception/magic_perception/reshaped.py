@@ -5,6 +5,10 @@ of a moment are off by ``r = J x + B d``, with the change ``x`` (6,) of the tool
 over it.  ``x`` is taken out of each moment's normal equations (by their Schur complement) after what else is known of the pose: that the
 tool lay where it lay first, and where its outline was seen since.  What is left of all moments says what ``d`` is, beside what it is
 expected to be: a Gaussian process over the surface, as far off as reconstructed surfaces are.
+
+A measured point belongs to what its ray meets, not to what is nearest to it: behind a wall of 3 mm the nearest is its other side, so that only
+points with errors towards the camera count, and the depth of a rim that has run over the hollow behind it is nearest to that rim.  Both made
+walls thicker.
 """
 
 from __future__ import annotations
@@ -26,9 +30,9 @@ from magic_core.mesh import Mesh
 Array = NDArray[np.float64]
 #: How far a reconstructed surface is off (standard deviation, m); errors hold together over so far (m), on one side of a wall.
 OFF, TOGETHER = 0.003, 0.015
-#: It is moved by at most so many deviations, and inwards by no more than this share of the thickness there.
+#: Each time it is moved by at most so many deviations, and inwards by no more than this share of the thickness there.
 MOST, THINNER = 2.0, 0.4
-#: Standard deviation (m) of a measured point; the points of a picture count as so many at most; farther off (m) they are not the tool's.
+#: Standard deviation (m) of a measured point; the points of a picture count as so many at most; farther off (m), along their rays, they are not the tool's.
 NOISE, WORTH, CLOSE = 0.004, 60.0, 0.010
 #: A surface is measured by what looks at it from no farther aside than this cosine.
 FACING = 0.3
@@ -55,11 +59,21 @@ class Picture(NamedTuple):
     outline: Aside
 
 
-class Reshaping:
-    """What pictures say of a surface: mesh, in its own frame; points (N, 3) on it with their normals (N, 3)."""
+class Met(NamedTuple):
+    """Where rays through measured points meet a surface, in its frame: how far (K,) m the points are before it along its normals (K, 3), at feet (K, 3);
+    which of the points, (M,), these are."""
 
-    def __init__(self, mesh: Mesh, points: Array, normals: Array) -> None:
-        self._mesh = mesh
+    off: Array
+    normals: Array
+    feet: Array
+    which: NDArray[np.bool_]
+
+
+class Reshaping:
+    """What pictures say of a surface: mesh, in its own frame; points (N, 3) on it with their normals (N, 3); first: what has mended it before."""
+
+    def __init__(self, mesh: Mesh, points: Array, normals: Array, first: Reshaping | None = None) -> None:
+        self._mesh, self._first = mesh, first
         self._scene = raycaster(mesh)
         inward = np.concatenate([points - 1e-4 * normals, -normals], axis=1).astype(np.float32)
         thick = self._scene.cast_rays(o3d.core.Tensor(inward))["t_hit"].numpy().astype(float)
@@ -95,7 +109,10 @@ class Reshaping:
         self._vector += off - both.T @ moved[:, -1]
 
     def mended(self, pieces: Sequence[Mesh] = ()) -> tuple[Mesh, tuple[Mesh, ...]]:
-        """The mesh with its surface where the pictures say, and convex pieces of its solid, their corners moved as the surface nearest to them is."""
+        """The mesh with its surface where the pictures say, and convex pieces of its solid (as it was before any mending), their corners moved as the surface
+        nearest to them is."""
+        if self._first is not None:
+            pieces = self._first.mended(pieces)[1]
         whole = trimesh.Trimesh(self._mesh.vertices, self._mesh.faces, process=True)  # what is one corner is moved as one
         fine = trimesh.Trimesh(*divided(whole.vertices, whole.faces, EDGE), process=False)
         off = np.clip(np.linalg.solve(self._matrix, self._vector), self._least, MOST * OFF)
@@ -116,17 +133,11 @@ class Reshaping:
     def _measured(self, picture: Picture, pose: Array) -> Aside:
         """Of a picture's points those that are the tool's: depth that is smeared past the tool's outline is not of it."""
         tool_from_world = transforms.inverse(pose)
-        local, source = transforms.apply(tool_from_world, picture.points), transforms.apply(tool_from_world, picture.eye)
-        rays = np.concatenate([np.broadcast_to(source, local.shape), local - source], axis=1).astype(np.float32)
-        inside = np.isfinite(self._scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy())
-        tensor = o3d.core.Tensor(local.astype(np.float32))
-        closest = self._scene.compute_closest_points(tensor)
-        foot, normal = (closest[name].numpy().astype(float) for name in ("points", "primitive_normals"))
-        signed = self._scene.compute_signed_distance(tensor).numpy().astype(float)
-        facing = ((source - foot) * normal).sum(axis=1) > FACING * np.linalg.norm(source - foot, axis=1)
-        fits = inside & facing & (np.abs(signed) < CLOSE)
-        weight = (1 / (1 + (signed[fits] / (CLOSE / 2)) ** 2)) ** 2 / NOISE**2 * min(1.0, WORTH / max(fits.sum(), 1))
-        return Aside(signed[fits], normal[fits] @ pose[:3, :3].T, transforms.apply(pose, foot[fits]), weight)
+        off, normals, feet, _ = met(
+            self._scene, transforms.apply(tool_from_world, picture.points), transforms.apply(tool_from_world, picture.eye)
+        )
+        weight = (1 / (1 + (off / (CLOSE / 2)) ** 2)) ** 2 / NOISE**2 * min(1.0, WORTH / max(len(off), 1))
+        return Aside(off, normals @ pose[:3, :3].T, transforms.apply(pose, feet), weight)
 
     def _shares(self, places: Array, normals: Array) -> csr_matrix:
         """(M, N): how much the points tell of places (M, 3) with their normals (M, 3)."""
@@ -142,6 +153,21 @@ def raycaster(mesh: Mesh) -> o3d.t.geometry.RaycastingScene:
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
     return scene
+
+
+def met(scene: o3d.t.geometry.RaycastingScene, points: Array, eye: Array) -> Met:
+    """Where rays from an eye (3,) through measured points (M, 3) meet a surface that faces it and is no farther than CLOSE from them, all in its frame.
+
+    What is in sight is what was measured; where that is farther off, as along the edge of what is before it, the sensor's depth is of something else.
+    """
+    away = points - eye
+    rays = np.concatenate([np.broadcast_to(eye, points.shape), away], axis=1).astype(np.float32)
+    cast = scene.cast_rays(o3d.core.Tensor(rays))
+    far, normals = cast["t_hit"].numpy().astype(float), cast["primitive_normals"].numpy().astype(float)
+    length, along = np.linalg.norm(away, axis=1), (normals * away).sum(axis=1)
+    which = (np.abs(far - 1) * length < CLOSE) & (-along > FACING * length)
+    far, away, along, normals = far[which], away[which], along[which], normals[which]
+    return Met((1 - far) * along, normals, eye + far[:, None] * away, which)
 
 
 def divided(vertices: Array, faces: NDArray[np.int64], longest: float) -> tuple[Array, NDArray[np.int64]]:

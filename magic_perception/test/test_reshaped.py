@@ -7,7 +7,7 @@ import trimesh
 
 from magic_core import transforms
 from magic_core.mesh import from_trimesh
-from magic_perception.reshaped import Aside, Picture, Reshaping, divided
+from magic_perception.reshaped import CLOSE, Aside, Picture, Reshaping, divided, met, raycaster
 
 EYES = np.array([[0.5, 0.45, 0.6], [0.5, -0.45, 0.6]])
 NOTHING = Aside(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -64,6 +64,56 @@ def test_what_was_hidden_as_it_lay_is_seen_as_it_turns():
     assert found.vertices[above, 2].mean() == pytest.approx(0.015, abs=0.0003)
     assert found.to_trimesh().is_watertight  # its long sides were divided first
     np.testing.assert_allclose(piece.bounds, found.bounds, atol=0.0005)  # what physics takes it for
+
+
+def test_a_thin_wall_does_not_grow_by_the_sensor_s_noise():
+    """2 mm along the rays, of a wall of 3 mm: what is measured behind its middle is of the side in sight as well."""
+    rng = np.random.default_rng(0)
+    model = trimesh.creation.box([0.08, 0.05, 0.003])
+    points, face = trimesh.sample.sample_surface(model, 500, seed=1)
+    reshaping = Reshaping(from_trimesh(model), np.asarray(points), np.asarray(model.face_normals[face]))
+    for _ in range(10):
+        shown = []
+        for eye in EYES:
+            seen = measured(model, np.eye(4), eye, rng)
+            rays = (seen - eye) / np.linalg.norm(seen - eye, axis=1)[:, None]
+            shown.append(Picture(seen + rng.normal(0, 0.002, (len(seen), 1)) * rays, eye, NOTHING))
+        reshaping.see(shown, np.eye(4), np.zeros(3), LYING)
+    vertices = reshaping.mended()[0].vertices
+    above = (np.abs(vertices[:, :2]) < [0.03, 0.015]).all(axis=1) & (vertices[:, 2] > 0)
+    assert vertices[above, 2].mean() == pytest.approx(0.0015, abs=0.0001)
+
+
+def test_what_is_mended_twice_takes_its_pieces_along():
+    rng = np.random.default_rng(0)
+    true, model = (trimesh.creation.icosphere(3, radius) for radius in (0.03, 0.027))
+    pieces, first = [from_trimesh(model)], None
+    mesh = pieces[0]
+    for _ in range(2):
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        first = Reshaping(mesh, solid.triangles_center[::3], solid.face_normals[::3], first)
+        for _ in range(5):
+            first.see(
+                [Picture(measured(true, np.eye(4), eye, rng), eye, NOTHING) for eye in [*EYES, *-EYES]], np.eye(4), np.zeros(3), LYING
+            )
+        mesh, (piece,) = first.mended(pieces)
+    np.testing.assert_allclose(piece.bounds, mesh.bounds, atol=0.0005)
+    assert np.linalg.norm(mesh.vertices, axis=1).mean() == pytest.approx(0.03, abs=0.0005)
+
+
+def test_the_depth_of_a_rim_over_the_hollow_behind_it_is_of_neither():
+    """Of a box with a plate over half of it: a camera above measures the plate's depth some way past its edge."""
+    box, plate = trimesh.creation.box([0.08, 0.05, 0.01]), trimesh.creation.box([0.04, 0.05, 0.004])
+    plate.apply_translation([-0.02, 0, 0.03])
+    scene = raycaster(from_trimesh(trimesh.util.concatenate([box, plate])))
+    x = np.array([-0.02, -0.001, 0.002, 0.004, 0.02])
+    points = np.column_stack([x, np.zeros(5), [0.033, 0.033, 0.032, 0.032, 0.003]])
+    found = met(scene, points, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_array_equal(found.which, [True, True, False, False, True])
+    np.testing.assert_allclose(found.off, [0.001, 0.001, -0.002], atol=1e-6)
+    np.testing.assert_allclose(found.feet[:, 2], [0.032, 0.032, 0.005], atol=1e-6)
+    aside = met(scene, points[:1] + [0, 0, 2 * CLOSE], np.array([0.0, 0.0, 1.0]))
+    assert not aside.which.any()
 
 
 def test_a_surface_is_divided_for_both_of_its_sides():
