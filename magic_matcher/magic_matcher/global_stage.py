@@ -21,6 +21,9 @@ from magic_matcher import contour as contours
 from magic_matcher import curvature
 from magic_matcher.contour import Contour
 
+#: A tool that is led across its contact's normal by more than this share of its way along it is not led straight on.
+ACROSS = 0.25
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -29,7 +32,8 @@ class Reference:
     pixel (2,) on the tool's contour in ``view``; normal (2,) unit, outward; concave: its
     sign; target_radius: radius in pixels of ``view`` of the object touched there (the
     target's curvature at p_O), ``None`` where it is unknown; contour: of view.mask; let_go:
-    the tool stays at the target, held by it alone.
+    the tool stays at the target, held by it alone; straight: it is led
+    along the contact's normal as long as it acts on the target.
     """
 
     view: CanonicalView
@@ -40,6 +44,7 @@ class Reference:
     target_radius: float | None
     contour: Contour
     let_go: bool = False
+    straight: bool = True
 
     def key(self) -> str:
         """A name for everything in here that shapes features, for caches."""
@@ -166,4 +171,6 @@ def from_strategy(strategy: Strategy) -> Reference:
     disc = strategy.target_contact.disc_radius
     radius = None if disc is None else disc / strategy.tool_view.metres_per_pixel
     made = make_reference(strategy.tool_view, strategy.tool_contact.pixel, strategy.tool_contact.normal, radius)
-    return replace(made, let_go=strategy.releases)
+    led = np.array([w.offset for w in strategy.waypoints if w.phase in ("contact", "goal") and not w.contact]).reshape(-1, 3)
+    along, *across = np.ptp(led, axis=0) if len(led) else np.zeros(3)
+    return replace(made, let_go=strategy.releases, straight=bool(np.hypot(*across) <= ACROSS * along))

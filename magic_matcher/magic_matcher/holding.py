@@ -29,6 +29,9 @@ DIRECTIONS = 72
 #: By so much (rad) a pull may be off to either side and still has to find the disc held, in steps in which a better pull is looked for, and
 #: the farthest that one is from the contact's own normal.
 ASTRAY, TURN_STEP, TURN_MOST = np.deg2rad(15.0), np.deg2rad(5.0), np.deg2rad(45.0)
+#: A disc that has moved aside by so many radii has left its place: what a side of a shallow hollow rises by farther off holds it at another one.
+#: A disc's centres are looked at so many times as closely for that.
+STAYS, FINER = 0.75, 4
 
 
 #: Closed curves (K, 2) of a disc's centres, and their unit normals (K, 2) into the open.
@@ -270,17 +273,48 @@ def _around(good: NDArray[np.bool_], at: int, most: int) -> int:
     return next((k - 1 for k in range(most + 1) if not good[at - k : at + k + 1].all()), most)
 
 
+def _finer(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A closed row of points (K, 2) with others between them, :data:`FINER` K in all."""
+    count = len(points)
+    at = np.arange(FINER * count) / FINER
+    return np.column_stack([np.interp(at, np.arange(count + 1), np.append(axis, axis[0])) for axis in points.T])
+
+
+def _along(
+    radius: float, curve: NDArray[np.float64], free: NDArray[np.float64], at: int, out: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """A disc pressed against directions ``out`` (T, 2) from one of its centres: how deep (T,) it is held, radii, how high (T,) the lower side of where
+    it comes to rest is within :data:`STAYS`, and the index (T,) of that centre."""
+    tolerance = max(TOLERANCE * radius, 0.6)
+    height = (out @ (curve - curve[at]).T).astype(np.float32)
+    rest, depth, _ = _settle(curve, free, out, np.full(len(out), at), height, tolerance, False)
+    # What rolls farther than its own radius is at another place.
+    held = np.where(np.hypot(*(curve[rest] - curve[at]).T) <= radius, depth.min(axis=1) / radius, 0.0)
+    beside = np.column_stack([-out[:, 1], out[:, 0]])
+    aside = beside @ curve.T - np.sum(beside * curve[rest], axis=1)[:, None]
+    near = np.where(np.abs(aside) <= STAYS * radius, height, -np.inf)
+    sides = [_climb(_walks(near, rest, sign), height[np.arange(len(out)), rest], tolerance) for sign in (1, -1)]
+    return held, np.minimum(held, np.min(sides, axis=0) / radius), rest
+
+
 def steadied(
-    contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float64], radius: float, curves: Curves, enough: float
+    contour: Contour,
+    point: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    radius: float,
+    curves: Curves,
+    enough: float,
+    straight: bool = True,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """The contact (2,) and normal (2,) by which a disc of ``radius`` px is held, pulled a little astray as well, that was met at a
     contact; ``None`` where its own normal serves, or no other is better.  curves: those of its :func:`centres`.
 
     A large disc in a small corner touches both of its arms, the shorter one at its end: pulled along the bisector of the corner it rolls
     over that end.  Of normals turned about the disc's centre the one that is turned least counts for which the hollow is ``enough``
-    radii deep, pulled along it and :data:`ASTRAY` to either side; where none is so deep, the deepest, and where none bears such pulls the one that
-    bears the most to either side.  The contact is then where the
-    line through the disc's centre meets the outline.
+    radii deep, pulled along it and :data:`ASTRAY` to either side.  Where none is so deep and the tool is led ``straight`` on, it is the one along
+    which the lower side is highest (:data:`STAYS`), of those along which the hollow is ``enough`` deep if it is so along the contact's own.  Of a scoop,
+    that is led along and then up, it is the deepest, and where none bears such pulls the one that bears the most to either side.  The contact is then
+    where the line through the disc's centre meets the outline.
     """
     if not curves:
         return None
@@ -295,32 +329,34 @@ def steadied(
     at = nearest - (int(ends[which - 1]) if which else 0)
     tolerance = max(TOLERANCE * radius, 0.6)
 
-    def pressed(turns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """How deep (T,) in radii the disc is held, pressed along the normal turned by so much, those directions, and where it rests."""
-        directions = np.cos(turns)[:, None] * normal + np.sin(turns)[:, None] * across
-        height = (directions @ (curve - curve[at]).T).astype(np.float32)
-        rest, depth, _ = _settle(curve, free, directions, np.full(len(turns), at), height, tolerance, False)
-        # What rolls farther than its own radius is at another place.
-        here = np.hypot(*(curve[rest] - curve[at]).T) <= radius
-        return np.minimum(np.where(here, depth.min(axis=1) / radius, 0.0), enough), directions, rest
-
-    own = float(pressed(np.array([-ASTRAY, 0.0, ASTRAY]))[0].min())
+    side = round(ASTRAY / TURN_STEP)
+    count = round(TURN_MOST / TURN_STEP) + side
+    turns = np.arange(-count, count + 1) * TURN_STEP
+    directions = np.cos(turns)[:, None] * normal + np.sin(turns)[:, None] * across
+    own = min(enough, float(_along(radius, curve, free, at, directions[[count - side, count, count + side]])[0].min()))
     if own >= enough:
         return None
-    count, side = round(TURN_MOST / TURN_STEP), round(ASTRAY / TURN_STEP)
-    turns = np.arange(-count - side, count + side + 1) * TURN_STEP
-    held, directions, rest = pressed(turns)
+    held, _, rest = _along(radius, curve, free, at, directions)
+    held = np.minimum(held, enough)
     steady = np.min([held[side + k : len(held) - side + k] for k in (-side, 0, side)], axis=0)
-    best = int(np.lexsort((np.abs(turns[side:-side]), -steady))[0])
-    if steady[best] <= own + TOLERANCE:
-        # Too shallow for such pulls: the middle of those that it bears.
-        bears = [_around(held > TOLERANCE, side + k, side) for k in range(len(steady))]
-        best = int(np.lexsort((np.abs(turns[side:-side]), -np.array(bears)))[0])
-        # Of a disc for which the tolerance is less than a pixel the outline tells no single step, as in a wide bowl.
-        unsure = bears[count] >= 0 and TOLERANCE * radius < 1.0
-        if bears[best] <= bears[count] + unsure:
+    nearby = np.abs(turns[side:-side])
+    best = side + int(np.lexsort((nearby, -steady))[0])
+    if straight and steady[best - side] < enough:
+        curve, free, at = _finer(curve), _finer(free), FINER * at
+        held, lower, rest = _along(radius, curve, free, at, directions)
+        lower[held < min(held[count], enough)] = 0.0  # what is deep enough stays so
+        best = side + int(np.lexsort((nearby, -lower[side:-side]))[0])
+        if lower[best] <= lower[count] + tolerance / radius:
             return None
-    direction, centre = directions[side + best], curve[rest[side + best]]
+    elif not straight and steady[best - side] <= own + TOLERANCE:
+        # Too shallow for such pulls: the middle of those that it bears.
+        bears = np.array([_around(held > TOLERANCE, side + k, side) for k in range(len(steady))])
+        best = side + int(np.lexsort((nearby, -bears))[0])
+        # Of a disc for which the tolerance is less than a pixel the outline tells no single step, as in a wide bowl.
+        unsure = bears[count - side] >= 0 and TOLERANCE * radius < 1.0
+        if bears[best - side] <= bears[count - side] + unsure:
+            return None
+    direction, centre = directions[best], curve[rest[best]]
     way = np.arange(0.0, 3 * radius, 0.25)
     ahead = centre - way[:, None] * direction
     solid = np.flatnonzero(contour.sample(*ahead.T.astype(np.float32)[:, None])[0] > 0.5)

@@ -540,7 +540,7 @@ def _steadied(
     the place is similar enough (``floor``)."""
     if asked.hollow is None or found.concave != asked.concave or not proposal.similarity >= floor:
         return found
-    held = holding.steadied(contour, found.point, found.normal, radius, curves, asked.hollow)
+    held = holding.steadied(contour, found.point, found.normal, radius, curves, asked.hollow, asked.straight)
     return found if held is None else replace(found, point=held[0], normal=held[1])
 
 

@@ -37,7 +37,8 @@ SHALLOW, UNLIKE = 0.5, 0.8
 @dataclass(frozen=True)
 class Demands:
     """What a place must show.  concave: its sign, ``None``: either; floor: of s_dino; gap (at most) and hollow (at least) in radii of the
-    target, ``None`` where they are not asked; loop: the reference lies in a loop (:mod:`magic_matcher.enclosing`); hangs: the tool is let go there."""
+    target, ``None`` where they are not asked; loop: the reference lies in a loop (:mod:`magic_matcher.enclosing`); hangs: the tool is let go there;
+    straight: it is led along the contact's normal."""
 
     concave: bool | None
     floor: float
@@ -45,6 +46,7 @@ class Demands:
     hollow: float | None
     loop: bool = False
     hangs: bool = False
+    straight: bool = True
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,12 @@ def demands(reference: Reference, floor: float) -> Demands:
     concave = reference.concave if np.isfinite(reference.radius) else None
     loop = reference.concave and enclosing.asked(reference.contour, reference.pixel, reference.normal, reference.radius)
     if not reference.concave or reference.target_radius is None or not np.isfinite(reference.target_radius):
-        return Demands(concave, floor, None, None, loop, reference.let_go)
+        return Demands(concave, floor, None, None, loop, reference.let_go, reference.straight)
     held = holding.hold(reference.contour, reference.pixel[None], reference.normal[None], reference.target_radius)
     gap = float(held.gap[0])
     depth = HOLLOW_SHARE * float(held.press[0, 0])
     room, hollow = max(GAP, GAP_SHARE * gap) if np.isfinite(gap) else None, min(HOLLOW, depth) if depth > 0 else None
-    return Demands(concave, floor, room, hollow, loop, reference.let_go)
+    return Demands(concave, floor, room, hollow, loop, reference.let_go, reference.straight)
 
 
 def lesser(asked: Demands) -> Demands:

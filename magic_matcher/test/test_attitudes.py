@@ -9,7 +9,7 @@ from magic_core import shapes, transforms
 from magic_core import strategy as strategies
 from magic_core.scene import SceneObject
 from magic_core.views import find_view
-from magic_matcher import attitudes, features, matching, tools
+from magic_matcher import attitudes, features, global_stage, matching, plausible, tools
 
 STRATEGIES = Path(__file__).resolve().parents[2] / "ros2_ws" / "src" / "magic_bringup" / "strategies"
 if not STRATEGIES.is_dir():
@@ -95,3 +95,9 @@ def test_what_faces_the_table_in_a_cut_alone_is_hidden():
     assert not matching.Tool("tool", view).hides(view, down)
     side = find_view(attitudes.load("mug:8", ""), None, "side")
     assert not matching.Tool("tool", side, up=up).hides(side, down)
+
+
+@pytest.mark.parametrize(("strategy", "straight"), [("hooking", True), ("hanging", True), ("scooping", False)])
+def test_a_scoop_is_led_along_and_then_up_and_a_hook_straight_on(strategy, straight):
+    reference = global_stage.from_strategy(strategies.find(strategy, STRATEGIES))
+    assert plausible.demands(reference, 0.0).straight is straight

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from magic_core import shapes, transforms
+from magic_core import shapes
 from magic_core.errors import MagicError
 from magic_matcher import bench, contour, embedded, holding, jobs, match_meshes
 
@@ -101,22 +101,49 @@ def test_where_a_contact_holds_its_own_normal_stays():
     assert holding.steadied(deep, side, np.array([0.0, -1.0]), 30.0, curves, 0.2) is None
 
 
-def test_in_a_shallow_hollow_the_pull_goes_to_the_middle_of_those_that_it_bears():
-    # A V whose arms rise by 8 and by 22 degrees: pulls from 8 degrees to one side to 22 to the other are borne, none and 15 to either side of it.
-    rise = [150 * np.tan(np.deg2rad(angle)) for angle in (8, 22)]
-    mask = np.zeros((500, 600), np.uint8)
-    cv2.fillPoly(mask, [np.array([(150, 300 - rise[0]), (300, 300), (450, 300 - rise[1]), (450, 400), (150, 400)], np.int32)], 1)
-    edge, radius, up = contour.extract(mask > 0), 60.0, np.array([0.0, -1.0])
-    place = edge.points[edge.nearest((300.0, 300.0))]
-    around = holding.room(edge, radius)
-    point, normal = holding.steadied(edge, place, up, radius, holding.centres(around, radius), 0.2)
+def hollow(left, short, right, far):
+    """Two arms from (350, 300), of so many pixels, that rise by so many degrees."""
+    mask = np.zeros((500, 700), np.uint8)
+    ends = [
+        (350 + sign * n * np.cos(a), 300 - n * np.sin(a)) for sign, a, n in ((-1, np.deg2rad(left), short), (1, np.deg2rad(right), far))
+    ]
+    corners = [ends[0], (350, 300), ends[1], (ends[1][0], 450), (ends[0][0], 450)]
+    cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 1)
+    return contour.extract(mask > 0)
 
-    def borne(point, normal):
-        turned = [transforms.from_rpy(0, 0, np.deg2rad(angle))[:2, :2] @ normal for angle in (-10, 10)]
-        return holding.hold(edge, np.array([point] * 2), np.array(turned), radius, around).press[:, 0].min()
 
-    assert np.degrees(np.arctan2(abs(normal[0]), -normal[1])) == pytest.approx(7, abs=3)
-    assert borne(place, up) < 0.02 < borne(point, normal)
+@pytest.mark.parametrize(
+    ("arms", "turned"),
+    [
+        # Pulls from 8 degrees to one side to 22 to the other are borne, none and 15 to either side of it: the middle is best.
+        ((8, 150, 22, 150), -7),
+        # Of a short steep arm and a long slight one the short one is the lower side of a pull towards it, and the long one, where the disc
+        # still is at its place, of one away from it.
+        ((40, 25, 12, 250), 0),
+        ((50, 40, 12, 250), 10),
+    ],
+)
+def test_in_a_shallow_hollow_the_pull_is_that_whose_lower_side_is_highest(arms, turned):
+    edge, radius, up = hollow(*arms), 60.0, np.array([0.0, -1.0])
+    place = edge.points[edge.nearest((350.0, 300.0))]
+    found = holding.steadied(edge, place, up, radius, holding.centres(holding.room(edge, radius), radius), 0.2)
+    normal = up if found is None else found[1]
+    assert np.degrees(np.arctan2(normal[0], -normal[1])) == pytest.approx(turned, abs=3)
+
+
+def test_a_turned_pull_leaves_a_hollow_as_deep_as_is_asked():
+    # Its lower side is highest with the pull turned by 10 degrees, along which it is 0.17 radii deep.
+    edge, radius, up = hollow(40, 36, 7, 250), 60.0, np.array([0.0, -1.0])
+    place, curves = edge.points[edge.nearest((350.0, 300.0))], holding.centres(holding.room(edge, radius), radius)
+    found = holding.steadied(edge, place, up, radius, curves, 0.2)
+    assert found is not None and holding.hold(edge, found[0][None], found[1][None], radius).press[0, 0] >= 0.2
+
+
+def test_of_a_shallow_hollow_a_tool_that_is_led_along_and_up_is_turned_to_the_middle_of_the_pulls_that_it_bears():
+    edge, radius, up = hollow(8, 150, 22, 150), 60.0, np.array([0.0, -1.0])
+    place, curves = edge.points[edge.nearest((350.0, 300.0))], holding.centres(holding.room(edge, radius), radius)
+    _, normal = holding.steadied(edge, place, up, radius, curves, 0.2, straight=False)
+    assert np.degrees(np.arctan2(normal[0], -normal[1])) == pytest.approx(-7, abs=3)
 
 
 def test_sides_tips_and_outer_corners_do_not_hold(corner):
@@ -213,8 +240,9 @@ def test_shapes_and_folders_of_meshes(tmp_path, capsys):
         assert caught.value.code == 2 and "BAD_REQUEST" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("straight", [True, False])
 @pytest.mark.parametrize("off", [0.2, 0.4, 0.6])
-def test_in_a_wide_bowl_of_few_pixels_the_pull_stays(off):
+def test_in_a_wide_bowl_of_few_pixels_the_pull_stays(off, straight):
     # A wide flat bowl, a little askew, and a disc of 17 pixels that it holds when pulled straight: 5 degrees more or less are a matter of its pixels.
     column = np.arange(200)
     floor = 70 - 0.0024 * (column - 100 - off) ** 2 + 0.06 * (column - 100)
@@ -222,4 +250,4 @@ def test_in_a_wide_bowl_of_few_pixels_the_pull_stays(off):
     edge = contour.extract((np.arange(120)[:, None] >= np.round(floor)) & (np.arange(120)[:, None] < 95))
     place, radius = edge.points[edge.nearest((100.0, 70.0))], 17.0
     curves = holding.centres(holding.room(edge, radius), radius)
-    assert holding.steadied(edge, place, np.array([0.0, -1.0]), radius, curves, 0.2) is None
+    assert holding.steadied(edge, place, np.array([0.0, -1.0]), radius, curves, 0.2, straight) is None
