@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -95,10 +97,77 @@ def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArra
     return np.unique(part, return_inverse=True)[1]
 
 
+#: Voxels of a level face look up to this cosine, so many of them lie within LEVEL of its height, m, and other faces are APART from it, m.
+UPWARD, FACE, LEVEL, APART = 0.95, 30, 0.006, 0.012
+#: What stands on it begins so much above it, m, where voxels look up to this cosine, and at its height where they do not.
+ABOVE, SIDE = 0.004, 0.8
+#: Where it begins such a share of the surface bends inward.
+BENT = 0.25
+#: A thing that stands beside the face goes on below it: of its lowest BAND above the face, m, more than such a share has something below the face that lies at most
+#: so far aside, m, and differs by no more in colour (R, G, B of 0..1).
+GOES_ON, BAND, ASIDE, PAINT = 0.3, 0.016, 0.010, 0.08
+
+
+def on_tops(voxels: seams.Voxels, least: int = 50) -> NDArray[np.int64]:
+    """Parts (V,) from 0 of the voxels, cut where something stands on a level face: it hangs together with what bears it where their sides lie in one plane, or where
+    its own side is seen before the other's back edge, and no seam bends inward all around."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    part = np.zeros(len(voxels.centre), np.int64)
+    for level in _tops(voxels.height[voxels.normal[:, 2] > UPWARD]):
+        above = (part == 0) & (voxels.height > level + np.where(voxels.normal[:, 2] > SIDE, ABOVE, 0.0))
+        inner = above[voxels.a] & above[voxels.b]
+        link = coo_matrix((np.ones(np.count_nonzero(inner)), (voxels.a[inner], voxels.b[inner])), shape=(len(part), len(part)))
+        group = connected_components(link, directed=False)[1]
+        for number in np.unique(group[above]):
+            upper = above & (group == number)
+            told = (upper[voxels.a] != upper[voxels.b]) & voxels.clear
+            inward = (voxels.opening[told] < 0) & (voxels.bend[told] > 25)
+            bent = np.count_nonzero(inward) > BENT * len(inward)
+            if np.count_nonzero(upper) >= least and bent and _going_on(voxels, (part == 0) & ~upper, upper, level) <= GOES_ON:
+                part[upper] = part.max() + 1
+    return part
+
+
+def _going_on(voxels: seams.Voxels, lower: NDArray[np.bool_], upper: NDArray[np.bool_], level: float) -> float:
+    """The share of the foot of an upper part (V,) that goes on in its own colour in the lower one (V,) below the level of its face."""
+    from scipy.spatial import cKDTree
+
+    foot = upper & (voxels.height < level + BAND)
+    under = lower & (voxels.height < level - LEVEL) & (voxels.height > level - LEVEL - BAND)
+    if not foot.any() or not under.any():
+        return 0.0
+    where = np.column_stack([voxels.centre[:, :2] / ASIDE, voxels.rgb / PAINT])
+    return float(np.mean(cKDTree(where[under]).query(where[foot], p=np.inf)[0] <= 1))
+
+
+def _tops(heights: NDArray[np.float64]) -> list[float]:
+    """Heights of the level faces among upward voxels (N,), the highest first."""
+    found: list[float] = []
+    if len(heights) < FACE:
+        return found
+    count, edges = np.histogram(heights, np.arange(heights.min() - LEVEL, heights.max() + 2 * LEVEL, LEVEL / 2))
+    near = np.convolve(count, np.ones(4), "valid")
+    for k in np.argsort(-near, kind="stable"):
+        if near[k] < FACE:
+            break
+        level = float(np.median(heights[(heights >= edges[k]) & (heights <= edges[k + 4])]))
+        if all(abs(level - other) > APART for other in found):
+            found.append(level)
+    return sorted(found, reverse=True)
+
+
 def parts(
-    points: NDArray[np.floating], normal: NDArray[np.floating], heights: NDArray[np.floating], rgb: NDArray[np.floating], judge: seams.Judge
+    points: NDArray[np.floating],
+    normal: NDArray[np.floating],
+    heights: NDArray[np.floating],
+    rgb: NDArray[np.floating],
+    judge: seams.Judge,
+    cut: Callable[[seams.Voxels], NDArray[np.int64]] = pieces,
 ) -> NDArray[np.int64]:
-    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table, colours (N, 3), 0..255."""
+    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table, colours (N, 3), 0..255; ``cut``
+    makes the parts of its voxels of which the judge tells whether they are things."""
     from scipy.spatial import cKDTree
 
     labels = np.zeros(len(points), np.int64)
@@ -109,7 +178,7 @@ def parts(
     if made is None:
         return labels
     voxels, index = made
-    part = seams.joined(voxels, pieces(voxels), judge)
+    part = seams.joined(voxels, cut(voxels), judge)
     labels[sound] = part[index]
     if part.max() > 0 and (~sound).any():
         labels[~sound] = part[cKDTree(voxels.centre).query(points[~sound])[1]]

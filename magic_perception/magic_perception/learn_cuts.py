@@ -5,7 +5,7 @@ The scenes are procedural: neighbours of different colours and single things of 
 where none has more than a tenth of itself on the other side.  The labelled scenes of OSD are left out, and judge the result.
 
 The figures are of scenes that the weights know nothing of: each fifth of the scenes is judged by weights from the others.  With ``--first`` the scenes of
-other seeds are segmented whole, by the weights that ship: how many neighbours are two things, and single things one.
+other seeds are segmented whole, by the weights that ship: how many neighbours are so many things, things on each other two, and single things one.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def cross_validated(found: list[Cluster], folds: int = 5) -> str:
 
 
 def told(made: Pile, segmenter: DepthSegmenter) -> str:
-    """What becomes of a scene of neighbours, segmented whole: ``right``; ``merged``: two are one; ``torn``: there are more things than are; ``lost``."""
+    """What becomes of a scene of neighbours, segmented whole: ``right``; ``merged``: some are one; ``torn``: there are more things than are; ``lost``."""
     labels = segmenter.segment(looked_at(made, Parameters()), (), Parameters())
     top = max(int(image.max()) for image in labels)
     votes = np.zeros((made.things, top + 1))
@@ -122,6 +122,8 @@ def judged(first: int, rounds: int) -> str:
     for seed in range(first, first + rounds):
         for number, (_, gap, _, _) in enumerate(neighbours.PAIRS):
             counts[f"two, {1000 * gap:.0f} mm apart", told(neighbours.pair(seed, number), segmenter)] += 1
+            counts[f"three, {1000 * gap:.0f} mm apart", told(neighbours.three(seed, number), segmenter)] += 1
+            counts["one on the other", told(neighbours.stacked(seed, number), segmenter)] += 1
             counts["partly hidden", told(neighbours.behind(seed, number), segmenter)] += 1
             counts[neighbours.kind_of(number), told(neighbours.single(seed, number), segmenter)] += 1
     lines = ["| what | right | taken for one | torn | not found |", "| --- |" + " --- |" * 4]

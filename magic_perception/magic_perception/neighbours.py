@@ -1,7 +1,8 @@
-"""Procedural pairs of neighbours of different colours, and single things of several colours: what is to be parted, and what is to stay one.
+"""Procedural neighbours of different colours, two or three, things on each other, and single things of several colours: what is to be parted, and what is to
+stay one.
 
-A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), as many single things, and as many that another thing
-hides in part.
+A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), and as many threes, things that stand on another, single
+things, and single things that another hides in part.
 """
 
 from __future__ import annotations
@@ -41,8 +42,30 @@ MIDDLE = (0.52, 0.0)
 def pair(seed: int, number: int) -> Pile:
     """The pair of a seed and of a number in :data:`PAIRS`."""
     random = np.random.default_rng([seed, number, 2911])
-    forms, gap, (low, high), equal = PAIRS[number]
     table = TABLES[int(random.integers(len(TABLES)))]
+    meshes, _, turn = _two(random, number, table)
+    place = transforms.from_rpy(0, 0, turn, [*MIDDLE, 0])
+    return _seen(random, [mesh.transformed(place) for mesh in meshes], table)
+
+
+def three(seed: int, number: int) -> Pile:
+    """Such a pair and a third thing beside it on any side, as far from it as its two are from each other."""
+    random = np.random.default_rng([seed, number, 2913])
+    table = TABLES[int(random.integers(len(TABLES)))]
+    meshes, colors, turn = _two(random, number, table)
+    (_, form), gap, (low, high), _ = PAIRS[number]
+    color = _color(random, [table, *colors])
+    third = _standing(random, form, random.uniform(low, high), color).transformed(transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi)))
+    meshes = [mesh.transformed(transforms.from_rpy(0, 0, turn)) for mesh in meshes]
+    meshes = [*meshes, _beside(meshes, third, gap)]
+    middle = np.mean([mesh.vertices[:, :2].mean(axis=0) for mesh in meshes], axis=0)
+    place = transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi), [*MIDDLE, 0]) @ transforms.from_rpy(0, 0, 0, [*-middle, 0])
+    return _seen(random, [mesh.transformed(place) for mesh in meshes], table)
+
+
+def _two(random: np.random.Generator, number: int, table: tuple[int, int, int]) -> tuple[list[Mesh], list[tuple[int, int, int]], float]:
+    """Two things side by side about the origin, their colours, and a turn to place them by."""
+    forms, gap, (low, high), equal = PAIRS[number]
     first = _color(random, [table])
     colors = [first, _color(random, [table, first])]
     tall = random.uniform(low, high)
@@ -54,9 +77,9 @@ def pair(seed: int, number: int) -> Pile:
         _standing(random, form, height, color).transformed(transforms.from_rpy(0, 0, own, [0, random.uniform(-0.012, 0.012), 0]))
         for form, color, height, own in zip(forms, colors, heights, turns, strict=True)
     )
-    far = _apart(one, two, gap)
-    place = transforms.from_rpy(0, 0, turn, [*MIDDLE, 0]) @ transforms.from_rpy(0, 0, 0, [-far / 2, 0, 0])
-    return _seen(random, [mesh.transformed(place) for mesh in (one, _along(two, far))], table)
+    meshes = [one, _beside([one], two, gap)]
+    middle = transforms.from_rpy(0, 0, 0, [-float(meshes[1].vertices[:, 0].mean() - two.vertices[:, 0].mean()) / 2, 0, 0])
+    return [mesh.transformed(middle) for mesh in meshes], colors, turn
 
 
 def _standing(random: np.random.Generator, form: str, height: float, color: tuple[int, int, int]) -> Mesh:
@@ -70,19 +93,15 @@ def _standing(random: np.random.Generator, form: str, height: float, color: tupl
     return _printed(random, mesh, solid.extents, color) if random.random() < PRINTED else mesh
 
 
-def _apart(one: Mesh, two: Mesh, gap: float) -> float:
-    """How far along x the second mesh is to be moved until it is so far from the first, m."""
-    outlines = [shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull for mesh in (one, two)]
+def _beside(meshes: list[Mesh], mesh: Mesh, gap: float) -> Mesh:
+    """The mesh moved along x until it is so far from the others, m."""
+    others = shapely.union_all([shapely.MultiPoint(other.vertices[:, :2]).convex_hull for other in meshes])
+    outline = shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull
     near, far = 0.0, 0.4
     for _ in range(20):
         middle = (near + far) / 2
-        close = outlines[0].distance(shapely.affinity.translate(outlines[1], middle, 0.0)) <= gap
+        close = others.distance(shapely.affinity.translate(outline, middle, 0.0)) <= gap
         near, far = (middle, far) if close else (near, middle)
-    return far
-
-
-def _along(mesh: Mesh, far: float) -> Mesh:
-    """The mesh moved along x, m."""
     return mesh.transformed(transforms.from_rpy(0, 0, 0, [far, 0, 0]))
 
 
@@ -160,9 +179,39 @@ def behind(seed: int, number: int) -> Pile:
     way = sensor.STATION[names[0]][:2, 3] - MIDDLE
     turn = transforms.from_rpy(0, 0, float(np.arctan2(way[1], way[0])), [*MIDDLE, 0])
     away = transforms.from_rpy(0, 0, 0, [0, random.uniform(-0.08, 0.08), 0])
-    front = front.transformed(away)
-    far = _apart(mesh.transformed(transforms.inverse(turn)), front, random.uniform(0.012, 0.06))
-    return _seen(random, [mesh, _along(front, far).transformed(turn)], table, names)
+    front = _beside([mesh.transformed(transforms.inverse(turn))], front.transformed(away), random.uniform(0.012, 0.06)).transformed(turn)
+    return _seen(random, [mesh, front], table, names)
+
+
+def stacked(seed: int, number: int) -> Pile:
+    """A thing with a flat top, and a smaller one of another colour anywhere on it: a box, a cylinder, or a mug; by two cameras."""
+    random = np.random.default_rng([seed, number, 2915])
+    table = TABLES[int(random.integers(len(TABLES)))]
+    first = _color(random, [table])
+    color = _color(random, [table, first])
+    height = random.uniform(*HEIGHTS[number % len(HEIGHTS)])
+    top = ("box", "cylinder", "mug")[number // len(HEIGHTS) % 3]
+    if top == "mug":
+        upper = shapes.make("mug", int(random.integers(1 << 20))).mesh
+        upper = Mesh(upper.vertices, upper.faces).painted(color)
+    else:
+        upper = _standing(random, top, random.uniform(*HEIGHTS[int(random.integers(len(HEIGHTS)))]), color)
+    upper = upper.transformed(transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi)))
+    reach = np.ptp(upper.vertices[:, :2], axis=0)
+    if top == "cylinder" and random.random() < 0.5:
+        radius = np.hypot(*reach) / 2 + random.uniform(0.005, 0.03)
+        size = np.array([2 * radius, 2 * radius, height])
+        lower = _row(size, [], [first], round_=True)
+        room = np.full(2, (radius - np.hypot(*reach) / 2) / np.sqrt(2))
+    else:
+        size = np.array([*(reach + random.uniform(0.01, 0.12, 2)), height])
+        lower = _row(size, [], [first])
+        if random.random() < PRINTED:
+            lower = _printed(random, lower, size, first)
+        room = (size[:2] - reach) / 2
+    upper, lower = _at(upper, random.uniform(-room, room), height), _at(lower, np.zeros(2), 0.0)
+    place = transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi), [*MIDDLE, 0])
+    return _seen(random, [mesh.transformed(place) for mesh in (lower, upper)], table, ("left", "right"))
 
 
 def _seen(random: np.random.Generator, meshes: list[Mesh], table: tuple[int, int, int], names: tuple[str, ...] | None = None) -> Pile:

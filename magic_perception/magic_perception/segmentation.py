@@ -50,9 +50,10 @@ class DepthSegmenter:
     def segment(self, looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters) -> list[NDArray[np.int32]]:
         """See :class:`Segmenter`."""
         found = clustered(looks, known, parameters, self._workers)
-        instance = (
-            cuts.parted(looks, found, uncut(looks, found, self._judge, parameters), self._cut) if parameters.split else found.instance
-        )
+        instance = found.instance
+        if parameters.split:
+            instance = cuts.parted(looks, found, uncut(looks, found, self._judge, parameters), self._cut)
+            instance = _borne(looks, found, instance, self._judge)
         labels = []
         start = 0
         for mask, where in zip(found.masks, found.spots, strict=True):
@@ -85,6 +86,24 @@ def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.in
             instance[mine[part == number]] = following
             following += 1
     return convexity.insides(found.cloud, seen.normal, instance, seen.heights)
+
+
+def _borne(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
+    """The instances (N,) with those parted of which one thing stands on another's level face; what a hand holds over a face does not."""
+    seen = surfaces(looks, found)
+    held = np.concatenate(
+        [
+            np.zeros(len(where[0]), bool) if look.frame.held is None else look.frame.held[where] > 0
+            for look, where in zip(looks, found.spots, strict=True)
+        ]
+    )
+    result = instance.copy()
+    for number in np.setdiff1d(np.arange(int(instance.max(initial=-1)) + 1), instance[held]):
+        mine = np.nonzero(instance == number)[0]
+        part = convexity.parts(found.cloud[mine], seen.normal[mine], seen.heights[mine], seen.rgb[mine], judge, convexity.on_tops)
+        result[mine[part > 0]] = result.max() + part[part > 0]
+    # Of a mug that stood so, seams may have parted the inside before.
+    return instance if np.array_equal(result, instance) else convexity.insides(found.cloud, seen.normal, result, seen.heights)
 
 
 def _attached(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:

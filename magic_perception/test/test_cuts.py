@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
+import shapely
 import trimesh
 
 from magic_core import sensor
@@ -163,6 +165,19 @@ def test_what_is_behind_another_thing_is_hidden_unless_a_camera_sees_that_it_is_
 def test_a_striped_thing_that_another_hides_in_part_is_one(number):
     made = neighbours.behind(2001, number)
     assert len(made.meshes) == 2 and learn_cuts.told(made, DepthSegmenter()) == "right"
+
+
+def test_a_box_on_a_box_is_another():
+    made = neighbours.stacked(5000, 19)
+    assert len(made.meshes) == 2 and learn_cuts.told(made, DepthSegmenter()) == "right"
+
+
+def test_three_boxes_are_as_far_from_each_other_as_asked():
+    """The gap of a pair is that of the third thing from the nearer of the two."""
+    number = next(i for i, (_, gap, *_) in enumerate(neighbours.PAIRS) if gap == 0.010)
+    outlines = [shapely.MultiPoint(mesh.vertices[:, :2]).convex_hull for mesh in neighbours.three(5000, number).meshes]
+    far = sorted(a.distance(b) for a, b in itertools.combinations(outlines, 2))
+    assert far[:2] == pytest.approx([0.010, 0.010], abs=1e-4)
 
 
 def test_points_near_the_plane_follow_their_colour():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scenes
 import trimesh
+from scipy.spatial import cKDTree
 
 from magic_core import sensor, shapes, transforms
 from magic_core.errors import Code
@@ -71,6 +72,41 @@ def test_parts_are_joined_until_none_is_likelier_one():
     # Only what differs in colour is two.
     by_color = seams.joined(voxels, fine, lambda row, *_: row[list(seams.CRITERIA).index("hue")] - 0.1)
     assert np.array_equal(by_color, part)
+
+
+def faces_of(blocks):
+    """Voxels of the front, left and top faces of blocks (low and high corner, m, colour 0..1), where no other block covers them; normals as smooth as cameras'."""
+    points, normal, color = [], [], []
+    for number, (low, high, paint) in enumerate(blocks):
+        for axis, end, way in ((1, low, -1.0), (0, low, -1.0), (2, high, 1.0)):
+            spans = [np.arange(low[i] + 0.001, high[i], 0.002) for i in range(3)]
+            spans[axis] = np.array([end[axis]])
+            face = np.stack(np.meshgrid(*spans, indexing="ij"), axis=-1).reshape(-1, 3)
+            for other in blocks[:number] + blocks[number + 1 :]:
+                face = face[~np.all((face >= np.array(other[0]) - 1e-6) & (face <= np.array(other[1]) + 1e-6), axis=1)]
+            points.append(face)
+            normal.append(np.tile(way * np.eye(3)[axis], (len(face), 1)))
+            color.append(np.tile(paint, (len(face), 1)))
+    place, faced = np.concatenate(points), np.concatenate(normal)
+    near = cKDTree(place).query_ball_point(place, 0.010)
+    smooth = np.array([faced[some].mean(axis=0) for some in near])
+    smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
+    return convexity.voxels_of(place, smooth, place[:, 2], np.concatenate(color))[0]
+
+
+RED, BLUE = (0.7, 0.2, 0.2), (0.2, 0.2, 0.7)
+
+
+def test_what_stands_on_a_top_is_cut_from_it_though_their_fronts_go_on_in_one_plane():
+    voxels = faces_of([((0, 0, 0), (0.12, 0.10, 0.06), RED), ((0.04, 0, 0.06), (0.10, 0.05, 0.11), BLUE)])
+    part = convexity.on_tops(voxels)
+    upper = voxels.height > 0.066
+    assert len(set(part[upper])) == 1 and not set(part[upper]) & set(part[voxels.height < 0.054])
+
+
+def test_what_stands_beside_a_top_is_not_cut_at_its_height():
+    voxels = faces_of([((0, 0, 0), (0.10, 0.10, 0.05), RED), ((0.10, 0, 0), (0.16, 0.10, 0.14), BLUE)])
+    assert convexity.on_tops(voxels).max() == 0
 
 
 def test_examples_tell_things_from_parts_of_one():
