@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from concurrent.futures import BrokenExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,13 @@ def test_one_that_is_killed_is_replaced():
         assert workers.submit(os.getpid).result(30.0) not in (first, os.getpid())
     finally:
         workers.close()
+
+
+def test_one_that_dies_as_it_begins_is_not_begun_again():
+    workers = Workers(1, partial(os._exit, 1))
+    wait_for(lambda: workers.ready)
+    assert workers.submit(os.getpid) is None and workers.executor is None
+    assert workers.submit(os.getpid) is None
 
 
 def test_one_that_stands_still_ends_with_the_others():
