@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
+from concurrent.futures import TimeoutError as Late  # Python 3.10 has another one of its own
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -42,20 +43,25 @@ def shared_out(work: Callable[[S, T], R], given: S, items: Sequence[T], costs: S
     """
     order = np.argsort(-np.asarray(costs, float), kind="stable").tolist()
     found: dict[int, R] = {}
-    if workers is not None and workers.ready and len(items) > 1:
-        with tempfile.TemporaryDirectory(prefix="magic_") as folder:
-            if (path := _written(given, Path(folder))) is not None:
-                found = _Shared(work, given, path, items, order, workers).done()
+    if workers is not None and workers.ready and len(items) > 1 and (path := _written(given)) is not None:
+        try:
+            found = _Shared(work, given, path, items, order, workers).done()
+        finally:
+            path.unlink(missing_ok=True)
     return [found[index] if index in found else work(given, items[index]) for index in range(len(items))]
 
 
-def _written(given: object, folder: Path) -> Path | None:
-    """A file of what is given; ``None`` where there is no room for it."""
-    path = folder / "given.pickle"
+def _written(given: object) -> Path | None:
+    """A file of what is given; ``None`` where there is no room for it, or nowhere to write."""
+    path = None
     try:
-        with path.open("wb") as file:
+        number, name = tempfile.mkstemp(prefix="magic_")
+        path = Path(name)
+        with open(number, "wb") as file:
             pickle.dump(given, file, pickle.HIGHEST_PROTOCOL)
     except OSError:
+        if path is not None:
+            path.unlink(missing_ok=True)
         return None
     return path
 
@@ -81,7 +87,7 @@ class _Shared(Generic[S, T, R]):
                 found[index] = future.result(timeout=max(patience - time.monotonic(), 0.0))
             except (BrokenExecutor, CancelledError):
                 continue
-            except TimeoutError:
+            except Late:
                 self._workers.begin_anew()
         # They know this one by what they call when they are done: it would keep what was given until somebody looks for such circles.
         self._elsewhere.clear()

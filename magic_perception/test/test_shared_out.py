@@ -64,9 +64,21 @@ def test_what_goes_wrong_elsewhere_is_told_here(workers):
         shared_out(refuses, None, range(2), [2, 1], workers)
 
 
-def test_where_there_is_no_room_for_what_is_given_this_process_does_it_all(workers, monkeypatch):
-    monkeypatch.setattr(module.pickle, "dump", lambda *given: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+@pytest.mark.parametrize("what, name", [(module.pickle, "dump"), (module.tempfile, "mkstemp")])
+def test_where_there_is_no_room_for_what_is_given_this_process_does_it_all(what, name, workers, monkeypatch, tmp_path):
+    def full(*given, **more):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(what, name, full)
     assert {pid for _, _, pid in shared_out(who, 0, range(3), [1, 2, 3], workers)} == {os.getpid()}
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_left_of_what_was_given(workers, monkeypatch, tmp_path):
+    monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
+    assert len({pid for _, _, pid in shared_out(who, os.getpid(), range(6), [1] * 6, workers)}) == 2
+    assert not list(tmp_path.iterdir())
 
 
 def test_two_processes_see_the_scene_that_one_sees():
