@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from magic_core.strategy import Strategy
 from magic_interfaces.msg import CanonicalView as CanonicalViewMsg
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
-from magic_matcher import features, global_stage, matching, score
+from magic_matcher import clear_way, features, global_stage, matching, score
 from magic_matcher.cache import Cache
 from magic_matcher.features import BACKENDS
 from magic_matcher.remembered import Remembered
@@ -169,13 +171,24 @@ class MatcherNode(Node):
 
     def _answer(self, request: MatchContact.Request, response: MatchContact.Response) -> None:
         found = self._strategy(request.strategy)
-        tools, target, poses = self._parties(request, found)
         top_k = int(request.top_k) or int(self.get_parameter("top_k").value)
-        if isinstance(target, SceneObject) and all(isinstance(tool, SceneObject) for tool in tools):
-            result = self._remembered.match(found, tools, target, top_k, request.want_heatmap)
-        else:
+
+        def match(tools: Sequence[SceneObject], target: SceneObject) -> matching.MatchResult:
+            return self._remembered.match(found, tools, target, top_k, request.want_heatmap)
+
+        if request.tool_views or _has_image(request.target_view):
+            tools, target, poses = self._parties(request)
             result = self._matcher.match(found, tools, target, top_k, request.want_heatmap)
-        response.code, response.message = int(Code.OK), f"{len(result.candidates)} candidates on {len(tools)} tool(s)"
+            if isinstance(target, SceneObject) and found.turned_by:
+                result = self._led(found, target, result)
+        else:
+            scene = self._objects()
+            result = clear_way.match_led(self._matcher, match, found, scene, list(request.tool_ids), request.target_id)
+            poses = {item.id: item.world_from_object for item in scene.objects}
+        response.code, response.message = (
+            int(Code.OK),
+            f"{len(result.candidates)} candidates on {len({c.tool_id for c in result.candidates})} tool(s)",
+        )
         if result.refused:
             response.message += f"; none on: {'; '.join(result.refused)}"
         response.candidates = [conversions.candidate_to_msg(c, poses.get(c.tool_id)) for c in result.candidates]
@@ -186,9 +199,9 @@ class MatcherNode(Node):
             response.heatmap = conversions.image_to_msg(result.heatmap, "32FC1")
 
     def _parties(
-        self, request: MatchContact.Request, found: Strategy
+        self, request: MatchContact.Request
     ) -> tuple[list[SceneObject] | list[matching.Tool], SceneObject | CanonicalView | None, dict[str, np.ndarray]]:
-        """Tools, target and the tools' poses that a request means."""
+        """Tools, target and the tools' poses of a request with images."""
         has_target_view = _has_image(request.target_view)
         views = [_view(view, f"tool_views[{k}]") for k, view in enumerate(request.tool_views)]
         if request.tool_ids and views:
@@ -201,12 +214,13 @@ class MatcherNode(Node):
                 target = self._objects().find(request.target_id)
             return [matching.Tool(f"view_{k}", view) for k, view in enumerate(views)], target, {}
         scene = self._objects()
-        if has_target_view:
-            items = [scene.find(name) for name in request.tool_ids] or [item for item in scene.objects if item.source != "known"]
-            tools: list[SceneObject] = items
-        else:
-            tools, target = matching.select(scene, found, list(request.tool_ids), request.target_id, self._matcher.target_view)
-        return tools, target, {item.id: item.world_from_object for item in tools}
+        items = [scene.find(name) for name in request.tool_ids] or [item for item in scene.objects if item.source != "known"]
+        return items, target, {item.id: item.world_from_object for item in items}
+
+    def _led(self, found: Strategy, target: SceneObject, result: matching.MatchResult) -> matching.MatchResult:
+        """The candidates of tools that only pictures show, for a target of the scene, led among the other things."""
+        contact_at = clear_way.contacts_of(self._matcher, found, target)
+        return replace(result, candidates=clear_way.lead(found, result.candidates, target, self._objects().objects, contact_at).candidates)
 
     def _objects(self) -> Scene:
         if self._scene is None:

@@ -13,6 +13,9 @@ from magic_core.scene import CanonicalView, Scene, SceneObject
 from magic_core.strategy import Strategy
 from magic_matcher.targets import target_view
 
+#: What is as like the demonstrated target as the likest thing, to this share, may as well be meant.
+ALIKE = 0.9
+
 
 def select(
     scene: Scene,
@@ -70,16 +73,25 @@ def choose_target(
     strategy: Strategy, objects: Sequence[SceneObject], seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view
 ) -> SceneObject:
     """The object that looks most like the demonstration's target, seen as the target is, in shape and size; seen: what draws it (:func:`target_view`)."""
+    return alike(strategy, objects, seen)[0]
+
+
+def alike(
+    strategy: Strategy, objects: Sequence[SceneObject], seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view
+) -> list[SceneObject]:
+    """The objects of which each may as well be the target (:data:`ALIKE`), the one most like the demonstration's first; raises UNKNOWN_OBJECT for none."""
     if not objects:
         raise MagicError(Code.UNKNOWN_OBJECT, "objects to choose the target from", 0, "at least one")
 
-    def alike(item: SceneObject) -> float:
+    def like(item: SceneObject) -> float:
         try:
             return likeness(strategy.target_view, seen(item, strategy))
         except MagicError:  # what cannot be drawn as the target was (a mesh that is not closed has no cut) is not like it
             return -1.0
 
-    return max(objects, key=alike)
+    found = sorted(((like(item), -index) for index, item in enumerate(objects)), reverse=True)
+    best = found[0][0]
+    return [objects[-index] for value, index in found if value >= best - (1 - ALIKE) * abs(best)]
 
 
 def likeness(reference: CanonicalView, view: CanonicalView) -> float:

@@ -52,7 +52,8 @@ PUSHED_OUT = 0.05
 class Body:
     """An object ready for physics: hull corners in its own frame and its pose; ``mesh``, where it is given, is the exact
     surface that it collides by instead, as long as it is not free; ``centre_shift`` (3,): by how much its centre of mass is
-    off that of the filled hulls, metres in its own frame; ``known_balls``: what ``balls`` says, where that is known."""
+    off that of the filled hulls, metres in its own frame; ``known_balls``: what ``balls`` says, where that is known; ``loose``: of an
+    obstacle, that nothing holds it where it stands: what pushes it moves it."""
 
     id: str
     hulls: tuple[NDArray[np.float64], ...]
@@ -60,6 +61,7 @@ class Body:
     mesh: Mesh | None = None
     centre_shift: NDArray[np.float64] | None = None
     known_balls: tuple[tuple[NDArray[np.float64], float] | None, ...] | None = None
+    loose: bool = False
 
     @cached_property
     def balls(self) -> tuple[tuple[NDArray[np.float64], float] | None, ...]:
@@ -86,7 +88,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Setup:
-    """All that a run is built from.  ``target_kind`` is static or dynamic; obstacles and the table never move."""
+    """All that a run is built from.  ``target_kind`` is static or dynamic; table and fixtures never move, loose obstacles once they are touched."""
 
     tool: Body
     target: Body
@@ -121,12 +123,21 @@ def make_setup(
     if table.shape != (4,) or not np.all(np.isfinite(table)) or table[2] < 0.5:
         raise MagicError(Code.BAD_SCENE, "table plane", table, "a, b, c, d with a unit normal that points up")
     kind = STATIC if physics.target_is_fixed else DYNAMIC
-    setup = Setup(body(tool), body(target), tuple(body(o) for o in obstacles), table, physics, kind, settings)
+    around = tuple(_loose(body(o), table) if o.source == "camera" and not o.hanging else body(o) for o in obstacles)
+    setup = Setup(body(tool), body(target), around, table, physics, kind, settings)
     return replace(setup, target=lifted_onto_table(setup.target, table)) if kind == DYNAMIC else setup
 
 
+def _loose(body: Body, table: NDArray[np.float64]) -> Body:
+    """A thing that cameras saw beside tool and target, to be moved by what touches it; what is deep in the table stands fast."""
+    try:
+        return replace(lifted_onto_table(body, table), loose=True)
+    except MagicError:
+        return body
+
+
 def lifted_onto_table(body: Body, table: NDArray[np.float64]) -> Body:
-    """A free body raised out of the table, into which a reconstruction may reach by some millimetres."""
+    """A free body raised out of the table, into which a reconstruction may reach by some millimetres; raises ``BAD_SCENE`` for more."""
     corners = transforms.apply(body.world_from_object, body.corners)
     depth = -float((corners @ table[:3] + table[3]).min())
     if depth <= 0:
@@ -159,12 +170,13 @@ def settled(item: SceneObject, table: NDArray[np.float64], physics: Physics, sec
 
 
 def fill_world(setup: Setup, tool_kind: str) -> World:
-    """A world with table, obstacles, target and tool."""
+    """A world with table, obstacles, target and tool.  Loose obstacles are where they are until they are let go."""
     physics = setup.physics
     world = World(setup.settings)
     world.add_table(setup.table, physics.friction, TABLE)
     for obstacle in setup.obstacles:
-        world.add(obstacle.id, list(obstacle.hulls), obstacle.world_from_object, STATIC, 1000.0, physics.friction)
+        kind, density = (KINEMATIC, physics.target_density) if obstacle.loose else (STATIC, 1000.0)
+        world.add(obstacle.id, list(obstacle.hulls), obstacle.world_from_object, kind, density, physics.friction)
     for name, body, kind, density in (
         (TARGET, setup.target, setup.target_kind, physics.target_density),
         (TOOL, setup.tool, tool_kind, physics.tool_density),

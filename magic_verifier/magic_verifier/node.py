@@ -38,7 +38,7 @@ def mark_of(goal: VerifyMotion.Goal, proposal: Proposal) -> bytes:
     # What obstacles look like is in the film alone.
     simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in proposal.obstacles)
     plan = proposal.plan, goal.repetitions, goal.seed, goal.tried, goal.tool_mass, goal.target_mass
-    return digest((goal.strategy, proposal.tool, proposal.target, simulated, proposal.table, *plan))
+    return digest((goal.strategy, goal.candidate.turn, proposal.tool, proposal.target, simulated, proposal.table, *plan))
 
 
 class VerifierNode(Node):
@@ -132,7 +132,7 @@ class VerifierNode(Node):
             raise MagicError(Code.BAD_REQUEST, "repetitions", goal.repetitions, f"0 to {MAX_REPETITIONS}")
         if not (np.isfinite(goal.timeout) and goal.timeout >= 0):
             raise MagicError(Code.BAD_REQUEST, "timeout", goal.timeout, "0 or a number of seconds above it")
-        strategy = strategies.known(goal.strategy, self._given.strategies or None)
+        strategy = strategies.known(goal.strategy, self._given.strategies or None).turned(float(goal.candidate.turn))
         trajectories = goal.plan.tool_trajectory, goal.plan.arm_trajectory
         convert.check_frames(self._robot.base_frame, (goal.tool, goal.target, *goal.obstacles), *trajectories)
         tool, target = (convert.object_from_msg(item, pictures=False) for item in (goal.tool, goal.target))

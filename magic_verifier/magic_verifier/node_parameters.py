@@ -63,6 +63,9 @@ def _limits(node: Node) -> Limits:
             node, "limits.overlap", 0.0015, "Depth in m that the tool may be in static things before the contact.", low=0.0, high=0.1
         ),
         press=parameter(node, "limits.press", 0.01, "Depth in m that the tool may be in static things after that.", low=0.0, high=0.1),
+        shove=parameter(
+            node, "limits.shove", 0.005, "Way in m that a loose thing which has no part in the motion may be moved.", low=0.0, high=0.1
+        ),
         nudge=parameter(node, "limits.nudge", 0.002, "Way in m that the target may be pushed before the contact.", low=0.0, high=0.1),
         slip=parameter(node, "limits.slip", 0.02, "Way in m that the tool may slip in the gripper.", low=0.0, high=0.5),
         slip_angle=parameter(node, "limits.slip_angle", 0.35, "Angle in rad that the tool may turn in the gripper.", low=0.0, high=3.2),

@@ -45,7 +45,8 @@ class Limits:
     overlap: depth in metres to which the tool may be in static things before the contact phase,
     in a fixed target when it is let go (reconstructions are that uncertain, and a touch is an
     overlap of about nothing), and in the table at any time; press: the same for other static
-    things after the contact phase has begun, where the tool may well slide along them; nudge
+    things after the contact phase has begun, where the tool may well slide along them; shove (m): how far a loose thing that has no
+    part in the motion may be moved at any time, or a tool that is led may go into it; nudge
     (m): how far the target may be pushed before the contact phase; stray (m): how far it may move along the table by itself,
     before anything touches it; early_force (N): how hard a
     held tool may touch fixed things before it; slip (m) and slip_angle (rad): how far the tool
@@ -65,6 +66,7 @@ class Limits:
 
     overlap: float = 0.0015
     press: float = 0.01
+    shove: float = 0.005
     nudge: float = 0.002
     stray: float = 0.005
     early_force: float = 5.0
@@ -255,6 +257,7 @@ class _Rollout:
         touch_every = max(1, round(TOUCH_EVERY * setup.settings.frequency))
         # A thing that was seen to stand may roll off where its centre of mass or its shape was drawn otherwise.
         untouched = _Untouched(run, self._limits) if self._drawn is None else None
+        others = _Others(run, self._limits)
         # The run's clock stands still while a gripper closes: the number of steps is bounded apart from it.
         for step in range(int(np.ceil((end + 10.0) * setup.settings.frequency))):
             if run.time >= end - 1e-9:
@@ -268,6 +271,8 @@ class _Rollout:
                 self._note_held()
             if step % touch_every == 0 and run.time < run.contact_time:
                 _refuse_early_touch(run, watched, self._limits)
+            if step % touch_every == 0:
+                others.check()
         run.world.check(self._moving())
 
     def _run_on(self, seconds: float) -> None:
@@ -341,7 +346,9 @@ def _refuse_intrusions(
     Where that is not to be ``measured``, for it is shown to nobody, what is allowed in any case need not be found; ``planned``: what was of the
     tool as it is thought to be, m.
     """
-    found = run.intrusions(check=stop.check, harmless=0.0 if measured else min(limits.overlap, limits.press), planned=planned)
+    loose = {o.id for o in run.setup.obstacles if o.loose}
+    harmless = min(limits.overlap, limits.press, limits.shove if loose else np.inf)
+    found = run.intrusions(check=stop.check, harmless=0.0 if measured else harmless, planned=planned)
     for item in sorted(found, key=lambda i: i.time):
         if item.before_contact and item.depth > limits.overlap:
             raise MagicError(
@@ -356,6 +363,13 @@ def _refuse_intrusions(
                 f"the tool overlaps the fixed target at {item.time:.2f} s",
                 f"{item.depth * 1000:.1f} mm deep",
                 f"up to {limits.overlap * 1000:.1f} mm",
+            )
+        if item.body in loose and item.depth > limits.shove:
+            raise MagicError(
+                Code.OBSTACLE_PUSHED,
+                f"the tool goes through {item.body} at {item.time:.2f} s",
+                f"{item.depth * 1000:.1f} mm deep",
+                f"up to {limits.shove * 1000:g} mm",
             )
         allowed = limits.overlap if item.body == TABLE else limits.press
         if not item.before_contact and item.depth > allowed:
@@ -396,6 +410,36 @@ def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
             value,
             allowed,
         )
+
+
+class _Others:
+    """Refuses a motion that moves loose things which have no part in it.  Each stands where it was seen until something that moves touches it."""
+
+    def __init__(self, run: Any, limits: Limits) -> None:
+        self._run, self._limits = run, limits
+        self._resting = [o.id for o in run.setup.obstacles if o.loose]
+        self._stood: dict[str, tuple[NDArray[np.float64], str]] = {}  # where the middle of what is free was, and what has touched it
+
+    def check(self) -> None:
+        """Every few steps."""
+        world = self._run.world
+        for name in self._resting:
+            touched = world.touched_by(name)
+            if touched:
+                world.let_go(name)
+                self._stood[name] = world.centre_of_mass(name), " and ".join(touched)
+        self._resting = [name for name in self._resting if name not in self._stood]
+        normal = self._run.setup.table[:3]
+        for name, (stood, pusher) in self._stood.items():
+            way = world.centre_of_mass(name) - stood
+            moved = float(np.linalg.norm(way - (way @ normal) * normal))
+            if moved > self._limits.shove:
+                raise MagicError(
+                    Code.OBSTACLE_PUSHED,
+                    f"the {pusher} pushes {name} at {self._run.time:.2f} s ({self._run.phase})",
+                    f"moved {moved * 1000:.1f} mm",
+                    f"up to {self._limits.shove * 1000:g} mm",
+                )
 
 
 class _Untouched:

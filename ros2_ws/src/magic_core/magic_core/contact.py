@@ -75,7 +75,8 @@ class ContactCandidate:
     tool.  s_dino is the global score, s_curv the local one, score their combination.
     tool_from_reference (4, 4) carries the reference tool's frame onto the new tool's
     frame by aligning the contact frames.  companions: the further contacts of a strategy
-    with several, in its order; score is then that of all together.
+    with several, in its order; score is then that of all together.  turn: by how much (rad) target's contact and motion are
+    turned about the vertical from how the strategy has them, as something stands in the way of that.
     """
 
     tool_id: str
@@ -88,6 +89,7 @@ class ContactCandidate:
     score: float
     tool_from_reference: NDArray[np.float64]
     companions: tuple[Companion, ...] = ()
+    turn: float = 0.0
 
 
 def contact_frame(view: CanonicalView, pixel: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -593,6 +593,7 @@ def candidate_to_msg(candidate: ContactCandidate, world_from_tool: NDArray[np.fl
         has_target=candidate.target is not None,
         point=Point(x=point[0], y=point[1], z=point[2]),
         rotation=float(candidate.rotation),
+        turn=float(candidate.turn),
         flipped=bool(candidate.flipped),
         s_dino=float(candidate.s_dino),
         s_curv=float(candidate.s_curv),
@@ -618,6 +619,7 @@ def candidate_from_msg(msg: mi.ContactCandidate) -> ContactCandidate:
         score=float(msg.score),
         tool_from_reference=pose_from_msg(msg.tool_from_reference),
         companions=tuple(companion_from_msg(companion) for companion in msg.companions),
+        turn=float(msg.turn),
     )
 
 

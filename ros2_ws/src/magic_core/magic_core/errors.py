@@ -53,6 +53,7 @@ class Code(IntEnum):
     OBJECT_CUT_OFF = 210
     AMBIGUOUS_OBJECT = 211
     HANDLE_NOT_SEEN = 212
+    WAY_BLOCKED = 213
 
     # Planning
     BAD_MOTION = 300
@@ -81,6 +82,7 @@ class Code(IntEnum):
     LIMIT_EXCEEDED = 409
     UNKNOWN_GOAL = 410
     NOT_SURE_ENOUGH = 411
+    OBSTACLE_PUSHED = 412
 
     # Execution
     SERVER_UNAVAILABLE = 500

@@ -131,6 +131,10 @@ REMEDIES: dict[Code, Remedy] = {
         "The demonstrated contact lies in a loop (a handle, a hook), and what was seen of the tool has none: it may be on the side that no camera saw, or its hole was not seen through.",
         "Turn the tool so that the handle stands out to the side of a camera; a second camera helps. The message says how much was not seen, and where.",
     ),
+    Code.WAY_BLOCKED: Remedy(
+        "Something stands where the target is to be led, whichever way the strategy allows.",
+        "The message names it and where it stands: move it aside, name another target, or set the target where there is room. `turned_by` of the strategy says how far the way may be turned.",
+    ),
     Code.BAD_MOTION: Remedy(
         "A pose, frame or table in the request is no rigid transform or plane.",
         "An error of who sends it: quaternions of length 1, finite numbers.",
@@ -207,6 +211,10 @@ REMEDIES: dict[Code, Remedy] = {
     Code.NOT_SURE_ENOUGH: Remedy(
         "It often works in simulation, but not surely enough: the lower end of the interval is below required_rate.",
         "`failures` says what goes wrong and how often: mend that. More rollouts make the interval narrower.",
+    ),
+    Code.OBSTACLE_PUSHED: Remedy(
+        "In simulation tool, target or arm push a thing that has no part in it.",
+        "The message names it: move that thing aside, or the target where more room is. `limits.shove` says how far it may be moved.",
     ),
     Code.SERVER_UNAVAILABLE: Remedy(
         "A node that is needed is not there or has died.",

@@ -18,6 +18,9 @@ places, at once or one after the other, each is an entry of a list beside them, 
       tool: {pixel: [372.6, 168.8], normal: [1.0, 0.0], radius: .inf, concave: false, scale: 0.06}
       target: {pixel: [191.5, 316.0], normal: [0.0, 1.0], radius: .inf, concave: false, scale: 0.02, normal_in_world: [-1.0, 0.0, 0.0], outline: outer}
 
+Under ``target``, ``turned_by: 40`` allows motion and goal to be turned by up to 40 degrees about the vertical where other things stand in the
+way.
+
 A waypoint with ``contact: back`` is a pose of that contact of the tool in the frame of that contact of the target; without it, of the first.
 """
 
@@ -25,7 +28,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +110,8 @@ class Strategy:
     that face the target's normal.  reflections: what to do with mirrored matches, in
     order of trial: ``keep`` the tool's face or ``turn`` it over.  environment: names
     and numbers of fixed things around (for the scene set-ups).  contacts: the pairs of
-    contacts after the first.
+    contacts after the first.  turned_by: by how much (rad) to either side the target's normal, and with it
+    motion and goal, may be turned about the vertical where something stands in the way (degrees, ``target: turned_by`` in the file).
     """
 
     name: str
@@ -133,6 +137,17 @@ class Strategy:
     simulatable: bool = True
     environment: dict[str, Any] = field(default_factory=dict)
     contacts: tuple[ContactPair, ...] = ()
+    turned_by: float = 0.0
+
+    def turned(self, angle: float) -> Strategy:
+        """The strategy with the target's normal turned by an angle (rad) about the vertical, and so what its goal calls the pull; raises BAD_REQUEST
+        for more than it allows."""
+        if angle == 0:
+            return self
+        if not abs(angle) <= self.turned_by + 1e-6:
+            allowed = f"up to {np.degrees(self.turned_by):.0f} degrees to either side"
+            raise MagicError(Code.BAD_REQUEST, f"turn of strategy {self.name}", f"{np.degrees(angle):.1f} degrees", allowed)
+        return replace(self, target_normal=transforms.from_rpy(0, 0, angle)[:3, :3] @ self.target_normal)
 
 
 def _read_image(path: Path) -> NDArray[np.uint8]:
@@ -193,6 +208,9 @@ def _check(strategy: Strategy) -> None:
         **{f"{name}: a finite number": np.isfinite(value) for name, value in numbers.items()},
         **{f"{name}: above 0": numbers[name] > 0 for name in positive},
         "friction: 0 or more": physics.friction >= 0,
+        "turned_by of the target: 0 to 180 degrees": 0 <= strategy.turned_by <= np.pi,
+        "turned_by of the target: of one contact with a level normal, looked at from above": strategy.turned_by == 0
+        or (not strategy.contacts and abs(strategy.target_normal[2]) < 1e-6 and strategy.target_view_direction[2] < -1 + 1e-6),
     }
     pairs = [("", strategy.tool_contact, strategy.target_contact), *((f" {p.name}", p.tool, p.target) for p in strategy.contacts)]
     names = [pair.name for pair in strategy.contacts]
@@ -270,6 +288,7 @@ def load(folder: str | Path) -> Strategy:
             simulatable=bool(data.get("simulatable", True)),
             environment=dict(data.get("environment", {})),
             contacts=tuple(_pair(tool_view, target_view, entry) for entry in data.get("contacts", [])),
+            turned_by=float(np.deg2rad(float(data["target"].get("turned_by", 0.0)))),
         )
         _check(strategy)
         return strategy
@@ -437,6 +456,7 @@ def save(strategy: Strategy, folder: str | Path) -> None:
             "normal_in_world": _floats(strategy.target_normal),
             "view_direction_in_world": _floats(strategy.target_view_direction),
             "outline": strategy.target_outline,
+            **({"turned_by": round(float(np.degrees(strategy.turned_by)), 6)} if strategy.turned_by else {}),
         },
         "reflections": list(strategy.reflections),
         "releases": strategy.releases,

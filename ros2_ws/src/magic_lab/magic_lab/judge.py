@@ -168,16 +168,29 @@ class Replay:
 
 
 def judge(scene: Scene, tool: str, track: Track) -> Judgement:
-    """What the strategy's goal test says of the truth; never raises for what may have happened to things."""
+    """What the strategy's goal test says of the truth, and where it is met whether other things stand where they stood; never raises for what may
+    have happened to things."""
     try:
         run = Replay(scene, tool, track)
         test = goal_test(scene.strategy, run, np.random.default_rng(0))  # nobody kicks the target: it is not asked to disturb
         while run.time < max(run.duration, test.until()):
             run.advance()
             test.observe()
-        return test.judge(run.go_on)
+        found = test.judge(run.go_on)
     except MagicError as error:
         return Judgement(error.code, error.message)
+    pushed = pushed_aside(scene, tool, track)
+    if found.code != Code.OK or not pushed:
+        return found
+    told = ", ".join(f"{name} by {1000 * way:.0f} mm" for name, way in pushed.items())
+    return Judgement(Code.OBSTACLE_PUSHED, f"{found.message}; but other things were moved: {told}", found.metrics)
+
+
+def pushed_aside(scene: Scene, tool: str, track: Track) -> dict[str, float]:
+    """How far (m) from where they began things that have no part in it ended, of those that are farther than :data:`MOVED`."""
+    others = [thing for thing in scene.things if thing.name in track.poses and thing.name not in (tool, scene.target, *track.put)]
+    ways = {t.name: np.linalg.norm(np.diff([middle(t, pose) for pose in track.poses[t.name][[0, -1]]], axis=0)) for t in others}
+    return {name: float(way) for name, way in ways.items() if way > MOVED}
 
 
 def nearest(names: Mapping[str, Array], place: Array) -> str:

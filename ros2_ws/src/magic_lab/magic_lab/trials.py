@@ -14,7 +14,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -273,6 +273,8 @@ class Session:
             record["simulated_seconds"] = round(ended - began, 2)
             names = {i: name for name, i in found.items()}
             record["tool"] = names.get(result.tool_id, scene.tools[0])
+            record["target"] = names.get(result.target_id, scene.target)
+            record["turn"] = result.candidates[-1].candidate.turn if result.candidates else 0.0
         except MagicError as error:
             record.update(code=int(error.code), reason=error.message)
         seen = self.seen
@@ -280,6 +282,8 @@ class Session:
             track = Track.of(list(seen.truth), self._hand).begun(BEGUN)
             record["begun"] = track is not None
             if track is not None:
+                # What was chosen is judged, as it was to be led.
+                scene = replace(scene, target=record.get("target", scene.target), strategy=scene.strategy.turned(record.get("turn", 0.0)))
                 judgement = judge(scene, record.get("tool", scene.tools[0]), track)
                 success = judgement.code == Code.OK and record["executed"]
                 record.update(truth=int(judgement.code), judgement=judgement.message, success=success)

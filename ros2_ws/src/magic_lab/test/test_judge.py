@@ -9,10 +9,10 @@ import pytest
 from magic_core import transforms
 from magic_core.contact import OPPOSED
 from magic_core.errors import Code
-from magic_core.shapes import mug_of_set
+from magic_core.shapes import make, mug_of_set
 from magic_lab.judge import Replay, Track, judge, loop_in_sight, nearest
 from magic_lab.scenarios import SCENARIOS, draw
-from magic_lab.world import SETTINGS
+from magic_lab.world import SETTINGS, Thing
 
 
 @lru_cache
@@ -102,6 +102,13 @@ def test_a_cup_hung_by_its_handle_passes():
 
     found = judge(s, "tool_1", track(s, [(0, {}), (1, {"tool_1": hung}), (3.5, {"tool_1": hung})], hand))
     assert found.code == Code.OK, found.message
+    # It does not where something that has no part in it was moved.
+    beside = make("cylinder", 1, radius=0.02).as_object("beside", transforms.make(translation=[0.3, 0.4, 0.02]))
+    s = replace(s, things=(*s.things, Thing(beside)))
+    for way, code in ((0.03, Code.OBSTACLE_PUSHED), (0.005, Code.OK)):
+        moves = [(0, {}), (1, {"tool_1": hung}), (3.5, {"tool_1": hung, "beside": shifted(beside.world_from_object, way)})]
+        found = judge(s, "tool_1", track(s, moves, hand))
+        assert found.code == code and ("beside by 30 mm" in found.message) == (code != Code.OK)
 
 
 def test_the_truth_begins_with_the_arm():

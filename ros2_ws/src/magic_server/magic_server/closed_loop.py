@@ -629,12 +629,13 @@ class ClosedLoop:
         before = seen_goal.Sight({item.id: thing(item) for item in scene.objects}, conversions.time_from_msg(scene.header.stamp))
         tolerance, accuracy = self._limits.object_tolerance, self._settings.accuracy
         stood, ids = job.claim.scene.objects, (outcome.tool_id, outcome.target_id)
+        strategy = self._goal.strategy.turned(outcome.reports[-1].trial.candidate.turn)
         after = After(scene, stood, *ids, self._carried, self._held, self._closing, tolerance, accuracy)
         firsts, seconds = (after.sights(look, self._server.hand) for look in (first, second))
         found = []
         for now in seconds:
             looks = before, min(firsts, key=lambda sight: sight.apart(now, outcome.tool_id)), now
-            found.append(seen_goal.judge(self._goal.strategy, names, phases, looks, table, hand, accuracy))
+            found.append(seen_goal.judge(strategy, names, phases, looks, table, hand, accuracy))
         return seen_goal.SeenGoal.of_all(found)
 
     def _arm_surface(self) -> NDArray[np.float64]:

@@ -1,0 +1,66 @@
+"""Things that have no part in the motion: what cameras saw is loose, and nothing may move it; a fixture stands fast."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import scenes
+
+from magic_core import transforms
+from magic_core.errors import Code
+from magic_verifier.verification import Proposal, verify_proposal
+
+#: Half the side of a block beside the pulled cylinder's way, and the cylinder's radius, m.
+HALF, RADIUS = 0.02, 0.025
+
+
+def beside(gap, source="camera", height=0.05, x=0.31, sunk=0.0):
+    """A block whose face is so far (m) from the way of the cylinder that the L hook pulls; the hook's own bar stops 15 mm before it."""
+    y = RADIUS + gap + HALF
+    block = scenes.block((-HALF, HALF), (-HALF, HALF), (-height / 2, height / 2))
+    return replace(scenes.item("block", [block], transforms.make(translation=[x, y, height / 2 - sunk])), source=source)
+
+
+def pulled(*others, repetitions=1):
+    strategy, tool, target, plan = scenes.hooking("L", RADIUS, noise=0.0)
+    return verify_proposal(Proposal(strategy, tool, target, others, scenes.TABLE, plan), repetitions=repetitions)
+
+
+def test_nothing_beside_the_way_changes_a_verdict():
+    assert pulled().success
+    free = pulled(beside(0.05))
+    assert free.success and free.metrics == pulled().metrics
+
+
+def test_a_loose_thing_that_the_target_pushes_is_named_with_how_far():
+    verdict = pulled(beside(-0.01))
+    assert verdict.code == Code.OBSTACLE_PUSHED and not verdict.success
+    assert "target" in verdict.message and "block" in verdict.message and "mm" in verdict.message and "(goal)" in verdict.message
+
+
+def test_a_brush_that_moves_nothing_is_allowed():
+    assert pulled(beside(-0.001)).success
+
+
+def test_what_the_led_tool_goes_through_is_named():
+    """8 mm deep: along a wall a tool may slide so, a loose thing it would push."""
+    aside = 2.2 * RADIUS - 0.008 - RADIUS
+    verdict = pulled(beside(aside, x=0.4))
+    assert verdict.code == Code.OBSTACLE_PUSHED and "the tool goes through block" in verdict.message
+    assert pulled(beside(aside, source="known", x=0.4)).success
+
+
+def test_a_fixture_stands_fast():
+    assert pulled(beside(-0.01, source="known")).code != Code.OBSTACLE_PUSHED
+
+
+@pytest.mark.parametrize("sunk", [0.004, 0.03])
+def test_a_reconstruction_that_reaches_into_the_table_is_no_push(sunk):
+    """Raised out of it where that is little; what is deep in it stands fast."""
+    assert pulled(beside(0.05, sunk=sunk)).success
+
+
+def test_in_drawn_rollouts_as_well():
+    verdict = pulled(beside(-0.003), repetitions=12)
+    assert verdict.success or any("block" in text for text in verdict.failures)
