@@ -436,7 +436,7 @@ class _Others:
             if moved > self._limits.shove:
                 raise MagicError(
                     Code.OBSTACLE_PUSHED,
-                    f"the {pusher} pushes {name} at {self._run.time:.2f} s ({self._run.phase})",
+                    f"{name} is pushed by the {pusher} at {self._run.time:.2f} s ({self._run.phase})",
                     f"moved {moved * 1000:.1f} mm",
                     f"up to {self._limits.shove * 1000:g} mm",
                 )

@@ -95,9 +95,9 @@ class Replay:
         def body(thing: Thing, name: str) -> Body:
             return Body(name, tuple(usable_pieces(name, thing.item.pieces)), track.put.get(thing.name, track.poses[thing.name][0]))
 
-        others = [
-            replace(body(t, t.name), world_from_object=track.poses[t.name][-1]) for n, t in things.items() if n not in (tool, scene.target)
-        ]
+        # Where another thing was chosen, the one of that name is one of the others.
+        names = {n: "not_the_target" if n == TARGET else n for n in things if n not in (tool, scene.target)}
+        others = [replace(body(things[n], name), world_from_object=track.poses[n][-1]) for n, name in names.items()]
         true = things[scene.target]
         physics = replace(
             scene.strategy.physics, friction=things[tool].friction, tool_density=things[tool].density, target_density=true.density

@@ -111,6 +111,15 @@ def test_a_cup_hung_by_its_handle_passes():
         assert found.code == code and ("beside by 30 mm" in found.message) == (code != Code.OK)
 
 
+def test_another_target_that_was_chosen_is_judged():
+    s = scene("hooking")
+    ball = make("sphere", 1, radius=0.02).as_object("ball", transforms.make(translation=[0.3, 0.4, 0.02]))
+    s = replace(s, things=(*s.things, Thing(ball)), target="ball")
+    moved = track(s, [(0, {}), (1, {"ball": shifted(ball.world_from_object, -0.1)})], lambda _t, p: p["tool_1"])
+    found = judge(s, "tool_1", moved)
+    assert found.code == Code.LOST_CONTACT and "moved 100 mm" in found.message
+
+
 def test_the_truth_begins_with_the_arm():
     s = scene("hooking")
     away = transforms.make(translation=[0.3, 0, 0.3])

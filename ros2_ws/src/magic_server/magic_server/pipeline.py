@@ -442,7 +442,9 @@ class Run:
         reasons = "; ".join(
             f"{r.trial.index + 1}{'' if r.trial.reflection == 'keep' else ' turned'}: {r.code.name} at {r.stage}" for r in self._reports
         )
-        return f"{len(self._reports)} trials of {len(self._matches.candidates) if self._matches else 0} candidates failed ({reasons})"
+        furthest = max(self._reports, key=lambda r: STAGES.index(r.stage))  # the first of those that came furthest
+        said = f"; the first at {furthest.stage}: {split_metrics(furthest.message)[0]}"
+        return f"{len(self._reports)} trials of {len(self._matches.candidates) if self._matches else 0} candidates failed ({reasons}{said})"
 
     def _tell(self, stage: str, index: int, message: str) -> None:
         count = len(self._matches.candidates) if self._matches else 0
