@@ -100,6 +100,8 @@ class Ways:
 
     def at(self, candidate: ContactCandidate, turn: float) -> ContactCandidate:
         """The candidate turned."""
+        if turn == 0.0:
+            return candidate
         if turn not in self._contacts:
             self._contacts[turn] = self._contact_at(turn)
         return replace(candidate, target=self._contacts[turn], turn=turn)
@@ -108,9 +110,11 @@ class Ways:
         """The way that is turned the least of those with room enough; of none the one that pushes nothing aside, with the most room."""
         found: list[Way] = []
         others = {name: other for name, other in self._others.items() if tool is None or name != tool.id}
+        if not others:
+            return Way(0.0, np.inf, ())
         for turn in turns(self._strategy):
             target, *rest = led(self._strategy, self.at(candidate, turn), tool, self._target)
-            free = min((room(swept, other) for swept in (target, *rest) for other in others.values()), default=np.inf)
+            free = min(room(swept, other) for swept in (target, *rest) for other in others.values())
             pushed = tuple(name for name, other in others.items() if target.buffer(-PUSHED).intersects(other))
             found.append(Way(turn, free, pushed))
             if free >= ROOM:

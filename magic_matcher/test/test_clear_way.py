@@ -49,14 +49,21 @@ def contacts(pulling, matcher, target):
     return clear_way.contacts_of(matcher, pulling, target)
 
 
-def candidate(pulling):
-    return ContactCandidate("tool", pulling.tool_contact, None, 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
+def candidate(pulling, matcher):
+    return ContactCandidate("tool", pulling.tool_contact, contacts(pulling, matcher, cylinder())(0.0), 0.0, False, 1.0, 1.0, 1.0, np.eye(4))
 
 
 def best(pulling, matcher, *others, tool=None):
     target = cylinder()
     ways = clear_way.Ways(pulling, target, [target, *others], contacts(pulling, matcher, target))
-    return ways.best(candidate(pulling), tool)
+    return ways.best(candidate(pulling, matcher), tool)
+
+
+def test_alone_a_candidate_is_led_as_it_is(pulling, matcher):
+    target, one = cylinder(), candidate(pulling, matcher)
+    tool = shapes.make("l_hook", 1).as_object("tool", transforms.make(translation=[0.45, 0.0, 0.01]))
+    led = clear_way.lead(pulling, [one], target, [target, tool], contacts(pulling, matcher, target))
+    assert led.candidates == led.clear and led.candidates[0] is one and led.worth == one.score
 
 
 def test_a_way_that_is_clear_is_the_one_shown(pulling, matcher):
@@ -73,7 +80,7 @@ def test_the_least_turn_past_what_is_in_the_way(pulling, matcher, offset, turn):
 
 def test_turned_the_target_is_met_on_the_side_from_which_it_is_pulled(pulling, matcher):
     target = cylinder()
-    led = clear_way.lead(pulling, [candidate(pulling)], target, [target, in_the_way(8.0)], contacts(pulling, matcher, target))
+    led = clear_way.lead(pulling, [candidate(pulling, matcher)], target, [target, in_the_way(8.0)], contacts(pulling, matcher, target))
     (found,) = led.candidates
     world = target.world_from_object @ found.target.object_from_contact
     np.testing.assert_allclose(world[:3, 0], [np.cos(found.turn), np.sin(found.turn), 0.0], atol=0.02)
@@ -95,7 +102,7 @@ def test_the_tool_needs_room_as_well_and_is_not_in_its_own_way(pulling, matcher)
 def test_what_is_in_the_way_everywhere_is_named(pulling, matcher):
     wall = [in_the_way(angle, name=f"wall_{angle}") for angle in range(-40, 41, 10)]
     target = cylinder()
-    led = clear_way.lead(pulling, [candidate(pulling)], target, [target, *wall], contacts(pulling, matcher, target))
+    led = clear_way.lead(pulling, [candidate(pulling, matcher)], target, [target, *wall], contacts(pulling, matcher, target))
     assert not led.clear and led.worth == 0.0
     error = clear_way.blocked(pulling, target, led, [target, *wall])
     assert error.code is Code.WAY_BLOCKED and "wall_" in error.message and "target" in error.message and "40 degrees" in error.message
