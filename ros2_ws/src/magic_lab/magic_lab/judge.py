@@ -115,10 +115,13 @@ class Replay:
         self.phases = (Phase("goal", *self._pull()),)
 
     def _pull(self) -> tuple[float, float]:
-        """From when to when the target moved, s; of one that never did: all the time."""
-        times, places = self._track.times, self._track.poses[self._target][:, :3, 3]
-        speed = np.linalg.norm(np.gradient(places, times, axis=0), axis=1)
-        moving = np.flatnonzero(speed > MOVING)
+        """From when to when the target moved along with the tool, s, what rolls on after that left out; of one that never did: while it moved, and of
+        one that never moved: all the time."""
+        times, poses = self._track.times, self._track.poses
+        target, tool = (np.gradient(poses[name][:, :3, 3], times, axis=0) for name in (self._target, self._tool))
+        moves = np.linalg.norm(target, axis=1) > MOVING
+        led = moves & (np.einsum("ti,ti->t", target, tool) > MOVING**2)
+        moving = np.flatnonzero(led if led.any() else moves)
         first, last = (moving[0], moving[-1]) if len(moving) else (0, len(times) - 1)
         return float(times[first] - times[0]), float(times[last] - times[0])
 

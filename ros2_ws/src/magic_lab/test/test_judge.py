@@ -111,6 +111,19 @@ def test_a_cup_hung_by_its_handle_passes():
         assert found.code == code and ("beside by 30 mm" in found.message) == (code != Code.OK)
 
 
+def test_a_pull_ends_with_the_tool_and_not_with_what_rolls_on():
+    s = scene("hooking")
+    target, tool = s.thing("target").item.world_from_object, s.thing("tool_1").item.world_from_object
+    pulled = {"target": shifted(target, -0.28), "tool_1": shifted(tool, -0.28)}
+    moves = [(0, {}), (1, {}), (3.8, pulled), (5, {"target": shifted(target, -0.33), "tool_1": shifted(tool, -0.2)})]
+    (phase,) = Replay(s, "tool_1", track(s, moves, lambda _t, p: p["tool_1"])).phases
+    assert phase.start == pytest.approx(1.0, abs=0.1) and phase.end == pytest.approx(3.8, abs=0.1)
+    # What moves without the tool, when an event pushes it, moves all the same.
+    alone = [(0, {}), (1, {}), (3, {"target": shifted(target, -0.3)}), (4, {"target": shifted(target, -0.3)})]
+    (phase,) = Replay(s, "tool_1", track(s, alone, lambda _t, p: p["tool_1"])).phases
+    assert phase.end == pytest.approx(3.0, abs=0.1)
+
+
 def test_another_target_that_was_chosen_is_judged():
     s = scene("hooking")
     ball = make("sphere", 1, radius=0.02).as_object("ball", transforms.make(translation=[0.3, 0.4, 0.02]))
