@@ -130,7 +130,7 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
         return thin
     kept, foot = _upheld(sights, grid, top, noise)
     trimmed = _parts(polygons.smooth_field(kept, 1.8), grid)
-    if len(trimmed) <= len(parts):  # what a thing hangs together by is no smear
+    if len(trimmed) <= len(parts) and _holes(trimmed) >= _holes(parts):  # what a thing, or a ring in it, hangs together by is no smear
         parts = trimmed
     return Laid(grid, _large(parts), False, thickness, False, top, np.clip(foot, 0, top - 0.001), thin)
 
@@ -190,6 +190,11 @@ def _closed(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
 def _parts(field: NDArray[np.float32], grid: Grid) -> list[Polygon]:
     """The outlines of what a field over the map holds, the largest first."""
     return [p for p in polygons.outline(field, grid.origin, grid.cell) if p.area > LEAST]
+
+
+def _holes(parts: list[Polygon]) -> int:
+    """How many holes there are in a thing's parts."""
+    return sum(Polygon(ring).area > LEAST for part in parts for ring in part.interiors)
 
 
 def _large(parts: list[Polygon]) -> list[Polygon]:

@@ -5,7 +5,7 @@ import pytest
 
 from magic_core import sensor, shapes, transforms
 from magic_core.rendering import Raycaster
-from magic_perception import surface_error
+from magic_perception import lying, surface_error
 from magic_perception.learn_surface_error import alone
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
@@ -54,3 +54,19 @@ def test_a_handle_that_stands_off_the_table_stays_and_is_not_filled_below():
     assert np.abs(np.sort(mesh.extents) - np.sort(mallet.extents)).max() < 0.006
     # Under the sides of the handle, 12 mm above the table, cameras see the table.
     assert surface_error.distance(mallet, mesh) < 0.0035
+
+
+def test_what_closes_a_ring_is_not_taken_for_smear(monkeypatch):
+    # A band that stands off the table is seen empty below; a ring that is told open would be taken for a hook.
+    upheld = lying._upheld
+
+    def cut_through(sights, grid, top, noise):
+        kept, foot = upheld(sights, grid, top, noise)
+        x, y = np.moveaxis(grid.centres() - grid.centres()[np.isfinite(grid.top)].mean(axis=0), -1, 0)
+        return kept & ~((x > 0) & (np.abs(y) < 0.006)), foot
+
+    monkeypatch.setattr(lying, "_upheld", cut_through)
+    watch, mesh, shape = before_the_station(shapes.make("watch", 301).mesh, 0.0)
+    assert shape == "height field"
+    assert surface_error.distance(watch, mesh) < 0.004
+    assert len(mesh.to_trimesh().split()) == 1 and mesh.to_trimesh().euler_number == 0
