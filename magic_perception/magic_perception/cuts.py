@@ -2,9 +2,10 @@
 
 Two convex things on a table are on the two sides of some upright plane.  Where stereo fills the gap between them, or they touch with faces that go on in one
 plane, no seam bends inward, and low things have none that tells; but colour changes all along that plane, and either side alone is nearer to a convex body
-than both are together, as far as that is seen: where other things hide a body it may go on.  The colour of one printed thing changes as well, and so do those
-of a head and its handle: the chance of two things is a logistic function of what is measured at the plane (:data:`CRITERIA`), and what is one convex body
-stays one thing, whatever its colours.  ``cuts.json`` holds the weights, made by ``python -m magic_perception.learn_cuts`` from procedural scenes.
+than both are together: a camera sees past them where one convex body would be.  What no camera sees is no evidence, as a body may go on behind itself, behind
+other things and where its depth is lost.  The colour of one printed thing changes as well, and so do those of a head and its handle: the chance of two things
+is a logistic function of what is measured at the plane (:data:`CRITERIA`), and what may be one convex body stays one thing, whatever its colours.  ``cuts.json`` holds
+the weights, made by ``python -m magic_perception.learn_cuts`` from procedural scenes.
 """
 
 from __future__ import annotations
@@ -28,12 +29,11 @@ from magic_perception.looks import Looked
 CRITERIA = {
     "contrast": "log of one and the change of colour across the plane, in squared standard deviations",
     "own": "share of points that are nearer in colour to their own side's mean than to the other's, less a half",
-    "hull": "log of the share of the plan's convex hull that is in neither side's, over 0.03",
-    "block": "the same of the upright blocks on these hulls, each as high as what is in it",
-    "breadth": "log of the lesser breadth of the sides in plan, over 40 mm",
+    "hull": "log of the share of the plan's convex hull that is in neither side's and that a camera sees to be empty, up to 0.05, over 0.02",
+    "block": "the same of the upright block on that hull and those on the sides', each as high as what is in it",
+    "breadth": "log of the lesser breadth of the sides in plan, up to 40 mm, over that",
     "slim": "lesser ratio of breadth and length of the sides in plan",
-    "share": "log of the smaller side's share of the points",
-    "filled": "share of their hull in plan that both sides fill",
+    "hollow": "share of its own hull in plan that a camera sees to be empty below its top, of the side of which that is less",
 }
 
 #: Directions that are looked in, and the steps of the plane along them, m; what is compared across a plane lies so near to it, m.
@@ -52,10 +52,11 @@ CELL, UNSURE = 0.004, 0.004
 #: What lies so near to the plane, m, is the side's whose colour is nearer by this factor.
 NEAR, CLEAR = 0.008, 0.6
 
-#: What other things hide is looked at in cells of this size in plan, m, so high, as shares of the height of the cluster; depth so much farther than a place, m,
-#: shows that nothing is there.
-PLACE, LEVELS, EMPTY = 0.008, (0.25, 0.5, 0.75), 0.008
-NOWHERE = np.zeros((0, 2))
+#: Whether a camera sees that nothing is there is asked at these shares of the height of the cluster; depth so much farther than a place, m, shows it.  What is
+#: empty up to such a share of a side's height is hollow.
+LEVELS, EMPTY, HOLLOW = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 0.008, 0.8
+#: The share of the hull that has to be seen empty for what lies in it to be thought two things; the least and most that are told apart.
+SEEN, LEAST_SEEN, MOST_SEEN = 0.02, 0.004, 0.05
 
 #: Told the criteria (C,) of a plane: the logarithm of the odds that its sides are two things.
 Judge = Callable[[NDArray[np.float64]], float]
@@ -76,20 +77,29 @@ class Points:
 
 @dataclass(frozen=True)
 class Seen:
-    """A cluster: some :data:`POINTS` of its points, the area in plan that all of them cover, m2, and places (H, 2) in the middle of the cells of its convex hull
-    in plan that other things hide."""
+    """A cluster: some :data:`POINTS` of its points, and what cameras see in its convex hull in plan: empty (L, G), whether one sees that nothing is at heights
+    level (L,) above the table, m, in cells whose middles are at place (G, 2)."""
 
     points: Points
-    covered: float
-    hidden: NDArray[np.float64]
+    place: NDArray[np.float64]
+    level: NDArray[np.float64]
+    empty: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, points: Points, hidden: NDArray[np.float64] = NOWHERE) -> Seen:
-        """By all points of the cluster."""
-        cells = np.floor(points.place / CELL).astype(np.int64)
-        cells -= cells.min(axis=0)
-        covered = len(np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1])) * CELL**2
-        return cls(points.of(np.arange(0, len(points.place), max(1, len(points.place) // POINTS))), covered, hidden)
+    def of(cls, points: Points, empty: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> Seen:
+        """By all points of the cluster; ``empty`` is told places (N, 3), in plan and the height above the table, m."""
+        points = points.of(np.arange(0, len(points.place), max(1, len(points.place) // POINTS)))
+        outline = _hull(points.place)
+        low, high = outline[:, 0].min(axis=0), outline[:, 0].max(axis=0)
+        place = np.stack(np.meshgrid(*(np.arange(low[i] + CELL / 2, high[i], CELL) for i in range(2))), axis=-1).reshape(-1, 2)
+        place = place[_inside(place, outline)].astype(float)
+        level = float(np.percentile(points.height, 97)) * np.array(LEVELS)
+        asked = np.column_stack([np.tile(place, (len(level), 1)), np.repeat(level, len(place))])
+        return cls(points, place, level, empty(asked).reshape(len(level), -1))
+
+    def below(self, height: float) -> NDArray[np.bool_]:
+        """The cells (G,) that are seen to be empty at some level up to a height, m, or at the lowest."""
+        return np.any(self.empty[: max(1, np.count_nonzero(self.level <= height))], axis=0)
 
 
 class Plane(NamedTuple):
@@ -160,32 +170,34 @@ def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
     clear = [points.place[side & (np.abs(distance) > UNSURE)] for side in sides]
     if min(counts) < LEAST // 3 or min(len(place) for place in clear) < 3:
         return None
-    outlines = [_hull(place) for place in clear]
     boxes = [_extents(place) for place in clear]
     if min(box[0] for box in boxes) < NARROW:
         return None
-    whole = _hull(np.concatenate(clear))
-    area = max(float(cv2.contourArea(whole)), 1e-6)
-    areas = [max(float(cv2.contourArea(outline)), 1e-6) for outline in outlines]
-    strip = 2 * UNSURE * _chord(whole, plane)
-    hidden = _outside(seen.hidden, outlines, plane) * PLACE**2
+    inside = [_inside(seen.place, _hull(place)) for place in clear]
     tops = [max(float(np.percentile(points.height[side], 95)), 1e-3) for side in sides]
+    off = np.abs(plane.distance(seen.place)) > UNSURE
+    beside = off & ~inside[0] & ~inside[1]
+    solid = np.any([within & (seen.level[:, None] <= top) for within, top in zip(inside, tops, strict=True)], axis=0)
     scaled = points.lab / SPREAD
     away = [np.linalg.norm(scaled - scaled[side].mean(axis=0), axis=1) for side in sides]
     return np.array([
         np.log1p(plane.change),
         min(float(np.mean(away[i][side] < away[1 - i][side])) for i, side in enumerate(sides)) - 0.5,
-        np.log(max(1 - (sum(areas) + strip + hidden) / area, 0.004) / 0.03),
-        np.log(max(1 - (areas[0] * tops[0] + areas[1] * tops[1] + strip * np.mean(tops) + hidden * max(tops)) / (area * max(tops)), 0.004) / 0.03),
-        np.log(min(box[0] for box in boxes) / 0.040),
+        _share(beside & seen.below(min(tops))),
+        _share(seen.empty & ~solid & off),
+        min(np.log(min(box[0] for box in boxes) / 0.040), 0.0),
         min(float(box[0] / max(box[1], box[0])) for box in boxes),
-        np.log(min(counts) / len(first)),
-        (seen.covered + hidden) / area,
+        min(float(np.mean(seen.below(HOLLOW * top)[within])) if within.any() else 0.0 for within, top in zip(inside, tops, strict=True)),
     ])  # fmt: skip
 
 
+def _share(empty: NDArray[np.bool_]) -> float:
+    """The logarithm of the share of what is seen to be empty, over what tells something."""
+    return float(np.log(np.clip(np.mean(empty) if empty.size else 0.0, LEAST_SEEN, MOST_SEEN) / SEEN))
+
+
 def convex(row: NDArray[np.float64]) -> bool:
-    """Whether by the criteria (C,) of a plane both sides are as good as one convex body."""
+    """Whether by the criteria (C,) of a plane both sides may be one convex body, as far as cameras see."""
     names = list(CRITERIA)
     return row[names.index("hull")] <= 0 and row[names.index("block")] <= 0
 
@@ -197,24 +209,8 @@ def _extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.subtract(*np.percentile(local @ axes, [95, 5], axis=0)) / 0.9
 
 
-def _chord(outline: NDArray[np.float32], plane: Plane) -> float:
-    """How long a plane is within a convex outline (N, 1, 2) in plan, m."""
-    ring = outline[:, 0].astype(float)
-    distance, run = plane.distance(ring), ring @ [-np.sin(plane.angle), np.cos(plane.angle)]
-    after, beyond = np.roll(distance, -1), np.roll(run, -1)
-    cut = (distance < 0) != (after < 0)
-    at = run[cut] + distance[cut] / (distance[cut] - after[cut]) * (beyond[cut] - run[cut])
-    return float(np.ptp(at)) if len(at) else 0.0
-
-
 def _hull(place: NDArray[np.float64]) -> NDArray[np.float32]:
     return cv2.convexHull(np.ascontiguousarray(place, np.float32)[:, None])
-
-
-def _outside(place: NDArray[np.float64], outlines: list[NDArray[np.float32]], plane: Plane) -> int:
-    """How many of the places (N, 2) are in no outline, nor so near to the plane that they are nobody's."""
-    place = place[np.abs(plane.distance(place)) > UNSURE]
-    return int(np.count_nonzero(~_inside(place, outlines[0]) & ~_inside(place, outlines[1])))
 
 
 def _inside(place: NDArray[np.float64], outline: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -248,52 +244,36 @@ def points_of(looks: list[Looked], found: Clusters) -> Points:
     return Points(found.cloud[:, :2].astype(float), height.astype(float), lab.astype(float))
 
 
-def images_of(looks: list[Looked], found: Clusters, instance: NDArray[np.int64]) -> list[NDArray[np.int32]]:
-    """For each look (H, W) the instance at each pixel; -1: none; -2: what is known, or where the camera is blind."""
-    images, start = [], 0
-    for look, fixed, where in zip(looks, found.fixed, found.spots, strict=True):
-        image = np.where(fixed | ~look.open, np.int32(-2), np.int32(-1))
-        image[where] = instance[start : start + len(where[0])]
-        start += len(where[0])
-        images.append(image)
-    return images
+def bare(looks: list[Looked], found: Clusters) -> list[NDArray[np.bool_]]:
+    """For each look (H, W) where it shows no thing, nothing known, and is not blind."""
+    return [look.open & ~mask & ~fixed for look, mask, fixed in zip(looks, found.masks, found.fixed, strict=True)]
 
 
-def hidden(
-    looks: list[Looked], images: list[NDArray[np.int32]], label: int, cloud: NDArray[np.float32], height: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Places (H, 2) within the hull in plan of an instance at which no camera sees that nothing is there, as other things are before them; cloud (N, 3), height
-    (N,): its own points."""
-    step = max(1, len(cloud) // POINTS)
-    cloud, height = cloud[::step], height[::step]
-    outline = _hull(cloud[:, :2])
-    low, high = outline[:, 0].min(axis=0), outline[:, 0].max(axis=0)
-    place = np.stack(np.meshgrid(*(np.arange(low[i] + PLACE / 2, high[i], PLACE) for i in range(2))), axis=-1).reshape(-1, 2)
-    place = place[_inside(place, outline)].astype(float)
-    ground, top = float(np.mean(cloud[:, 2] - height)), float(np.percentile(height, 95))
-    levels = ground + top * np.repeat(LEVELS, len(place))
-    empty, behind = np.zeros(len(place), bool), np.zeros(len(place), bool)
-    for look, image in zip(looks, images, strict=True):
+def empty(looks: list[Looked], bared: list[NDArray[np.bool_]], asked: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which places (N, 3) in the world a camera sees to be empty: it is :func:`bare` there, or what it sees lies behind them."""
+    result = np.zeros(len(asked), bool)
+    for look, none in zip(looks, bared, strict=True):
         k = look.frame.intrinsics
-        local = transforms.apply(
-            transforms.inverse(look.frame.world_from_camera), np.column_stack([np.tile(place, (len(LEVELS), 1)), levels])
-        )
+        local = transforms.apply(transforms.inverse(look.frame.world_from_camera), asked)
         z = np.maximum(local[:, 2], 1e-3)
         u, v = np.rint(k.fx * local[:, 0] / z + k.cx), np.rint(k.fy * local[:, 1] / z + k.cy)
         inside = (local[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
         u, v = (np.where(inside, i, 0).astype(int) for i in (u, v))
-        there = image[v, u]
         with np.errstate(invalid="ignore"):
-            past = (there == -1) | (look.frame.depth[v, u] > z + EMPTY)
-        empty |= (inside & past).reshape(len(LEVELS), -1).any(axis=0)
-        behind |= (inside & ~past & (there != label)).reshape(len(LEVELS), -1).any(axis=0)
-    return place[behind & ~empty]
+            result |= inside & (none[v, u] | (look.frame.depth[v, u] > z + EMPTY))
+    return result
+
+
+def seen_of(looks: list[Looked], bared: list[NDArray[np.bool_]], cloud: NDArray[np.float32], points: Points) -> Seen:
+    """What is seen of a cluster; cloud (N, 3), points (N,): its own points in the world, and over the table."""
+    ground = np.array([0, 0, np.mean(cloud[:, 2] - points.height)])
+    return Seen.of(points, lambda asked: empty(looks, bared, asked + ground))
 
 
 def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
     """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things."""
     instance = instance.copy()
-    points, images = points_of(looks, found), images_of(looks, found, instance)
+    points, bared = points_of(looks, found), bare(looks, found)
     todo = list(range(int(instance.max(initial=-1)) + 1))
     while todo:
         label = todo.pop()
@@ -301,7 +281,7 @@ def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], ju
         if len(mine) < 2 * LEAST:
             continue
         own = points.of(mine)
-        plane = best(Seen.of(own, hidden(looks, images, label, found.cloud[mine], own.height)), judge)
+        plane = best(seen_of(looks, bared, found.cloud[mine], own), judge)
         if plane is None:
             continue
         first = _first(own, plane)
@@ -309,7 +289,6 @@ def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], ju
             continue
         new = int(instance.max()) + 1
         instance[mine[first]] = new
-        images = images_of(looks, found, instance)
         todo += [label, new]
     return instance
 

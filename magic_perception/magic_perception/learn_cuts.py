@@ -1,6 +1,6 @@
 """Learn which upright planes part things of different colours: ``python -m magic_perception.learn_cuts --out cuts.json``.
 
-The scenes are procedural: neighbours of different colours and single things of several (:mod:`magic_perception.neighbours`), and piles
+The scenes are procedural: two and three neighbours of different colours and single things of several (:mod:`magic_perception.neighbours`), and piles
 (:mod:`magic_perception.piles`).  Every plane that is looked at in what seams leave together (:mod:`magic_perception.cuts`) is an example, which parts things
 where none has more than a tenth of itself on the other side.  The labelled scenes of OSD are left out, and judge the result.
 
@@ -29,8 +29,8 @@ from magic_perception.segmentation import DepthSegmenter, uncut
 
 #: What has so little of a cluster is no thing of it; a plane leaves a thing whole that has so little of itself on one side.
 TRACE, WHOLE = 0.05, 0.1
-#: What an example of a single thing weighs: in practice there are more of these, and parting one is as wrong.
-SINGLE = 3.0
+#: What an example of a single thing weighs: in practice there are more of these than of pairs and threes, and parting one is as wrong.
+SINGLE = 5.0
 #: The region of interest of piles.
 PILES = Parameters(region_low=(-0.3, -0.8, -0.05), region_high=(1.3, 0.8, 0.6))
 
@@ -57,7 +57,7 @@ def clusters_of(made: Pile, parameters: Parameters, scene: int, kind: str) -> li
     looks = looked_at(made, parameters)
     found = clustered(looks, (), parameters)
     instance = uncut(looks, found, learned(), parameters)
-    points, images = cuts.points_of(looks, found), cuts.images_of(looks, found, instance)
+    points, bared = cuts.points_of(looks, found), cuts.bare(looks, found)
     truth = np.concatenate([image[where] for image, where in zip(made.truth, found.spots, strict=True)])
     result = []
     for label in range(int(instance.max(initial=-1)) + 1):
@@ -66,7 +66,7 @@ def clusters_of(made: Pile, parameters: Parameters, scene: int, kind: str) -> li
             continue
         things = [thing for thing in np.unique(truth[mine]) if thing > 0 and np.mean(truth[mine] == thing) > TRACE]
         own = points.of(mine)
-        seen, rows, two = cuts.Seen.of(own, cuts.hidden(looks, images, label, found.cloud[mine], own.height)), [], []
+        seen, rows, two = cuts.seen_of(looks, bared, found.cloud[mine], own), [], []
         for plane in cuts.planes(seen.points):
             row = cuts.measured(seen, plane)
             if row is not None:
@@ -135,10 +135,10 @@ def judged(first: int, rounds: int) -> str:
 def main(args: list[str] | None = None) -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3, help="rounds of neighbours and of single things (default 3)")
+    parser.add_argument("--rounds", type=int, default=2, help="rounds of pairs, threes and single things (default 2)")
     parser.add_argument("--piles", type=int, default=100, help="piles (default 100)")
     parser.add_argument("--out", type=Path, help="file for the weights; without it nothing is written")
-    parser.add_argument("--first", type=int, help="learn nothing, but judge scenes from this seed on (those of 0 to 2 are learned from)")
+    parser.add_argument("--first", type=int, help="learn nothing, but judge scenes from this seed on (those of 0 and 1 are learned from)")
     given = parser.parse_args(args)
     if given.first is not None:
         print(judged(given.first, given.rounds))
@@ -148,6 +148,7 @@ def main(args: list[str] | None = None) -> None:
         for number in range(len(neighbours.PAIRS)):
             scene = seed * len(neighbours.PAIRS) + number
             found += clusters_of(neighbours.pair(seed, number), Parameters(), scene, "pair")
+            found += clusters_of(neighbours.three(seed, number), Parameters(), scene, "three")
             found += clusters_of(neighbours.single(seed, number), Parameters(), scene, "single")
     for seed in range(given.piles):
         found += clusters_of(pile(seed), PILES, seed, "pile")

@@ -99,6 +99,11 @@ def side_by_side(wide: float, other: float, turn: float) -> cuts.Points:
     return cuts.Points(place, np.full(len(place), 0.03), lab + np.random.default_rng(0).normal(0, 2, lab.shape))
 
 
+def seen_past(asked: np.ndarray, other: float = 0.04) -> np.ndarray:
+    """A camera sees to be empty all that is in neither rectangle of :func:`side_by_side`, 80 mm wide and ``other``."""
+    return np.abs(asked[:, 1] - 0.1) > np.where(asked[:, 0] < 0.5, 0.04, other / 2)
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.5, 1.9])
 def test_the_plane_between_two_colours_is_found(turn):
     plane = cuts.planes(side_by_side(0.08, 0.05, turn))[0]
@@ -108,57 +113,96 @@ def test_the_plane_between_two_colours_is_found(turn):
 
 @pytest.mark.parametrize(("other", "one"), [(0.08, True), (0.05, False)])
 def test_what_is_one_convex_body_is_not_asked_for_its_colours(other, one):
-    seen = cuts.Seen.of(side_by_side(0.08, other, 0.0))
+    seen = cuts.Seen.of(side_by_side(0.08, other, 0.0), lambda asked: seen_past(asked, other))
     row = cuts.measured(seen, cuts.planes(seen.points)[0])
     assert cuts.convex(row) == one
     assert (cuts.best(seen, lambda _: 1.0) is None) == one
 
 
-def test_criteria_of_two_rectangles():
-    seen = cuts.Seen.of(side_by_side(0.08, 0.04, 0.0))
+def test_criteria_of_two_rectangles(monkeypatch):
+    monkeypatch.setattr(cuts, "CELL", 0.001)
+    seen = cuts.Seen.of(side_by_side(0.08, 0.07, 0.0), lambda asked: seen_past(asked, 0.07))
     told_ = dict(zip(cuts.CRITERIA, cuts.measured(seen, cuts.Plane(0.0, 0.5, 3.0)), strict=True))
-    # Without 4 mm on either side of the plane, in mm2: rectangles of 56 x 80 and 56 x 40; a trapezoid from 80 to 40 between; 77.5 are its width at the plane.
-    hull = 56 * 80 + 64 * 60
-    assert 0.03 * np.exp(told_["hull"]) == pytest.approx(1 - (56 * 80 + 56 * 40 + 8 * 77.5) / hull, abs=0.005)
+    # The hull is a rectangle of 60 x 80 mm and a trapezoid from 80 to 70; in it beside the smaller rectangle two triangles, of which 4 mm beside the plane are nobody's.
+    hull, beside = 60 * 80 + 60 * 75, 60 * 5 * (56 / 60) ** 2
+    assert cuts.SEEN * np.exp(told_["hull"]) == pytest.approx(beside / hull, abs=0.005)
+    assert told_["block"] == pytest.approx(told_["hull"])
+    assert told_["hollow"] == 0.0
     assert told_["contrast"] == pytest.approx(np.log(4))
     assert told_["own"] == pytest.approx(0.5, abs=0.01)
-    assert 0.040 * np.exp(told_["breadth"]) == pytest.approx(0.04, abs=0.002)
-    assert told_["slim"] == pytest.approx(40 / 60, abs=0.05)
+    assert told_["breadth"] == 0.0
+    assert told_["slim"] == pytest.approx(56 / 80, abs=0.05)
 
 
-def test_what_other_things_hide_is_no_evidence():
-    """A rectangle of two colours, one of whose halves is narrower: two things, unless other things hide what it lacks."""
-    seen = side_by_side(0.08, 0.04, 0.0)
-    places = np.stack(np.meshgrid(np.arange(0.504, 0.56, cuts.PLACE), np.arange(0.064, 0.14, cuts.PLACE)), axis=-1).reshape(-1, 2)
-    places = places[np.abs(places[:, 1] - 0.1) > 0.02]
-    plane = cuts.Plane(0.0, 0.5, 3.0)
-    alone, behind = (cuts.measured(cuts.Seen.of(seen, hidden), plane) for hidden in (cuts.NOWHERE, places))
-    assert not cuts.convex(alone) and cuts.convex(behind)
-    filled = list(cuts.CRITERIA).index("filled")
-    assert behind[filled] > alone[filled] + 0.1
+def test_above_a_lower_side_a_block_is_seen_to_be_empty():
+    """Two rectangles as broad, one half as high: the plan does not tell."""
+    points = side_by_side(0.08, 0.08, 0.0)
+    points.height[points.place[:, 0] > 0.5] /= 2
+    seen = cuts.Seen.of(points, lambda asked: (asked[:, 0] > 0.5) & (asked[:, 2] > 0.015))
+    told_ = dict(zip(cuts.CRITERIA, cuts.measured(seen, cuts.Plane(0.0, 0.5, 3.0)), strict=True))
+    assert cuts.SEEN * np.exp(told_["hull"]) == pytest.approx(cuts.LEAST_SEEN)
+    assert cuts.SEEN * np.exp(told_["block"]) == pytest.approx(cuts.MOST_SEEN)
 
 
-def test_what_is_behind_another_thing_is_hidden_unless_a_camera_sees_that_it_is_empty():
+def test_a_ring_is_hollow_on_both_sides_and_a_ring_beside_a_block_is_not():
+    long = np.arange(-0.04, 0.04, 0.0012)
+    grid = np.stack(np.meshgrid(long, long), axis=-1).reshape(-1, 2)
+    ring = grid[np.abs(grid).max(axis=1) > 0.025]
+    for other, hollow in ((ring, True), (grid, False)):
+        place = np.concatenate([ring - [0.042, 0], other + [0.042, 0]])
+        lab = np.repeat([[120.0, 150.0, 90.0], [120.0, 110.0, 160.0]], [len(ring), len(other)], axis=0)
+        free = [-0.042, 0.042] if hollow else [-0.042]
+        seen = cuts.Seen.of(
+            cuts.Points(place, np.full(len(place), 0.03), lab),
+            lambda asked, free=free: np.any([np.abs(asked[:, :2] - [x, 0]).max(axis=1) < 0.025 for x in free], axis=0),
+        )
+        told_ = dict(zip(cuts.CRITERIA, cuts.measured(seen, cuts.Plane(0.0, 0.0, 3.0)), strict=True))
+        assert told_["hollow"] == pytest.approx((50 / 78) ** 2 if hollow else 0.0, abs=0.06)
+
+
+def test_a_narrow_side_is_as_narrow_as_it_is():
+    points = side_by_side(0.024, 0.03, 0.0)
+    seen = cuts.Seen.of(points, lambda asked: np.zeros(len(asked), bool))
+    told_ = dict(zip(cuts.CRITERIA, cuts.measured(seen, cuts.Plane(0.0, 0.5, 3.0)), strict=True))
+    assert 0.040 * np.exp(told_["breadth"]) == pytest.approx(0.024, abs=0.002)
+    assert told_["slim"] == pytest.approx(24 / 60, abs=0.05)
+
+
+def test_what_no_camera_sees_is_no_evidence():
+    """A rectangle of two colours, one of whose halves is narrower: two things only where a camera sees that what it lacks is not there."""
+    points, plane = side_by_side(0.08, 0.04, 0.0), cuts.Plane(0.0, 0.5, 3.0)
+    past, none = (cuts.measured(cuts.Seen.of(points, told_), plane) for told_ in (seen_past, lambda asked: np.zeros(len(asked), bool)))
+    assert not cuts.convex(past) and cuts.convex(none)
+
+
+def test_a_notch_is_seen_to_be_empty_unless_something_stands_before_it():
     """Of a thing with a notch, before which a post stands, as the left camera sees it."""
     back = concatenate([box((0.07, 0.10, 0.05), 0.465, 0.0, BLUE), box((0.07, 0.05, 0.05), 0.535, -0.025, BLUE)])
     post = box((0.07, 0.07, 0.16), 0.62, 0.11, RED)
-    caster = sensor.scene_raycaster([back, post])
-    notch = {}
-    for names in (("left",), ("left", "right")):
+    notch, inside = np.array([[0.535, 0.025, 0.02]]), np.array([[0.465, 0.0, 0.02]])
+    for meshes, names, told_ in (([back], ("left",), True), ([back, post], ("left",), False), ([back, post], ("left", "right"), True)):
+        caster = sensor.scene_raycaster(meshes)
         frames = [
             sensor.capture([], sensor.D435, sensor.STATION[name], [5, i], camera=name, raycaster=caster) for i, name in enumerate(names)
         ]
-        looks = learn_cuts.looked_at(Pile(frames, [], [back, post]), Parameters())
-        found = clustered(looks, (), Parameters())
-        images, height = cuts.images_of(looks, found, found.instance), cuts.points_of(looks, found).height
-        for label in np.flatnonzero(np.bincount(found.instance[found.instance >= 0]) > cuts.LEAST):
-            mine = np.nonzero(found.instance == label)[0]
-            place = cuts.hidden(looks, images, int(label), found.cloud[mine], height[mine])
-            if np.median(found.cloud[mine, 0]) > 0.6:
-                assert len(place) == 0
-            else:
-                notch[names] = np.count_nonzero(np.all((place > [0.51, 0.005]) & (place < [0.56, 0.045]), axis=1))
-    assert notch["left",] > 10 and notch["left", "right"] < 4
+        looks = learn_cuts.looked_at(Pile(frames, [], meshes), Parameters())
+        bared = cuts.bare(looks, clustered(looks, (), Parameters()))
+        assert cuts.empty(looks, bared, notch)[0] == told_
+        assert not cuts.empty(looks, bared, inside)[0]
+
+
+def test_depth_that_is_lost_shows_nothing_to_be_empty():
+    """A block whose middle has no depth, as a dark carton's: where its mask goes on nothing is empty."""
+    block = box((0.10, 0.10, 0.05), 0.5, 0.0, BLUE)
+    frame = sensor.capture([block], sensor.D435, sensor.STATION["left"], 5, camera="left")
+    rows, columns = np.nonzero(frame.color[..., 2] > frame.color[..., 0].astype(int) + 40)
+    v, u = int(np.median(rows)), int(np.median(columns))
+    frame.depth[v - 8 : v + 8, u - 8 : u + 8] = np.nan
+    looks = learn_cuts.looked_at(Pile([frame], [], [block]), Parameters())
+    found = clustered(looks, (), Parameters())
+    assert np.isnan(looks[0].frame.depth[v, u]) and not cuts.bare(looks, found)[0][v, u]
+    grid = np.stack(np.meshgrid(np.arange(0.46, 0.54, 0.004), np.arange(-0.04, 0.04, 0.004), [0.03]), axis=-1).reshape(-1, 3)
+    assert not cuts.empty(looks, cuts.bare(looks, found), grid).any()
 
 
 @pytest.mark.parametrize("number", [54, 64])
