@@ -164,6 +164,13 @@ def blocked(strategy: Strategy, target: SceneObject, led: Led, objects: Sequence
     return MagicError(Code.WAY_BLOCKED, f"what stands where {target.id} is to be led", told, f"nothing there, or nothing on a way {most}")
 
 
+def kept(strategy: Strategy, result: MatchResult, target: SceneObject, led: Led, objects: Sequence[SceneObject]) -> MatchResult:
+    """A match with those of its candidates whose target pushes nothing aside; raises ``WAY_BLOCKED`` where there are none."""
+    if not led.clear:
+        raise blocked(strategy, target, led, objects)
+    return replace(result, candidates=led.clear)
+
+
 def match_led(matcher: Matcher, match: Match, strategy: Strategy, scene: Scene, tool_ids: Sequence[str], target_id: str) -> MatchResult:
     """The match of what a request names in a scene, or means by naming nothing, each candidate led among the other things.
 
@@ -177,15 +184,16 @@ def match_led(matcher: Matcher, match: Match, strategy: Strategy, scene: Scene, 
     targets = [target] if target_id else alike(strategy, [o for o in scene.objects if o.id not in tool_ids], matcher.target_view)
     found: list[tuple[float, MatchResult | MagicError]] = []
     for item in targets:
+        worth = -1.0
         try:
             result = match(select(scene, strategy, tool_ids, item.id, matcher.target_view)[0], item)
+            led = lead(strategy, result.candidates, item, scene.objects, contacts_of(matcher, strategy, item))
+            worth = led.worth
+            found.append((worth, kept(strategy, result, item, led, scene.objects)))
         except MagicError as error:
-            found.append((-1.0, error))
+            found.append((worth, error))
             continue
-        led = lead(strategy, result.candidates, item, scene.objects, contacts_of(matcher, strategy, item))
-        clear = led.clear
-        found.append((led.worth, replace(result, candidates=clear) if clear else blocked(strategy, item, led, scene.objects)))
-        if led.worth >= ALIKE * max(candidate.score for candidate in result.candidates):
+        if worth >= ALIKE * max(candidate.score for candidate in result.candidates):
             break
     best = max(found, key=lambda entry: entry[0])[1]
     if isinstance(best, MagicError):

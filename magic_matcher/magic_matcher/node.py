@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -219,8 +218,9 @@ class MatcherNode(Node):
 
     def _led(self, found: Strategy, target: SceneObject, result: matching.MatchResult) -> matching.MatchResult:
         """The candidates of tools that only pictures show, for a target of the scene, led among the other things."""
-        contact_at = clear_way.contacts_of(self._matcher, found, target)
-        return replace(result, candidates=clear_way.lead(found, result.candidates, target, self._objects().objects, contact_at).candidates)
+        objects, contact_at = self._objects().objects, clear_way.contacts_of(self._matcher, found, target)
+        led = clear_way.lead(found, result.candidates, target, objects, contact_at)
+        return clear_way.kept(found, result, target, led, objects)
 
     def _objects(self) -> Scene:
         if self._scene is None:

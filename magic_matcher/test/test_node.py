@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,6 +38,8 @@ def until(condition, seconds=20.0):
 def graph(demonstration, tmp_path_factory):
     root = tmp_path_factory.mktemp("strategies")
     strategy.save(demonstration, root / "test")
+    pull = (strategy.Waypoint("touch", np.zeros(3), "contact"), strategy.Waypoint("pulled", np.array([-0.2, 0.0, 0.0]), "goal"))
+    strategy.save(replace(demonstration, name="led", waypoints=pull, turned_by=np.deg2rad(40.0)), root / "led")
     (root / "broken").mkdir()
     (root / "broken" / "strategy.yaml").write_text("name: broken\n")
     rclpy.init(args=["--ros-args", "-p", f"strategies:={root}", "-p", "cache:=none"])
@@ -68,9 +71,10 @@ def graph(demonstration, tmp_path_factory):
 
             return wait
 
-        def show(self):
-            publisher.publish(conversions.scene_to_msg(Scene(tuple(items), np.array([0, 0, 1.0, 0]))))
-            until(lambda: node._scene is not None)
+        def show(self, *others):
+            shown = Scene((*items, *others), np.array([0, 0, 1.0, 0]))
+            publisher.publish(conversions.scene_to_msg(shown))
+            until(lambda: node._scene is not None and len(node._scene.objects) == len(shown.objects))
 
     yield Graph()
     executor.shutdown()
@@ -111,6 +115,23 @@ def test_by_ids(graph):
     assert answer.heatmap.width == 0
     scores = [c.score for c in answer.candidates]
     assert scores == sorted(scores, reverse=True)
+
+
+def test_what_blocks_every_way_is_named_whether_the_tool_stands_there_or_a_picture_shows_it(graph, demonstration):
+    graph.show()
+    fields = ({"tool_ids": ["l_hook"]}, {"tool_views": [image_request(demonstration)]})
+    for tool in fields:
+        answer = graph.ask(strategy="led", target_id="cylinder", **tool)
+        assert answer.code == Code.OK, answer.message
+    walls = []
+    for angle in range(-40, 41, 10):
+        place = transforms.from_rpy(0, 0, np.deg2rad(angle))[:3, :3] @ [-0.16, 0.0, 0.0] + [0.4, 0.1, 0.02]
+        walls.append(shapes.make("cylinder", 1, radius=0.02).as_object(f"wall_{angle}", transforms.make(translation=place)))
+    graph.show(*walls)
+    for tool in fields:
+        answer = graph.ask(strategy="led", target_id="cylinder", **tool)
+        assert answer.code == Code.WAY_BLOCKED and "wall_" in answer.message, answer.message
+    graph.show()
 
 
 def test_choosing_tool_and_target(graph):
