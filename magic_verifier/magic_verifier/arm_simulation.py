@@ -158,8 +158,7 @@ class ArmRun:
         self._effort = self._arm.effort.tolist()
         self._metrics = {"torque_ratio": 0.0, "grip_load": 0.0, "grasp_slip": 0.0, "grasp_turn": 0.0, "grip_width": float("nan")}
         self._begin(held, begin)
-        self._positions = self._q[self._first :].tolist()
-        self._led = self._commands()[self._first :].tolist()
+        self._positions, self._led = self._q[self._first :], self._commands()[self._first :]
 
     def _iterate_for_weight(self) -> None:
         """More solver iterations where the target is much heavier than the tool (:data:`HEAVIER`)."""
@@ -260,7 +259,7 @@ class ArmRun:
         row = min(max(self._index - self._lag - self._first, 0), len(self._positions) - 1)
         waiting = self._gripper()
         still = waiting or self._index >= len(self._q)
-        self._arm.drive(self._positions[row] if still else self._led[row])
+        self._arm.drive((self._positions if still else self._led)[row].tolist())
         self.world.step()
         if self._rests and self.world.touched_by(TOOL):
             self._wake()
@@ -270,7 +269,7 @@ class ArmRun:
         if self._let_go_at is not None and over == 0:
             self._asleep = self._arm.sleeps()
         if self.world.steps % self._every == 0:
-            self._watch(self._positions[row])
+            self._watch(self._positions[row].tolist())
             if self.stands_still and over >= 0 and self._held_still() and self._arm.sleeps():
                 self.world.hold(TOOL)
                 self._asleep = True

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.robot import Description, RobotConfig
 from magic_core.robot_pictures import shape_mesh
 from magic_verifier.grip import Grip, Patch
-from magic_verifier.simulation import World, engine, from_pose
+from magic_verifier.simulation import World, engine, from_pose, to_pose
 
 ARM = "arm"
 FINGERS = "fingers"
@@ -135,7 +136,8 @@ class Articulation:
         # along it where it slides: the axis is x of the engine's joint frames.
         links = [link.name for link in body.links]
         self._carried = np.array([6 * links.index(joint.child) + (0 if joint.sliding else 3) for joint in robot.arm])
-        self._tcp = body.find_link_by_name(robot.config.move_group)
+        carrier, carrier_from_tcp = _prepared(robot).bare.get(robot.config.move_group, (robot.config.move_group, np.eye(4)))
+        self._carrier, self._carrier_from_tcp = body.find_link_by_name(carrier), to_pose(carrier_from_tcp)
         self.hand = body.find_link_by_name(robot.fingers[0].parent)
         #: Of the hand, in which the tool is.
         self._gripper = [link for link in body.links if link.name in robot.finger_links] + [self.hand]
@@ -200,12 +202,12 @@ class Articulation:
 
     def tcp(self) -> NDArray[np.float64]:
         """world_from_tcp (4, 4)."""
-        return from_pose(self._tcp.entity_pose)
+        return from_pose(self.tcp_pose)
 
     @property
     def tcp_pose(self) -> Any:
         """The same as the engine's pose."""
-        return self._tcp.entity_pose
+        return self._carrier.entity_pose * self._carrier_from_tcp
 
     def transmitted(self) -> list[float]:
         """(J,): the torque about (the force along) the axis that each of the arm's joints carries, Nm (N)."""
@@ -221,7 +223,8 @@ class Articulation:
         """Set the drives of the arm to positions that lead by :attr:`lead` (J,), and feed gravity and Coriolis torques forward."""
         for target, position in zip(self._targets, targets, strict=True):
             target(position)
-        self.body.set_qf(self.body.compute_passive_force(gravity=True, coriolis_and_centrifugal=True))
+        # Gravity and Coriolis are what it gives unless told otherwise: to be told so takes it half as long again.
+        self.body.set_qf(self.body.compute_passive_force())
 
     def open_fingers(self, width: float | None = None) -> None:
         """Drive the fingers to where they are open, or ``width`` metres apart."""
@@ -282,19 +285,19 @@ class Articulation:
 
 
 def _load(world: World, robot: Description) -> Any:
-    builder, groups, counts = _prepared(robot)
-    builder.set_scene(world.scene)
+    prepared = _prepared(robot)
+    prepared.builder.set_scene(world.scene)
     try:
-        body = builder.build()
+        body = prepared.builder.build()
     except Exception as error:  # the engine raises whatever a file brings up
         raise _unloadable(robot, error) from error
     finally:
-        builder.set_scene(None)  # a world that has ended is not kept
+        prepared.builder.set_scene(None)  # a world that has ended is not kept
     body.set_solver_position_iterations(world.settings.position_iterations)
     body.set_solver_velocity_iterations(world.settings.velocity_iterations)
     for link in body.links:
         # The engine leaves out, and only logs, what it can make no hull of.
-        count = counts[link.name]
+        count = prepared.counts[link.name]
         if len(link.collision_shapes) != count:
             raise MagicError(
                 Code.BAD_REQUEST,
@@ -303,7 +306,7 @@ def _load(world: World, robot: Description) -> Any:
                 f"all {count}; meshes with a volume",
             )
         for shape in link.collision_shapes:
-            shape.set_collision_groups([1, 1, groups.get(link.name, 0), 0])
+            shape.set_collision_groups([1, 1, prepared.groups.get(link.name, 0), 0])
     return body
 
 
@@ -312,12 +315,24 @@ def _unloadable(robot: Description, error: Exception) -> MagicError:
     return MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", reason, "a URDF that SAPIEN loads")
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """The engine's builder of an arm; for each link the bits of its filter and how many collision shapes it has; of the links that were left out which one
+    carries each, and where on it that is (4, 4)."""
+
+    builder: Any
+    groups: dict[str, int]
+    counts: dict[str, int]
+    bare: dict[str, tuple[str, NDArray[np.float64]]]
+
+
 @lru_cache(maxsize=4)
-def _prepared(robot: Description) -> tuple[Any, dict[str, int], dict[str, int]]:
-    """The engine's builder of the arm, read once, and for each link the bits of its filter and how many collision shapes it has."""
+def _prepared(robot: Description) -> _Prepared:
+    """What is built of an arm, read once."""
     from sapien.wrapper.urdf_loader import URDFLoader
 
     tree = robot.tree()
+    bare = _leave_out_bare(robot, tree)
     for link in tree.iterfind("link"):
         _complete_inertia(robot, link)
     sapien = engine()
@@ -333,7 +348,42 @@ def _prepared(robot: Description) -> tuple[Any, dict[str, int], dict[str, int]]:
             raise _unloadable(robot, error) from error
     if len(builders) != 1 or others:
         raise MagicError(Code.BAD_REQUEST, f"robot {robot.urdf}", f"{len(builders) + len(others)} separate bodies", "one")
-    return builders[0], collision_groups(robot), {link: len(robot.shapes(link)) for link in robot.links}
+    return _Prepared(builders[0], collision_groups(robot), {link: len(robot.shapes(link)) for link in robot.links}, bare)
+
+
+def _leave_out_bare(robot: Description, tree: ET.Element) -> dict[str, tuple[str, NDArray[np.float64]]]:
+    """Take links out of a URDF that are no more than names of a place: fixed on another one, with neither mass nor shape.
+
+    The engine solves each link in every part of every step, whether or not a joint moves it.  Those that a moving joint hangs on stay, for parent
+    and child of a joint are never tested for contact, and so does what the fingers hang on.  Returns for each which link carries it, and where on it that is (4, 4).
+    """
+    poses, parents = robot.poses({}), {name: joint.parent for name, joint in robot.joints.items()}
+    above = {joint.child: name for name, joint in robot.joints.items()}
+    joints, links = ({element.get("name", ""): element for element in tree.iterfind(tag)} for tag in ("joint", "link"))
+    bare: dict[str, tuple[str, NDArray[np.float64]]] = {}
+    for link in robot.beyond(robot.base)[1:]:  # nearer ones first
+        below = [name for name, parent in parents.items() if parent == link]
+        moves = any(joints[name].get("type") != "fixed" for name in (above[link], *below))
+        if moves or robot.masses.get(link, (0.0,))[0] > 0 or robot.shapes(link):
+            continue
+        carrier = parents[above[link]]
+        bare[link] = carrier, transforms.inverse(poses[carrier]) @ poses[link]
+        for name in below:
+            parents[name] = carrier
+            _hang(joints[name], carrier, bare[link][1] @ robot.joints[name].parent_from_joint)
+        del parents[above[link]]
+        tree.remove(joints[above[link]])
+        tree.remove(links[link])
+    return bare
+
+
+def _hang(joint: ET.Element, parent: str, parent_from_joint: NDArray[np.float64]) -> None:
+    """Hang a joint of a URDF on another link."""
+    for element in [*joint.iterfind("parent"), *joint.iterfind("origin")]:
+        joint.remove(element)
+    xyz, rpy = parent_from_joint[:3, 3], Rotation.from_matrix(parent_from_joint[:3, :3]).as_euler("xyz")
+    ET.SubElement(joint, "parent", {"link": parent})
+    ET.SubElement(joint, "origin", {name: " ".join(map(repr, values.tolist())) for name, values in (("xyz", xyz), ("rpy", rpy))})
 
 
 def _complete_inertia(robot: Description, link: ET.Element) -> None:

@@ -568,20 +568,25 @@ class World:
         """The last step's contacts by the names of their bodies, sorted once a step."""
         if self._sorted_at != self.steps:
             self._sorted_at = self.steps
-            self._sorted = found = {}
-            names, named_at = self._names, self._named_at
+            # By the bodies first, of which there are few: each of the contacts, up to a hundred, is looked up once.
+            by_bodies: dict[tuple[Any, Any], list[Any]] = {}
             for contact in self._system.get_contacts():
-                a, b = contact.bodies
-                first, second = names.get(a), names.get(b)
-                if first is None:
-                    first = named_at.get(a._physx_pointer, "")
-                if second is None:
-                    second = named_at.get(b._physx_pointer, "")
-                if (first, second) in found:
-                    found[first, second].append(contact)
+                first, second = contact.bodies
+                pair = first, second
+                if pair in by_bodies:
+                    by_bodies[pair].append(contact)
                 else:
-                    found[first, second] = [contact]
+                    by_bodies[pair] = [contact]
+            found: dict[tuple[str, str], list[Any]] = {}
+            for (first, second), contacts in by_bodies.items():
+                found.setdefault((self._name_of(first), self._name_of(second)), []).extend(contacts)
+            self._sorted = found
         return self._sorted
+
+    def _name_of(self, component: Any) -> str:
+        """The name under which contacts of a component are found; "" where it has none."""
+        name = self._names.get(component)
+        return self._named_at.get(component._physx_pointer, "") if name is None else name
 
 
 class Probe:

@@ -327,14 +327,20 @@ class _Elsewhere:
             self.fill(end)
 
     def fill(self, end: int) -> None:
-        """Give out what can be: one more than there are processes, so that none waits for this one to look round."""
-        while self._pool is not None and self._packed is not None and self.following < end and len(self._waiting) <= self._workers:
+        """Give out what can be: one more than there are processes, so that none waits for this one to look round, but not the last one that is
+        left: this process would wait for it, while another is still at what it was given before."""
+        while self._pool is not None and self._packed is not None and len(self._waiting) < self._most(end):
             try:
                 self._waiting[self.following] = self._pool.submit(_elsewhere, self._packed, self.following)
             except RuntimeError:  # a process was killed, or the pool is closed: this one does it all
                 self._pool = None
                 return
             self.following += 1
+
+    def _most(self, end: int) -> int:
+        """How many may be given out, with what is."""
+        left = end - self.following
+        return self._workers + (left > 1) if left > 0 else 0
 
     def done(self) -> dict[int, Outcome | None]:
         """What has been computed since this was last asked; ``None`` for what was lost with its process."""

@@ -19,7 +19,7 @@ pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.robot import Description
+from magic_core.robot import Description, RobotConfig
 from magic_core.testing import six_axis
 from magic_planner.arm import ArmPlanner
 from magic_planner.budget import Budget
@@ -29,7 +29,7 @@ from magic_planner.robot import Robot
 from magic_verifier import verification
 from magic_verifier.articulation import ArmOptions, Articulation, collision_groups
 from magic_verifier.film import film_strip
-from magic_verifier.simulation import Settings, World
+from magic_verifier.simulation import Settings, World, from_pose
 from magic_verifier.verification import Proposal, verify_proposal
 
 #: One gain for all joints: neither of these arms has the Panda's seven.
@@ -148,6 +148,24 @@ def test_what_a_urdf_leaves_out_of_masses_is_filled_in(config, pull, tmp_path, w
     np.testing.assert_allclose(np.sort(shoulder.inertia), np.sort(shoulder.mass * ((size**2).sum() - size**2) / 12), rtol=1e-3)
     scene, plan = pull
     assert verify_proposal(Proposal(*scene, plan, arm_options=GAINS, robot=robot), repetitions=1).success
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "baxter"])
+def test_links_that_only_name_a_place_are_not_solved_and_none_is_elsewhere_for_it(name, tmp_path):
+    robot = Description({"panda": RobotConfig, "ur5": lambda: robots.ur5_with_franka_hand(tmp_path), "baxter": robots.baxter}[name]())
+    arm = Articulation(World(Settings()), robot, GAINS)
+    q = np.array(robot.config.home) + 0.1
+    arm.place(q)
+    np.testing.assert_allclose(arm.tcp(), robot.forward(q)[0], atol=1e-5)
+    poses = robot.poses(robot.arm_positions(np.append(q, robot.opened)))
+    there = {link.name: from_pose(link.entity_pose) for link in arm.body.links}
+    for link, pose in there.items():
+        np.testing.assert_allclose(pose, poses[link], atol=1e-5)
+    gone = set(robot.links) - set(there)
+    assert (
+        gone >= {"panda": {"panda_link8", "panda_hand_tcp"}, "ur5": {"panda_hand_tcp"}, "baxter": set()}[name]
+    )  # each of Baxter's has a mass
+    assert not any(robot.shapes(link) or robot.masses.get(link, (0.0,))[0] > 0 for link in gone)
 
 
 @pytest.mark.parametrize("content", ["", "solid nothing\nendsolid nothing\n", "garbage"])

@@ -66,8 +66,8 @@ def test_others_begin_beside_the_scene_as_given_and_end_with_it():
     pool = Backwards()
     verdict = verdict_of(scenes.hooking("bar"), pool=pool, workers=2)
     assert verdict.failures == ("1 of 1: the tool lost the target",)
-    # One more than there are processes was given out, and taken back: none of it is done.
-    assert len(pool.given) == 3 and all(future.cancelled() for future, _ in pool.given)
+    # Of the three that it takes at least one was given to each of the processes, and taken back: none of it is done.
+    assert len(pool.given) == 2 and all(future.cancelled() for future, _ in pool.given)
 
 
 def test_steps_are_longer_where_the_tool_is_slow():
@@ -143,6 +143,40 @@ class Backwards(Executor):
 
         self.given.append((future, call))
         return future
+
+
+class Keeping(Executor):
+    """Is at what it is given until it is told to be done with the first of it."""
+
+    def __init__(self):
+        self.given = []
+
+    def submit(self, work, /, *args, **options):
+        self.given.append(Future())
+        return self.given[-1]
+
+    def finish(self):
+        self.given.pop(0).set_result(None)
+
+
+def test_the_last_that_is_left_is_not_given_to_who_is_still_at_work(monkeypatch):
+    """This process would wait for it, from then on with nothing to do."""
+    monkeypatch.setattr(verification._Packed, "of", classmethod(lambda cls, _task: cls(b"")))
+    pool = Keeping()
+    elsewhere = verification._Elsewhere(pool, 1)
+    elsewhere.begin(None, 4)
+    assert len(pool.given) == 2 and elsewhere.following == 3
+    pool.finish()
+    elsewhere.done()
+    elsewhere.fill(4)
+    assert len(pool.given) == 1 and elsewhere.following == 3
+    elsewhere.fill(5)  # there is one more
+    assert len(pool.given) == 2 and elsewhere.following == 4
+    pool.finish()
+    pool.finish()
+    elsewhere.done()
+    elsewhere.fill(5)
+    assert len(pool.given) == 1 and elsewhere.following == 5
 
 
 class Killed(Executor):
