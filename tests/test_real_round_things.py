@@ -1,13 +1,14 @@
-"""Real captures of mugs, bowls and cans: handles open, bowls whole, lids closed, no hole that is not there."""
+"""Real captures of mugs, bowls and cans: the table they stand on, handles open, bowls whole, lids closed, no hole that is not there."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from magic_core import images
+from magic_core import images, transforms
 from magic_core.camera import RgbdFrame
 from magic_core.views import find_view, holes_of
+from magic_perception.looks import find_table
 from magic_perception.parameters import Parameters
 from magic_perception.pipeline import Report, perceive
 from magic_perception.table import camera_over_table
@@ -54,3 +55,21 @@ def test_round_things_of_a_capture(capture):
         # A body alone has no hole from anywhere, a handle makes one loop.
         assert item.mesh.to_trimesh().euler_number == (0 if hole else 2)
         assert 1000 * np.max(item.mesh.extents) == pytest.approx(max(width, 1000 * item.mesh.extents[2]), abs=10)
+
+
+@pytest.mark.parametrize("turn", np.radians([0, 60, 120, 200, 290]))
+def test_the_table_of_a_capture_is_found_whichever_way_the_world_is_turned(turn):
+    # A narrow table, half a metre above a floor that fills more of the picture.
+    folder = CAPTURES / "mugs"
+    picture = images.read_rgbd(
+        folder / "cluttered_6_color.png", folder / "cluttered_6_depth_mm.png", str(folder / "intrinsics.json:cluttered_6"), "mm"
+    )
+    points = picture.intrinsics.unproject(picture.depth)
+    for step in (1, 3):
+        pose = camera_over_table(points[::step, ::step])
+        foot = transforms.apply(pose, points[300:330, 420:470].reshape(-1, 3))
+        assert np.nanmedian(foot[:, 2]) == pytest.approx(0.0, abs=0.01), "the table's own pixels"
+        turned = transforms.from_rpy(0, 0, turn) @ pose
+        frame = RgbdFrame(picture.color, picture.depth, picture.intrinsics, turned, "camera")
+        table = find_table([frame], Parameters(region_low=(-3, -3, -0.05), region_high=(3, 3, 0.6)))[0]
+        assert table.heights(turned[:3, 3]) == pytest.approx(pose[2, 3], abs=0.01)

@@ -13,7 +13,7 @@ from magic_core.camera import RgbdFrame
 from magic_core.errors import MagicError
 from magic_perception.parameters import Parameters
 from magic_perception.pixels import where
-from magic_perception.table import Plane, fit_plane, supports
+from magic_perception.table import ALIKE, Plane, fit_plane, supports
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,11 @@ def find_table(frames: list[RgbdFrame], parameters: Parameters, notes: list[str]
     centre = np.median(everything[np.abs(both.heights(everything)) < 0.02], axis=0)
     if notes is not None:
         for other in found[1:]:
-            if other.things:
+            if other.things >= 0.5:
                 above = 1000 * float(-other.plane.heights(centre))
                 notes.append(
-                    f"{other.things} things stand on a level {abs(above):.0f} mm {'above' if above > 0 else 'below'} the one taken for the table, "
-                    f"on which {found[0].things} do" + (": ambiguous" if other.things >= found[0].things else "")
+                    f"{other.things:.0f} things stand on a level {abs(above):.0f} mm {'above' if above > 0 else 'below'} the one taken for the table, "
+                    f"on which {found[0].things:.0f} do" + (": ambiguous" if other.things >= found[0].things - ALIKE else "")
                 )
         if not low[2] <= centre[2] <= max(-low[2], 0.0):
             notes.append(

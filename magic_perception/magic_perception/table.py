@@ -97,30 +97,37 @@ def fit_plane(
 
 #: Of a support that lies on another (a tray, a board, a mat): its largest height, its least edge and its least area, m and m^2.
 RAISED, EDGE, AREA = 0.045, 0.16, 0.04
+#: Least edge and area of a table that stands high above another level, m and m^2.
+WIDE = (0.28, 0.12)
+
+
+#: Two levels have the same claim where the things on them differ by no more than this.
+ALIKE = 0.3
 
 
 @dataclass(frozen=True)
 class Support:
-    """A plane that may be the table: how many things stand on it, and the share of the points that lie on it."""
+    """A plane that may be the table: how many things stand on it (:func:`standing`), and the share of the points that lie on it."""
 
     plane: Plane
-    things: int
+    things: float
     share: float
 
 
 def standing(
     heights: NDArray[np.floating], xy: NDArray[np.floating], level: float, band: float = 0.008, cell: float = 0.01
-) -> tuple[int, float]:
+) -> tuple[float, float]:
     """How many things stand on a level, and its area in m^2.
 
     heights (N,) and xy (N, 2) metres in a frame with z up.  A thing is a connected region of at most half a metre that rises from the
-    level by more than 12 mm, and around which at least six tenths of what is seen is the level.
+    level by more than 12 mm, and around which at least six tenths of what is seen is the level.  It counts by the share of its outline at which the level
+    is seen: specks of noise on a floor far below have gaps around them.
     """
     low = xy.min(axis=0) - 4 * cell
     index = np.floor((xy - low) / cell).astype(int)
     size = index.max(axis=0) + 5
     if size.max() > 1000:
-        return 0, 0.0
+        return 0.0, 0.0
     flat = index[:, 0] * size[1] + index[:, 1]
     top = np.full(int(size.prod()), -np.inf)
     np.maximum.at(top, flat, heights)
@@ -130,7 +137,7 @@ def standing(
     above = (top >= level + 0.012).astype(np.uint8)
     above = cv2.morphologyEx(above, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     n, labels, stats, _ = cv2.connectedComponentsWithStats(above, connectivity=8)
-    things = 0
+    things = 0.0
     for i in range(1, n):
         x, y, w, h, area = stats[i]
         if area < 4 or max(w, h) * cell > 0.5:
@@ -139,14 +146,16 @@ def standing(
         mine = (labels[cut] == i).astype(np.uint8)
         ring = (cv2.dilate(mine, np.ones((5, 5), np.uint8)) > 0) & (mine == 0)
         known = ring & np.isfinite(top[cut])
-        things += int(known.sum() >= 0.25 * ring.sum() and on[cut][known].mean() >= 0.6)
+        around = np.count_nonzero(on[cut] & known)
+        if known.sum() >= 0.25 * ring.sum() and around >= 0.6 * known.sum():
+            things += around / np.count_nonzero(ring)
     return things, float(on.sum()) * cell * cell
 
 
 def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> list[Support]:
     """The level ``plane`` and those parallel to it that hold many points (N, 3), the likeliest table first.
 
-    The table is the level that most things stand on; of equals the one that more points lie on.  A level a little above another
+    The table is the level that most things stand on; of levels with the same claim (:data:`ALIKE`) the one that more points lie on.  A level a little above another
     counts where it is as wide as a tray, a board or a mat; one high above another where it is as wide as a table: the top
     of a box is none, though things may stand on it.
     """
@@ -171,16 +180,30 @@ def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> 
         things, area = standing(heights, xy, level, band)
         share = float(near.mean())
         if level != 0.0:
-            size = np.sort(np.subtract(*np.percentile(xy[near], [95, 5], axis=0)))
+            narrow = _narrowest(xy[near])
             below = [other for other in levels if other < level - 2 * band]
-            tray = any(level - other <= RAISED for other in below) and size[0] >= EDGE and area >= AREA
-            wide = size[0] >= 0.35 and area >= 0.12
+            tray = any(level - other <= RAISED for other in below) and narrow >= EDGE and area >= AREA
+            wide = narrow >= WIDE[0] and area >= WIDE[1]
             if below and not (tray or wide):
                 continue
         coefficients = plane.coefficients.copy()
         coefficients[3] -= level
         found.append(Support(Plane(coefficients, share), things, share))
-    return sorted(found, key=lambda s: (s.things, s.share), reverse=True)
+    return _ranked(found)
+
+
+def _narrowest(xy: NDArray[np.floating]) -> float:
+    """The shorter of the extents of points (N, 2) along their principal axes, a twentieth left out at each end."""
+    local = xy - xy.mean(axis=0)
+    axes = np.linalg.eigh(local.T @ local)[1]
+    return float(np.subtract(*np.percentile(local @ axes, [95, 5], axis=0)).min())
+
+
+def _ranked(found: list[Support]) -> list[Support]:
+    """The likeliest table first, then by how many things stand on them."""
+    most = max(support.things for support in found)
+    best = max((support for support in found if support.things >= most - ALIKE), key=lambda support: support.share)
+    return [best, *sorted((s for s in found if s is not best), key=lambda s: (s.things, s.share), reverse=True)]
 
 
 def world_from_plane(plane: Plane) -> NDArray[np.float64]:
@@ -193,6 +216,8 @@ def world_from_plane(plane: Plane) -> NDArray[np.float64]:
 
 #: Cosine between a plane's normal and the picture's down beyond which the plane is upright: a wall, seen by a camera that looks down by 15 degrees.
 UPRIGHT = 0.26
+#: Points that tell the planes of a picture apart.
+ENOUGH = 20000
 
 
 def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 0, notes: list[str] | None = None) -> Plane:
@@ -203,7 +228,12 @@ def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 
     most things stand on is the table.
     ``notes`` gets a sentence where another plane has the same claim.  Raises ``NO_TABLE``; ``TABLE_AMBIGUOUS`` where all planes are upright.
     """
-    points = np.asarray(points, dtype=float).reshape(-1, 3)
+    points = np.asarray(points, dtype=float)
+    if points.ndim == 3:
+        # Of denser points the noise of a far floor makes more specks that stand on it.
+        step = max(1, round(np.sqrt(points[..., 0].size / ENOUGH)))
+        points = points[::step, ::step]
+    points = points.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     first = fit_plane(points, band=band, seed=seed)
     rest, planes = points, [first]
@@ -231,10 +261,10 @@ def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 
         )
     found: list[Support] = []
     for plane in level:
-        # Parallel ones are levels of one family: each family is judged once.
-        if not any(plane.normal @ other.plane.normal > 0.98 and _listed(plane, found, band) for other in found):
-            found += supports(points, plane, band)
-    found.sort(key=lambda s: (s.things, s.share), reverse=True)
+        # Levels of planes that are nearly parallel are one family's: each level is judged once, by the plane that most points agree with.
+        if not _listed(plane, found, band):
+            found += [support for support in supports(points, plane, band) if not _listed(support.plane, found, band)]
+    found = _ranked(found)
     best = found[0]
     plane = best.plane
     near = points[np.abs(plane.heights(points)) < 2 * band]
@@ -248,16 +278,19 @@ def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 
         if all(plane is not first for plane in level):
             notes.append(f"the largest plane ({first.inliers:.0%} of the depth) is upright in the picture: not the table")
         for other in found[1:]:
-            if other.things >= best.things > 0 and other.share > 0.1:
+            if best.things > 0 and other.things >= best.things - ALIKE and other.share > 0.1:
                 notes.append(
-                    f"table ambiguous: as many things ({other.things}) stand on a plane {_between(plane, other.plane)}; "
+                    f"table ambiguous: as many things ({other.things:.0f}) stand on a plane {_between(plane, other.plane)}; "
                     f"taken was the one with {best.share:.0%} of the depth, not {other.share:.0%}"
                 )
     return plane
 
 
 def _listed(plane: Plane, found: list[Support], band: float) -> bool:
-    return any(abs(plane.coefficients[3] - other.plane.coefficients[3]) < 2 * band for other in found)
+    """Whether a plane is one of those found, or hardly inclined to one and at its height."""
+    return any(
+        plane.normal @ other.plane.normal > 0.98 and abs(plane.coefficients[3] - other.plane.coefficients[3]) < 2 * band for other in found
+    )
 
 
 def _between(one: Plane, other: Plane) -> str:

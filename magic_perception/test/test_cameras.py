@@ -22,7 +22,7 @@ from magic_perception.pipeline import Report, perceive
 from magic_perception.seen import joined
 from magic_perception.solids import hangs_together
 from magic_perception.surface_error import distance
-from magic_perception.table import camera_over_table, table_in_view
+from magic_perception.table import Plane, camera_over_table, supports, table_in_view
 
 REGION = Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5))
 
@@ -161,6 +161,37 @@ def test_things_on_a_tray_stand_on_the_tray(thickness):
         found = min(scene.objects, key=lambda o: np.linalg.norm(o.world_from_object[:3, 3] - mesh.bounds.mean(axis=0)))
         assert found.mesh.transformed(found.world_from_object).bounds[0, 2] == pytest.approx(thickness, abs=0.003)
         np.testing.assert_allclose(np.sort(found.box_extents)[-1], np.sort(mesh.extents)[-1], rtol=0.25)
+
+
+def patch(random, low, high, z, step):
+    """Points (N, 3) of a level rectangle from low to high (x, y), with 1 mm of noise."""
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in zip(low, high, strict=True))), axis=-1).reshape(-1, 2)
+    return np.column_stack([grid, random.normal(z, 0.001, len(grid))])
+
+
+def over_floor(turn):
+    """Points (N, 3) of a table of 0.32 by 0.80 m with two boxes on it, half a metre above a floor that shows more of itself, and on which four
+    specks of noise lie, each seen from one side only; all turned about the vertical."""
+    random = np.random.default_rng(0)
+    made = partial(patch, random)
+    top, floor, rest = made((-0.16, -0.40), (0.16, 0.40), 0.5, 0.006), made((0.3, -0.8), (1.3, 0.8), 0.0, 0.009), []
+    for x, y in ((-0.05, -0.2), (0.03, 0.22)):
+        top = top[np.abs(top[:, :2] - (x, y)).max(axis=1) > 0.04]
+        rest.append(made((x - 0.04, y - 0.04), (x + 0.04, y + 0.04), 0.57, 0.006))
+    for x, y in ((0.5, -0.6), (0.7, 0.0), (0.9, 0.5), (1.1, -0.3)):
+        away = floor[:, :2] - (x, y)
+        floor = floor[(np.abs(away).max(axis=1) > 0.05) | (away[:, 0] > 0.02)]
+        rest.append(made((x - 0.015, y - 0.015), (x + 0.015, y + 0.015), 0.03, 0.006))
+    return transforms.apply(transforms.from_rpy(0, 0, turn), np.concatenate([top, floor, *rest]))
+
+
+@pytest.mark.parametrize("turn", np.radians([0, 20, 45, 70, 90]))
+def test_a_narrow_table_is_told_from_the_floor_below_it_whichever_way_it_stands(turn):
+    found = supports(over_floor(turn), Plane(np.array([0.0, 0.0, 1.0, 0.0])))
+    assert -found[0].plane.coefficients[3] == pytest.approx(0.5, abs=0.003)
+    assert found[0].things == pytest.approx(2, abs=0.1)
+    floor = next(support for support in found if abs(support.plane.coefficients[3]) < 0.003)
+    assert floor.share > 1.5 * found[0].share and 0.5 < floor.things < 1.6
 
 
 def wall_scene(elevation, wall):
