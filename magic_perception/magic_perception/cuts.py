@@ -24,6 +24,7 @@ from magic_core import transforms
 from magic_perception import clusters, logistic
 from magic_perception.clustered import Clusters
 from magic_perception.looks import Looked
+from magic_perception.percentiles import percentile
 
 #: What is measured at an upright plane between two sides of a cluster, and what it means.
 CRITERIA = {
@@ -174,7 +175,7 @@ def measured(seen: Seen, plane: Plane) -> NDArray[np.float64] | None:
     if min(box[0] for box in boxes) < NARROW:
         return None
     inside = [_inside(seen.place, _hull(place)) for place in clear]
-    tops = [max(float(np.percentile(points.height[side], 95)), 1e-3) for side in sides]
+    tops = [max(percentile(points.height[side], 95), 1e-3) for side in sides]
     off = np.abs(plane.distance(seen.place)) > UNSURE
     beside = off & ~inside[0] & ~inside[1]
     solid = np.any([within & (seen.level[:, None] <= top) for within, top in zip(inside, tops, strict=True)], axis=0)
@@ -206,7 +207,7 @@ def _extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
     """Breadth and length (2,) of most of the places (N, 2), m: a handle stays slim with a bit of its head beside it."""
     local = place - place.mean(axis=0)
     axes = np.linalg.eigh(local.T @ local)[1]
-    return np.subtract(*np.percentile(local @ axes, [95, 5], axis=0)) / 0.9
+    return np.array([percentile(along, 95) - percentile(along, 5) for along in (local @ axes).T]) / 0.9
 
 
 def _hull(place: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -240,7 +241,8 @@ def best(seen: Seen, judge: Judge) -> Plane | None:
 def points_of(looks: list[Looked], found: Clusters) -> Points:
     """All points of the clusters (N,)."""
     height = np.concatenate([look.heights[where] for look, where in zip(looks, found.spots, strict=True)])
-    lab = np.concatenate([cv2.cvtColor(look.frame.color, cv2.COLOR_RGB2LAB)[where] for look, where in zip(looks, found.spots, strict=True)])
+    color = np.concatenate([look.frame.color[where] for look, where in zip(looks, found.spots, strict=True)])
+    lab = cv2.cvtColor(color[:, None], cv2.COLOR_RGB2LAB)[:, 0] if len(color) else color
     return Points(found.cloud[:, :2].astype(float), height.astype(float), lab.astype(float))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import cuts, logistic, neighbours
-from magic_perception.clustered import clustered
+from magic_perception.clustered import clustered, surfaces
 from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import Parameters
 from magic_perception.piles import Pile, pile
@@ -56,7 +56,7 @@ def clusters_of(made: Pile, parameters: Parameters, scene: int, kind: str) -> li
     """The clusters of a scene that have planes."""
     looks = looked_at(made, parameters)
     found = clustered(looks, (), parameters)
-    instance = uncut(looks, found, learned(), parameters)
+    instance = uncut(looks, found, surfaces(looks, found), learned(), parameters)
     points, bared = cuts.points_of(looks, found), cuts.bare(looks, found)
     truth = np.concatenate([image[where] for image, where in zip(made.truth, found.spots, strict=True)])
     result = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -30,7 +30,7 @@ from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.room import bordered, room
 from magic_perception.seen import cut_off, joined, witnessed
 from magic_perception.segmentation import DepthSegmenter, Segmenter
-from magic_perception.shared_out import shared_out
+from magic_perception.shared_out import Shared, shared_out
 from magic_perception.sight import agreement
 from magic_perception.smear import before, behind
 from magic_perception.solids import hangs_together, hull_of
@@ -145,23 +145,29 @@ def perceive(
                 views = labelled(looks)
             report.earlier = list(zip(earlier, used[now:], strict=True))
 
-    with report.stage("cameras"):
-        report.cameras = _disagreements(views, used, parameters.seed)
-        worst = _worst(report.cameras)
-        report.notes += _about_poses(report.cameras, views)
-        apart = _apart(worst, views)
-        if views.corrects and worst is not None and worst.certain and worst.motion.any():
-            views = labelled(_brought_together(views, worst))
-        report.notes += _about_glass(views)
+    with ExitStack() as stack:
+        with report.stage("cameras"):
+            building = stack.enter_context(_building(views, parameters, workers))
+            report.cameras = _disagreements(views, used, parameters.seed)
+            worst = _worst(report.cameras)
+            report.notes += _about_poses(report.cameras, views)
+            apart = _apart(worst, views)
+            if views.corrects and worst is not None and worst.certain and worst.motion.any():
+                stack.close()  # what others have begun is of cameras that have moved since
+                views = labelled(_brought_together(views, worst))
+                building = stack.enter_context(_building(views, parameters, workers))
+            report.notes += _about_glass(views)
 
-    with report.stage("meshes"):
-        solids, refused = _solids(views, apart, parameters, workers)
-        report.notes += [f"cluster {label} left out: {error.message}" for label, error in refused.items()]
-        ids = {built.label: f"object_{number}" for number, built in enumerate(solids, 1)}
-        report.numbers = {name: label for label, name in ids.items()}
-        told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[:now])
-        report.labels = [next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)]
-        hidden = [_hidden(built, solids, views) for built in solids]
+        with report.stage("meshes"):
+            solids, refused = _solids(building, views, apart)
+            report.notes += [f"cluster {label} left out: {error.message}" for label, error in refused.items()]
+            ids = {built.label: f"object_{number}" for number, built in enumerate(solids, 1)}
+            report.numbers = {name: label for label, name in ids.items()}
+            told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[:now])
+            report.labels = [
+                next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)
+            ]
+            hidden = shared_out(_hidden, (solids, views), range(len(solids)), [len(built.points) for built in solids], workers)
 
     with report.stage("views"):
         objects = []
@@ -411,16 +417,25 @@ class _Built:
         return attached.shade(self.colors)
 
 
-def _solids(views: _Views, apart: float, parameters: Parameters, workers: Workers | None) -> tuple[list[_Built], dict[int, MagicError]]:
-    """The things that are built, in the order of their labels, and why others are not; apart: how far the cameras disagree, m."""
+def _building(
+    views: _Views, parameters: Parameters, workers: Workers | None
+) -> Shared[tuple[_Views, Parameters], int, _Built | MagicError]:
+    """The things that are to be built, which other processes begin with."""
     pixels = np.sum([np.bincount(image[image > 0], minlength=len(views.numbers) + 1) for image in views.labels], axis=0)
-    costs = [int(pixels[label]) for label in views.numbers]
-    found = dict(zip(views.numbers, shared_out(_attempt, (views, apart, parameters), views.numbers, costs, workers), strict=True))
+    return Shared(_attempt, (views, parameters), views.numbers, [int(pixels[label]) for label in views.numbers], workers)
+
+
+def _solids(
+    building: Shared[tuple[_Views, Parameters], int, _Built | MagicError], views: _Views, apart: float
+) -> tuple[list[_Built], dict[int, MagicError]]:
+    """The things that are built, in the order of their labels, and why others are not; apart: how far the cameras disagree, m."""
+    found = dict(zip(views.numbers, building.done(), strict=True))
     refused = {label: built for label, built in found.items() if isinstance(built, MagicError)}
-    return [built for built in found.values() if not isinstance(built, MagicError)], refused
+    solids = [built for built in found.values() if not isinstance(built, MagicError)]
+    return [replace(built, evidence=replace(built.evidence, apart=apart)) for built in solids], refused
 
 
-def _attempt(given: tuple[_Views, float, Parameters], label: int) -> _Built | MagicError:
+def _attempt(given: tuple[_Views, Parameters], label: int) -> _Built | MagicError:
     """The thing with that label, or why it cannot be built."""
     try:
         return _build(label, *given)
@@ -428,8 +443,8 @@ def _attempt(given: tuple[_Views, float, Parameters], label: int) -> _Built | Ma
         return error
 
 
-def _build(label: int, views: _Views, apart: float, parameters: Parameters) -> _Built:
-    """The solid of the thing with that label, and what speaks for it; apart: how far the cameras disagree, m.  Raises ``RECONSTRUCTION_FAILED``,
+def _build(label: int, views: _Views, parameters: Parameters) -> _Built:
+    """The solid of the thing with that label, and what speaks for it but how far the cameras disagree, which is measured meanwhile.  Raises ``RECONSTRUCTION_FAILED``,
     and ``OBJECT_CUT_OFF`` for a wall, a monitor, a person: no thing on the table."""
     looks, labels, now, hanging = views.looks, views.labels, views.now, label in views.hanging
     seen = _seen(label, views, parameters)
@@ -453,7 +468,7 @@ def _build(label: int, views: _Views, apart: float, parameters: Parameters) -> _
         witnessed=witnessed(solid.mesh, seen.sights),
         extents=solid.mesh.extents,
         cameras=_places(seen.sights),
-        apart=apart,
+        apart=np.nan,
         cut=cut,
         joined=joined(looks, labels, label),
     )
@@ -503,13 +518,15 @@ def _seen(label: int, views: _Views, parameters: Parameters) -> _Seen:
     return _Seen(sights, points[keep], colors[keep], counts)
 
 
-def _hidden(built: _Built, solids: list[_Built], views: _Views) -> list[int | str]:
-    """What keeps a part of a thing out of sight, once it is known where other things are: that something ends its outline in a picture does not say so, and that nothing
-    does does not say that there is none, as of what is thin.
+def _hidden(given: tuple[list[_Built], _Views], number: int) -> list[int | str]:
+    """What keeps a part of one of the things out of sight, once it is known where the others are: that something ends its outline in a picture does not say so, and
+    that nothing does does not say that there is none, as of what is thin.
 
     It may go on behind others where no camera looks: so far that it matters, or not.  What may be the rest of it, of its colour and beside it, leaves it cut off, and
     so do parts that nothing joins.  What it goes on as, of its colour and height where they touch, cuts it off.
     """
+    solids, views = given
+    built = solids[number]
     world_from_table = views.world_from_table
     rest = [other for other in solids if other is not built and _goes_on(built, other, world_from_table[:3, 2])]
     cut = list(dict.fromkeys([*built.evidence.cut, *(other.label for other in rest)]))

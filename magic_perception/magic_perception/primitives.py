@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.mesh import Mesh
+from magic_perception.percentiles import percentile
 from magic_perception.solids import Reconstruction
 
 
@@ -43,7 +44,7 @@ def fit_circle(points: NDArray[np.float64], rounds: int = 4, band: float | None 
         centre = mean + offset
         radius = float(np.sqrt(squared.mean() + offset @ offset))
         residual = np.abs(np.hypot(*(points - centre).T) - radius)
-        kept = points[residual <= max(np.percentile(residual, 80), 1e-4 if band is None else band)]
+        kept = points[residual <= max(percentile(residual, 80), 1e-4 if band is None else band)]
     return centre, radius
 
 
@@ -94,7 +95,7 @@ def fit_sphere(points: NDArray[np.float64]) -> Sphere | None:
         centre = mean + solution[:3]
         radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 0)))
         residual = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
-        kept = points[residual <= np.percentile(residual, 85)]
+        kept = points[residual <= percentile(residual, 85)]
     return Sphere(centre, radius, float(np.percentile(residual, 90)))
 
 

@@ -94,8 +94,10 @@ def room(
         farthest, away = _reach(field.reshape(shape), points, mesh, cell)
         return farthest, away[possible]
 
-    around, _ = reach(hidden)
-    behind, away = reach(hidden & ~np.any(seen == label, axis=0))
+    around, away = reach(hidden)
+    behind = 0.0
+    if around > 0:
+        behind, away = reach(hidden & ~np.any(seen == label, axis=0))
     by: set[int] = set()
     for there in seen if behind > far else ():
         before = there[away > far]
@@ -125,14 +127,18 @@ def _reach(open_: NDArray[np.bool_], points: NDArray[np.float64], mesh: Mesh, ce
     from scipy import ndimage
 
     away = np.zeros(len(points), np.float32)
-    if not open_.any():
+    where = np.nonzero(open_)
+    if len(where[0]) < WIDE**2:
         return 0.0, away
-    wide = ndimage.binary_opening(np.pad(open_, ((0, 0), (0, 0), (WIDE, 0)), mode="edge"), np.ones((WIDE,) * 3))[..., WIDE:]
+    # Few cells are open, and those below the lowest are as these.
+    cut = (*(slice(int(along.min()), int(along.max()) + 1) for along in where[:2]), slice(0, int(where[2].max()) + 1))
+    wide = ndimage.binary_opening(np.pad(open_[cut], ((0, 0), (0, 0), (WIDE, 0)), mode="edge"), np.ones((WIDE,) * 3))[..., WIDE:]
     pieces, count = ndimage.label(wide, np.ones((3, 3, 3)))
     if count == 0:
         return 0.0, away
-    index = np.nonzero(pieces.ravel())[0]
-    piece, distance = pieces.ravel()[index], _distances(mesh, points[index])
+    cells = np.arange(len(points)).reshape(open_.shape)[cut]
+    index, piece = cells[wide], pieces[wide]
+    distance = _distances(mesh, points[index])
     nearest = ndimage.minimum(distance, piece, np.arange(1, count + 1))
     reached = np.concatenate([[False], nearest < 2.5 * cell])[piece]
     away[index[reached]] = np.maximum(distance[reached], 0)

@@ -16,7 +16,7 @@ from magic_core.mesh import Mesh
 from magic_core.workers import Workers
 from magic_perception import attached, between, convexity, cuts
 from magic_perception.behind_one import behind_one
-from magic_perception.clustered import Clusters, clustered, surfaces
+from magic_perception.clustered import Clusters, Surfaces, clustered, surfaces
 from magic_perception.labels import beside, fill, sizeable, with_depth
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
@@ -52,8 +52,9 @@ class DepthSegmenter:
         found = clustered(looks, known, parameters, self._workers)
         instance = found.instance
         if parameters.split:
-            instance = cuts.parted(looks, found, uncut(looks, found, self._judge, parameters), self._cut)
-            instance = _borne(looks, found, instance, self._judge)
+            seen = surfaces(looks, found)
+            instance = cuts.parted(looks, found, uncut(looks, found, seen, self._judge, parameters), self._cut)
+            instance = _borne(looks, found, seen, instance, self._judge)
         labels = []
         start = 0
         for mask, where in zip(found.masks, found.spots, strict=True):
@@ -70,14 +71,13 @@ class DepthSegmenter:
         return [on_surfaces(image, looked) for image, looked in zip(labels, looks, strict=True)]
 
 
-def uncut(looks: list[Looked], found: Clusters, judge: Judge, parameters: Parameters) -> NDArray[np.int64]:
+def uncut(looks: list[Looked], found: Clusters, seen: Surfaces, judge: Judge, parameters: Parameters) -> NDArray[np.int64]:
     """The instances (N,) parted at the seams between things and where the table shows between them, before :mod:`magic_perception.cuts`."""
-    return between.parted(looks, found, _parted(looks, found, judge), parameters.min_pixels)
+    return between.parted(looks, found, _parted(found, seen, judge), parameters.min_pixels)
 
 
-def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.int64]:
+def _parted(found: Clusters, seen: Surfaces, judge: Judge) -> NDArray[np.int64]:
     """The instances (N,) with tall clusters parted at the seams between things."""
-    seen = surfaces(looks, found)
     instance = found.instance.copy()
     following = int(instance.max(initial=-1)) + 1
     for mine in seen.tall:
@@ -88,9 +88,8 @@ def _parted(looks: list[Looked], found: Clusters, judge: Judge) -> NDArray[np.in
     return convexity.insides(found.cloud, seen.normal, instance, seen.heights)
 
 
-def _borne(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
+def _borne(looks: list[Looked], found: Clusters, seen: Surfaces, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
     """The instances (N,) with those parted of which one thing stands on another's level face; what a hand holds over a face does not."""
-    seen = surfaces(looks, found)
     held = np.concatenate(
         [
             np.zeros(len(where[0]), bool) if look.frame.held is None else look.frame.held[where] > 0

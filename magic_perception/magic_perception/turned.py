@@ -14,6 +14,7 @@ from magic_perception import primitives
 from magic_perception.body import Body
 from magic_perception.handles import HOLE, handle_of, standing_off
 from magic_perception.parameters import Parameters
+from magic_perception.percentiles import percentile
 from magic_perception.sight import Sight, carve
 from magic_perception.solids import Reconstruction, hull_of
 
@@ -63,7 +64,7 @@ def round_body(points: NDArray[np.float64], eyes: NDArray[np.float64], height: f
     top = max(top, float(np.percentile(around[:, 2], 97)) if len(around) > 8 else top)
     # A rim is level: what rises far above it in a few directions is a pen that leans on it.
     sector = _sector(around, side.axis)
-    highest = [float(np.percentile(around[sector == k, 2], 97)) for k in range(SECTORS) if np.count_nonzero(sector == k) > 8]
+    highest = [percentile(around[sector == k, 2], 97) for k in range(SECTORS) if np.count_nonzero(sector == k) > 8]
     level = float(np.percentile(highest, 75)) if highest else top
     top = level if top > level + STICKS > 0.8 * top else top
     return Body(side.axis, _profile(side, front, top, band))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from magic_perception.measures import best_ious, mean, measure
+from magic_perception.percentiles import percentile
 
 SIZE = (120, 160)
 
@@ -50,3 +51,12 @@ def test_empty_pictures():
     assert measure(nothing, one).overlap_f == measure(one, nothing).overlap_f == 0
     assert best_ious(nothing, one).tolist() == [0] and best_ious(one, nothing).tolist() == []
     assert mean([measure(one, one), measure(nothing, one)]).detected == 0.5
+
+
+def test_percentiles_are_those_of_numpy_to_the_bit():
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 3, 10, 777):
+        for values in (rng.normal(size=count), np.round(rng.normal(size=count), 1), np.zeros(count)):
+            for share in (0, 3, 50, 80, 85.0, 97, 100):
+                assert percentile(values, share) == np.percentile(values, share)
+                assert percentile(values[::-2], share) == np.percentile(values[::-2], share)

@@ -1,0 +1,17 @@
+"""Percentiles of few numbers, which numpy takes longer to look at than to find."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def percentile(values: NDArray[np.float64], share: float) -> float:
+    """``np.percentile`` of numbers (N,), none of them NaN, to the bit: of some hundred in a fifth of its time."""
+    at = (len(values) - 1) * (share / 100)
+    below = int(at)
+    above = min(below + 1, len(values) - 1)
+    parted = np.partition(values, (below, above))
+    one, two = float(parted[below]), float(parted[above])
+    part = at - below
+    return one + (two - one) * part if part < 0.5 else two - (two - one) * (1 - part)
