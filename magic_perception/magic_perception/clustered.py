@@ -20,11 +20,27 @@ from magic_perception.shared_out import shared_out
 
 
 @dataclass(frozen=True)
+class Bridges:
+    """Straight ways across gaps in depth that colour shows to hang together.
+
+    ends (L, 2): the points on the two sides, by their numbers; place (L, S, 3): world points on the way between them.
+    """
+
+    ends: NDArray[np.int64]
+    place: NDArray[np.float32]
+
+    def among(self, mine: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The ends (K, 2) of those whose ends are both among some points (M,), ascending, by their places in that list."""
+        found = np.minimum(np.searchsorted(mine, self.ends), len(mine) - 1)
+        return found[np.all(mine[found] == self.ends, axis=1)]
+
+
+@dataclass(frozen=True)
 class Clusters:
     """What is above the table, by what hangs together in space.
 
     masks (H, W) for each look, without what is known; fixed (H, W): what is; table (H, W): what has the table's colour.  spots: rows and columns of the mask's pixels with depth in
-    each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1 for noise.
+    each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1 for noise; bridges: between points of the cloud.
     """
 
     masks: list[NDArray[np.bool_]]
@@ -33,6 +49,7 @@ class Clusters:
     spots: list[tuple[NDArray, NDArray]]
     cloud: NDArray[np.float32]
     instance: NDArray[np.int64]
+    bridges: Bridges
 
 
 def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters, workers: Workers | None = None) -> Clusters:
@@ -45,12 +62,13 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
         where(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights)) for mask, looked in zip(masks, looks, strict=True)
     ]
     cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
-    between = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]
+    made = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]
+    between = [bridges.place.reshape(-1, 3) for bridges in made]
     instance = clusters.cluster(np.concatenate([cloud, *between]), parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
     # A cluster of nothing but bridges is none.
-    instance = instance[: len(cloud)]
-    instance[instance >= 0] = np.unique(instance[instance >= 0], return_inverse=True)[1]
-    return Clusters(masks, fixed, list(tables), spots, cloud, instance)
+    bridges = _of_cloud(made, spots, masks)
+    instance = _bridged(instance[: len(cloud)], bridges)
+    return Clusters(masks, fixed, list(tables), spots, cloud, instance, bridges)
 
 
 def _foreground(given: tuple[list[Looked], Parameters], number: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -62,8 +80,8 @@ def _foreground(given: tuple[list[Looked], Parameters], number: int) -> tuple[ND
 STEEP, NOISE = 1.0, 0.004
 
 
-def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> NDArray[np.float32]:
-    """Points (N, 3), world, across the gaps in a mask's depth: what colour shows to be one thing is not two for want of depth.
+def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> Bridges:
+    """Across the gaps in a mask's depth, between pixels of the flattened picture: what colour shows to be one thing is not two for want of depth.
 
     Each pixel without depth goes to the nearest that has it; where two of these regions meet, straight lines join the pixels they go to.
     """
@@ -73,7 +91,7 @@ def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> NDArr
     own, z = mask[cut], looked.frame.depth[cut]
     seen = own & np.isfinite(z)
     if w == 0 or not seen.any():
-        return np.zeros((0, 3), np.float32)
+        return Bridges(np.zeros((0, 2), np.int64), np.zeros((0, samples - 2, 3), np.float32))
     _, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     source = np.zeros(int(index.max()) + 1, np.int64)
     source[index[seen]] = np.flatnonzero(seen)
@@ -90,11 +108,46 @@ def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> NDArr
     z0, z1, apart = z.ravel()[a].astype(float), z.ravel()[b].astype(float), np.hypot(u1 - u0, v1 - v0)
     k = looked.frame.intrinsics
     even = (apart > 2) & (flat[a] == flat[b]) & (np.abs(z1 - z0) < STEEP * apart * np.minimum(z0, z1) / k.fx + NOISE)
-    t = np.linspace(0, 1, samples)[1:-1, None]
-    u, v = (((1 - t) * p[even] + t * q[even]).ravel() for p, q in ((u0, u1), (v0, v1)))
-    middle = (1 / ((1 - t) / z0[even] + t / z1[even])).ravel()
-    local = np.column_stack([(u + cut[1].start - k.cx) / k.fx * middle, (v + cut[0].start - k.cy) / k.fy * middle, middle])
-    return transforms.apply(looked.frame.world_from_camera, local).astype(np.float32)
+    a, b, z0, z1 = a[even], b[even], z0[even, None], z1[even, None]
+    t = np.linspace(0, 1, samples)[1:-1]
+    u, v = (
+        (1 - t) * p[even, None] + t * q[even, None]
+        for p, q in ((u0 + cut[1].start, u1 + cut[1].start), (v0 + cut[0].start, v1 + cut[0].start))
+    )
+    middle = 1 / ((1 - t) / z0 + t / z1)
+    local = np.stack([(u - k.cx) / k.fx * middle, (v - k.cy) / k.fy * middle, middle], axis=-1)
+    place = transforms.apply(looked.frame.world_from_camera, local.reshape(-1, 3)).astype(np.float32).reshape(local.shape)
+    ends = np.column_stack([(v + cut[0].start) * mask.shape[1] + u + cut[1].start for v, u in (np.divmod(i, own.shape[1]) for i in (a, b))])
+    return Bridges(ends, place)
+
+
+def _of_cloud(made: list[Bridges], spots: list[tuple[NDArray, NDArray]], masks: list[NDArray[np.bool_]]) -> Bridges:
+    """The bridges of all looks between points of the cloud, which leaves depth out that is not the thing's own."""
+    found, start = [], 0
+    for bridges, (rows, columns), mask in zip(made, spots, masks, strict=True):
+        number = np.full(mask.size, -1)
+        number[rows * mask.shape[1] + columns] = np.arange(start, start + len(rows))
+        ends = number[bridges.ends]
+        kept = np.all(ends >= 0, axis=1)
+        found.append((ends[kept], bridges.place[kept]))
+        start += len(rows)
+    return Bridges(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _bridged(instance: NDArray[np.int64], bridges: Bridges) -> NDArray[np.int64]:
+    """The clusters (N,), numbered anew, of which those are one that a bridge joins: over a thin bar bridges are too few to be a cluster's core."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = instance[bridges.ends]
+    a, b = pairs[np.all(pairs >= 0, axis=1)].T
+    total = int(instance.max(initial=-1)) + 1
+    owner = (
+        connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(total, total)), directed=False)[1] if total else np.zeros(0, int)
+    )
+    result = np.full(len(instance), -1)
+    result[instance >= 0] = np.unique(owner[instance[instance >= 0]], return_inverse=True)[1]
+    return result
 
 
 #: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.

@@ -37,17 +37,22 @@ def normals(points: NDArray[np.float32], eye: NDArray[np.float64], size: int = 7
     return np.repeat(np.repeat(result, 2, axis=0)[:height], 2, axis=1)[:, :width]
 
 
+#: The edge of a voxel, and how far the middles of two neighbours are from each other at most, m.
+VOXEL, REACH = 0.008, 0.0144
+
+
 def voxels_of(
     points: NDArray[np.floating],
     normal: NDArray[np.floating],
     heights: NDArray[np.floating],
     rgb: NDArray[np.floating],
-    voxel: float = 0.008,
+    across: NDArray[np.floating] | None = None,
 ) -> tuple[seams.Voxels, NDArray[np.int64]] | None:
-    """The voxels of a cluster and the voxel of each point (N,); ``None`` where no two are neighbours.  points, normal, rgb (N, 3), heights (N,), all finite."""
+    """The voxels of a cluster and the voxel of each point (N,); ``None`` where no two are neighbours.  points, normal, rgb (N, 3), heights (N,), all finite;
+    across (L, 2, 3): places on the two sides of gaps in depth: voxels there are neighbours."""
     from scipy.spatial import cKDTree
 
-    centre, index = clusters.thin(points, voxel)
+    centre, index = clusters.thin(points, VOXEL)
     count = np.bincount(index)
 
     def mean_of(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -56,31 +61,68 @@ def voxels_of(
     mean = mean_of(normal)
     length = np.linalg.norm(mean, axis=1)
     mean /= np.maximum(length, 1e-9)[:, None]
-    pairs = cKDTree(centre).query_pairs(1.8 * voxel, output_type="ndarray")
+    pairs = cKDTree(centre).query_pairs(REACH, output_type="ndarray")
     if len(pairs) == 0:
         return None
     a, b = pairs.T
     d = centre[a] - centre[b]
     d /= np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
     opening = np.sum((mean[a] - mean[b]) * d, axis=1)
-    bend = np.degrees(np.arccos(np.clip(np.sum(mean[a] * mean[b], axis=1), -1, 1)))
+    bend = _angle(mean, a, b)
     # A voxel whose normals disagree lies on an edge itself: it tells nothing of convexity.
     clear = (length[a] > 0.8) & (length[b] > 0.8)
+    if across is not None:
+        p, q, turn, told = _over_gaps(centre, mean, across)
+        a, b, opening = (np.concatenate(both) for both in ((a, p), (b, q), (opening, turn)))
+        bend = np.concatenate([bend, _angle(mean, p, q)])
+        clear = np.concatenate([clear, told & (length[p] > 0.8) & (length[q] > 0.8)])
     return seams.Voxels(centre, mean, np.bincount(index, heights) / count, mean_of(rgb), a, b, opening, bend, clear), index
+
+
+def _angle(normal: NDArray[np.float64], a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Degrees (P,) between the normals (V, 3) of pairs of voxels."""
+    return np.degrees(np.arccos(np.clip(np.sum(normal[a] * normal[b], axis=1), -1, 1)))
+
+
+#: How far the next voxel is from the edge of a gap at most, as normals end some pixels before it, m; by so much, m and as a share of the distance, what lies on
+#: one surface may lie before its tangent plane across the gap.
+EDGE, BEFORE, RISE = 0.016, 0.003, 0.1
+
+
+def _over_gaps(
+    centre: NDArray[np.float64], normal: NDArray[np.float64], across: NDArray[np.floating]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Pairs of voxels (a, b) on the two sides of gaps; for each 1 where neither lies before the other's tangent plane, so that the surface may go on from one to
+    the other without bending inward, else -1; and whether that tells anything: where one lies before and the other behind there is a step.
+
+    centre, normal (V, 3); across (L, 2, 3): places on the two sides.
+    """
+    from scipy.spatial import cKDTree
+
+    distance, nearest = cKDTree(centre).query(across)
+    a, b = np.unique(np.sort(nearest[np.all(distance < EDGE, axis=1)], axis=1), axis=0).T
+    way = centre[b] - centre[a]
+    length = np.linalg.norm(way, axis=1)
+    a, b, way, length = (values[length > REACH] for values in (a, b, way, length))
+    slack = BEFORE + RISE * length
+    one, two = np.sum(normal[a] * way, axis=1), -np.sum(normal[b] * way, axis=1)
+    step = (np.maximum(one, two) > slack) & (np.minimum(one, two) < -slack)
+    return a, b, np.where(np.maximum(one, two) < slack, 1.0, -1.0), ~step
 
 
 def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArray[np.int64]:
     """Parts (V,) from 0 of the voxels, cut at every concave seam.
 
-    Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, and where at least half of
-    the voxels next to both agree.  A part of fewer than ``least`` voxels goes to the nearest other.
+    Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, over a gap by as much on each :data:`REACH` of
+    it, and where at least half of the voxels next to both agree.  A part of fewer than ``least`` voxels goes to the nearest other.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     n, a, b = len(voxels.centre), voxels.a, voxels.b
-    convex = ((voxels.opening > 0) | (voxels.bend < angle)) & voxels.clear
+    apart = np.linalg.norm(voxels.centre[a] - voxels.centre[b], axis=1)
+    convex = ((voxels.opening > 0) | (voxels.bend < angle * np.maximum(apart / REACH, 1))) & voxels.clear
     joined = coo_matrix((np.ones(convex.sum()), (a[convex], b[convex])), shape=(n, n)).tocsr()
     joined = joined + joined.T
     near = coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n)).tocsr()
@@ -165,16 +207,17 @@ def parts(
     rgb: NDArray[np.floating],
     judge: seams.Judge,
     cut: Callable[[seams.Voxels], NDArray[np.int64]] = pieces,
+    across: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
     """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table, colours (N, 3), 0..255; ``cut``
-    makes the parts of its voxels of which the judge tells whether they are things."""
+    makes the parts of its voxels of which the judge tells whether they are things; across (L, 2): points on the two sides of gaps in depth."""
     from scipy.spatial import cKDTree
 
     labels = np.zeros(len(points), np.int64)
     sound = np.isfinite(normal[:, 0]) & np.isfinite(heights)
     if sound.sum() < 200:
         return labels
-    made = voxels_of(points[sound], normal[sound], heights[sound], rgb[sound] / 255)
+    made = voxels_of(points[sound], normal[sound], heights[sound], rgb[sound] / 255, None if across is None else points[across])
     if made is None:
         return labels
     voxels, index = made

@@ -8,6 +8,7 @@ things, and single things that another hides in part.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -35,6 +36,8 @@ PRINTED = 0.3
 TABLES = ((186, 152, 112), (205, 190, 175), (120, 118, 115), (235, 235, 232), (70, 60, 52))
 #: Least difference of two colours, in the two colour axes or in lightness (OpenCV's Lab of 8 bits).
 HUE, LIGHTNESS = 20.0, 90.0
+#: What share of things' depth is taken away, and in blobs of how many pixels.
+MISSING, BLOBS = (0.3, 0.5, 0.7), (10, 20, 40, 80)
 #: The middle of the scene, m.
 MIDDLE = (0.52, 0.0)
 
@@ -212,6 +215,18 @@ def stacked(seed: int, number: int) -> Pile:
     upper, lower = _at(upper, random.uniform(-room, room), height), _at(lower, np.zeros(2), 0.0)
     place = transforms.from_rpy(0, 0, random.uniform(-np.pi, np.pi), [*MIDDLE, 0])
     return _seen(random, [mesh.transformed(place) for mesh in (lower, upper)], table, ("left", "right"))
+
+
+def torn(made: Pile, number: int) -> Pile:
+    """A scene of a number with a share of its things' depth missing in each picture, and as much of the rest, in blobs of one size; colour is whole."""
+    share, wide = MISSING[number % len(MISSING)], BLOBS[number // len(MISSING) % len(BLOBS)]
+    frames = []
+    for i, (frame, truth) in enumerate(zip(made.frames, made.truth, strict=True)):
+        # Noise that is smoothed so passes its mean every so many pixels.
+        wander = cv2.GaussianBlur(np.random.default_rng([number, i, 2916]).standard_normal(truth.shape), (0, 0), wide / 4.4)
+        lost = wander < np.quantile(wander[truth > 0], share) if np.any(truth > 0) else np.zeros(truth.shape, bool)
+        frames.append(replace(frame, depth=np.where(lost, np.float32(np.nan), frame.depth)))
+    return replace(made, frames=frames)
 
 
 def _seen(random: np.random.Generator, meshes: list[Mesh], table: tuple[int, int, int], names: tuple[str, ...] | None = None) -> Pile:

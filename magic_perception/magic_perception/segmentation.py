@@ -81,7 +81,9 @@ def _parted(found: Clusters, seen: Surfaces, judge: Judge) -> NDArray[np.int64]:
     instance = found.instance.copy()
     following = int(instance.max(initial=-1)) + 1
     for mine in seen.tall:
-        part = convexity.parts(found.cloud[mine], seen.normal[mine], seen.heights[mine], seen.rgb[mine], judge)
+        part = convexity.parts(
+            found.cloud[mine], seen.normal[mine], seen.heights[mine], seen.rgb[mine], judge, across=found.bridges.among(mine)
+        )
         for number in range(1, int(part.max()) + 1):
             instance[mine[part == number]] = following
             following += 1

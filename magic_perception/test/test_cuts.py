@@ -216,6 +216,16 @@ def test_a_box_on_a_box_is_another():
     assert len(made.meshes) == 2 and learn_cuts.told(made, DepthSegmenter()) == "right"
 
 
+def test_of_a_torn_scene_the_asked_share_of_the_things_depth_is_missing_and_no_colour():
+    whole = neighbours.pair(5, 3)
+    for number, share in enumerate(neighbours.MISSING):
+        made = neighbours.torn(whole, number)
+        for before, after, truth in zip(whole.frames, made.frames, made.truth, strict=True):
+            seen = np.isfinite(before.depth) & (truth > 0)
+            assert np.mean(np.isnan(after.depth[seen])) == pytest.approx(share, abs=0.05)
+            assert np.array_equal(after.color, before.color)
+
+
 def test_three_boxes_are_as_far_from_each_other_as_asked():
     """The gap of a pair is that of the third thing from the nearer of the two."""
     number = next(i for i, (_, gap, *_) in enumerate(neighbours.PAIRS) if gap == 0.010)

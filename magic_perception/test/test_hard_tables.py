@@ -120,16 +120,37 @@ def test_of_what_a_glossy_table_mirrors_and_of_its_glare_nothing_comes():
     check(replace(frame, color=color.astype(np.uint8), depth=depth), truth, least=0.9)
 
 
-@pytest.mark.parametrize("share, least", [(0.3, 9), (0.5, 7), (0.7, 5)])
-def test_what_has_lost_depth_in_blobs_stays_one_thing(share, least):
+@pytest.mark.parametrize("share, size, least", [(0.3, 5, 9), (0.5, 5, 9), (0.7, 5, 7), (0.5, 10, 9)])
+def test_what_has_lost_depth_in_blobs_stays_one_thing(share, size, least):
     hook, mug = scenes.shape("l_hook", 1, 0.40, 0.10, 0.4), scenes.shape("mug", 3, 0.58, 0.10, 2.0)
     frame, truth = seen([box((0.10, 0.07, 0.08), 0.50, -0.12, RED), mug, hook])
     whole = 0
     for seed in range(3):
-        depth = np.where(blobs(truth.shape, share, 5, seed), np.nan, frame.depth).astype(np.float32)
+        depth = np.where(blobs(truth.shape, share, size, seed), np.nan, frame.depth).astype(np.float32)
         whole += int((measures.best_ious(labelled(replace(frame, depth=depth)), truth) > 0.85).sum())
     # A blob may hide a mug's rim, or leave less than a fifth of a thing's depth: that is no thing any more.
     assert whole >= least
+
+
+def test_a_thin_bar_is_one_whose_depth_is_missing_for_longer_than_clusters_reach():
+    frame, truth = seen([box((0.012, 0.18, 0.012), 0.50, 0.0, RED)])
+    frame.depth[:, 290:345] = np.nan
+    check(frame, truth)
+
+
+@pytest.mark.parametrize(
+    "blocks",
+    [
+        [box((0.09, 0.06, 0.06), 0.50, 0.03, RED), box((0.05, 0.06, 0.11), 0.52, -0.03, RED)],
+        [box((0.05, 0.06, 0.06), 0.525, 0.03, RED), box((0.09, 0.06, 0.06), 0.545, -0.03, BLUE)],
+    ],
+    ids=["of two heights", "of two colours"],
+)
+def test_two_blocks_that_touch_where_no_depth_is_are_two(blocks):
+    frame, truth = seen(blocks)
+    met = cv2.dilate((truth == 1).astype(np.uint8), np.ones((25, 25))) & cv2.dilate((truth == 2).astype(np.uint8), np.ones((25, 25)))
+    frame.depth[met > 0] = np.nan
+    check(frame, truth, most_other=400)
 
 
 def test_a_box_that_another_hides_in_its_middle_is_one_whatever_its_print():

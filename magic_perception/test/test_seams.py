@@ -216,6 +216,29 @@ def test_parts_across_a_gap_are_judged_too():
     assert seams.joined(cut, part, lambda *_: 1.0).max() == 1
 
 
+@pytest.mark.parametrize(
+    ("rise", "bend", "count"),
+    [(0.0, 0, 1), (0.0, -70, 1), (0.0, 25, 1), (0.0, 70, 2), (0.020, 0, 2)],
+    ids=["level", "an edge", "a hollow", "a corner", "a step"],
+)
+def test_parts_on_both_sides_of_a_gap_in_depth_are_one_where_their_surface_goes_on(rise, bend, count):
+    """Two patches of different colours, 40 mm apart: the second ``rise`` metres higher, or bent up about the middle of the gap by so many degrees."""
+    s, t = (a.ravel() for a in np.meshgrid(np.arange(0.020, 0.080, 0.004), np.arange(0, 0.060, 0.004), indexing="ij"))
+    zero, turn = np.zeros_like(s), np.radians(bend)
+    place = np.vstack([np.column_stack([-s, t, zero]), np.column_stack([s * np.cos(turn), t, s * np.sin(turn) + rise])])
+    place[:, 2] += 0.2
+    normal = np.repeat([[0, 0, 1], [-np.sin(turn), 0, np.cos(turn)]], len(s), axis=0)
+    color = np.repeat([[180.0, 60, 50], [50, 80, 170]], len(s), axis=0)
+    edge = np.nonzero(s < 0.022)[0]
+    across = np.column_stack([edge, len(s) + edge])
+
+    def parts(across):
+        return len(np.unique(convexity.parts(place, normal, place[:, 2], color, lambda *_: 1.0, across=across)))
+
+    assert parts(across) == count
+    assert parts(None) == 2
+
+
 def test_the_outside_of_a_bowl_belongs_to_its_inside_though_little_of_it_shows():
     turn, up = (a.ravel() for a in np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(0, 1, 12), indexing="ij"))
     way = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
