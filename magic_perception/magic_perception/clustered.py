@@ -139,15 +139,15 @@ def _bridged(instance: NDArray[np.int64], bridges: Bridges) -> NDArray[np.int64]
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
+    real = instance >= 0
+    if not real.any():
+        return instance
     pairs = instance[bridges.ends]
     a, b = pairs[np.all(pairs >= 0, axis=1)].T
-    total = int(instance.max(initial=-1)) + 1
-    owner = (
-        connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(total, total)), directed=False)[1] if total else np.zeros(0, int)
-    )
-    result = np.full(len(instance), -1)
-    result[instance >= 0] = np.unique(owner[instance[instance >= 0]], return_inverse=True)[1]
-    return result
+    total = int(instance.max()) + 1
+    owner = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(total, total)), directed=False)[1]
+    instance[real] = np.unique(owner[instance[real]], return_inverse=True)[1]
+    return instance
 
 
 #: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
