@@ -65,8 +65,8 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
     made = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]
     between = [bridges.place.reshape(-1, 3) for bridges in made]
     instance = clusters.cluster(np.concatenate([cloud, *between]), parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
-    # A cluster of nothing but bridges is none.
     bridges = _of_cloud(made, spots, masks)
+    # A cluster of nothing but bridges is none.
     instance = _bridged(instance[: len(cloud)], bridges)
     return Clusters(masks, fixed, list(tables), spots, cloud, instance, bridges)
 

@@ -24,7 +24,7 @@ from magic_core import transforms
 from magic_perception import clusters, logistic
 from magic_perception.clustered import Clusters
 from magic_perception.looks import Looked
-from magic_perception.percentiles import percentile
+from magic_perception.percentiles import extents, percentile
 
 #: What is measured at an upright plane between two sides of a cluster, and what it means.
 CRITERIA = {
@@ -205,9 +205,7 @@ def convex(row: NDArray[np.float64]) -> bool:
 
 def _extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
     """Breadth and length (2,) of most of the places (N, 2), m: a handle stays slim with a bit of its head beside it."""
-    local = place - place.mean(axis=0)
-    axes = np.linalg.eigh(local.T @ local)[1]
-    return np.array([percentile(along, 95) - percentile(along, 5) for along in (local @ axes).T]) / 0.9
+    return extents(place) / 0.9
 
 
 def _hull(place: NDArray[np.float64]) -> NDArray[np.float32]:

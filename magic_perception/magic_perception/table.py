@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
+from magic_perception.percentiles import extents
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,6 @@ def fit_plane(
 RAISED, EDGE, AREA = 0.045, 0.16, 0.04
 #: Least edge and area of a table that stands high above another level, m and m^2.
 WIDE = (0.28, 0.12)
-
-
 #: Two levels have the same claim where the things on them differ by no more than this.
 ALIKE = 0.3
 
@@ -180,7 +179,7 @@ def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> 
         things, area = standing(heights, xy, level, band)
         share = float(near.mean())
         if level != 0.0:
-            narrow = _narrowest(xy[near])
+            narrow = extents(xy[near]).min()
             below = [other for other in levels if other < level - 2 * band]
             tray = any(level - other <= RAISED for other in below) and narrow >= EDGE and area >= AREA
             wide = narrow >= WIDE[0] and area >= WIDE[1]
@@ -190,13 +189,6 @@ def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> 
         coefficients[3] -= level
         found.append(Support(Plane(coefficients, share), things, share))
     return _ranked(found)
-
-
-def _narrowest(xy: NDArray[np.floating]) -> float:
-    """The shorter of the extents of points (N, 2) along their principal axes, a twentieth left out at each end."""
-    local = xy - xy.mean(axis=0)
-    axes = np.linalg.eigh(local.T @ local)[1]
-    return float(np.subtract(*np.percentile(local @ axes, [95, 5], axis=0)).min())
 
 
 def _ranked(found: list[Support]) -> list[Support]:
