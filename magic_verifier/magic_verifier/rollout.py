@@ -21,6 +21,7 @@ from magic_core.motion import MotionPlan
 from magic_core.robot import Description
 from magic_core.strategy import Strategy
 from magic_verifier import goals, uncertainty
+from magic_verifier.displacement import Place
 from magic_verifier.floating import TABLE, TARGET, TOOL, Body, FloatingRun, Setup, phase_start
 from magic_verifier.goals import Judgement, Watch
 from magic_verifier.simulation import DYNAMIC, STATIC
@@ -418,7 +419,8 @@ class _Others:
     def __init__(self, run: Any, limits: Limits) -> None:
         self._run, self._limits = run, limits
         self._resting = [o.id for o in run.setup.obstacles if o.loose]
-        self._stood: dict[str, tuple[NDArray[np.float64], str]] = {}  # where the middle of what is free was, and what has touched it
+        self._corners = {o.id: o.outermost for o in run.setup.obstacles if o.loose}
+        self._stood: dict[str, tuple[Place, str]] = {}  # where what is free stood, and what has touched it
 
     def check(self) -> None:
         """Every few steps."""
@@ -427,12 +429,11 @@ class _Others:
             touched = world.touched_by(name)
             if touched:
                 world.let_go(name)
-                self._stood[name] = world.centre_of_mass(name), " and ".join(touched)
+                place = Place(self._corners[name], world.pose(name), world.centre_of_mass(name), self._run.setup.table[:3])
+                self._stood[name] = place, " and ".join(touched)
         self._resting = [name for name in self._resting if name not in self._stood]
-        normal = self._run.setup.table[:3]
-        for name, (stood, pusher) in self._stood.items():
-            way = world.centre_of_mass(name) - stood
-            moved = float(np.linalg.norm(way - (way @ normal) * normal))
+        for name, (place, pusher) in self._stood.items():
+            moved = place.left_by(world.pose(name), world.centre_of_mass(name))
             if moved > self._limits.shove:
                 raise MagicError(
                     Code.OBSTACLE_PUSHED,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import scenes
 
 from magic_core import transforms
 from magic_core.errors import Code
+from magic_verifier.displacement import Place
 from magic_verifier.verification import Proposal, verify_proposal
 
 #: Half the side of a block beside the pulled cylinder's way, and the cylinder's radius, m.
@@ -41,6 +43,38 @@ def test_a_loose_thing_that_the_target_pushes_is_named_with_how_far():
 
 def test_a_brush_that_moves_nothing_is_allowed():
     assert pulled(beside(-0.001)).success
+
+
+def test_a_thing_turned_on_the_spot_has_moved():
+    """A bar with a weight at its near end, which stays about where it is while the cylinder pushes the far end."""
+    light = scenes.block((0.0, 0.13), (-0.003, 0.003), (-0.02, 0.02))
+    heavy = scenes.block((-0.06, 0.0), (-0.03, 0.03), (-0.02, 0.02))
+    pose = transforms.make(translation=[0.205, RADIUS - 0.006, 0.02])
+    verdict = pulled(replace(scenes.item("block", [light, heavy], pose), source="camera"))
+    assert verdict.code == Code.OBSTACLE_PUSHED and "block is pushed by the target" in verdict.message
+
+
+def test_how_far_a_thing_has_left_its_place():
+    up, middle = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    bar = scenes.block((-0.1, 0.1), (-0.01, 0.01), (-0.02, 0.02)).vertices
+    stood = transforms.from_rpy(0.0, 0.0, 0.7)
+    place = Place(bar, stood, middle, up)
+    assert place.left_by(stood, middle) == pytest.approx(0.0, abs=1e-12)
+    # By its middle, as well where that is not the way of a face; lifted straight up it has left nothing.
+    moved = transforms.make(translation=[0.03, 0.04, 0.2])
+    assert place.left_by(moved @ stood, moved[:3, 3]) == pytest.approx(0.05, abs=1e-9)
+    # Turned about its middle by its corners: each then stands half the length times the sine beyond the side.
+    angle = np.radians(30.0)
+    turned = stood @ transforms.from_rpy(0.0, 0.0, angle)
+    assert place.left_by(turned, middle) == pytest.approx(0.1 * np.sin(angle) + 0.01 * np.cos(angle) - 0.01)
+    # A round thing stays where it is, whichever way it is turned.
+    can = scenes.standing_cylinder(0.03, sections=360).vertices
+    assert Place(can, stood, middle, up).left_by(turned, middle) < 1e-5
+    # On a table that leans the same is so in the table's own plane.
+    leaning = transforms.from_rpy(0.5, 0.2, 0.0)
+    assert Place(bar, leaning @ stood, middle, leaning[:3, 2]).left_by(leaning @ turned, middle) == pytest.approx(
+        0.1 * np.sin(angle) + 0.01 * np.cos(angle) - 0.01
+    )
 
 
 def test_what_the_led_tool_goes_through_is_named():

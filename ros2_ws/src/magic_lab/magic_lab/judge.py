@@ -21,6 +21,7 @@ from magic_core.rendering import Raycaster
 from magic_core.sensor import STATION
 from magic_lab.scenarios import Scene
 from magic_lab.world import PLANE, SETTINGS, Thing
+from magic_verifier.displacement import Place
 from magic_verifier.floating import TARGET, TOOL, Body, Setup, fill_world
 from magic_verifier.goals import Judgement, goal_test
 from magic_verifier.simulation import DYNAMIC, KINEMATIC, STATIC, to_poses, usable_pieces
@@ -190,10 +191,15 @@ def judge(scene: Scene, tool: str, track: Track) -> Judgement:
 
 
 def pushed_aside(scene: Scene, tool: str, track: Track) -> dict[str, float]:
-    """How far (m) from where they began things that have no part in it ended, of those that are farther than :data:`MOVED`."""
+    """How far (m) things that have no part in it have left the places where they began, of those that did by more than :data:`MOVED`."""
     others = [thing for thing in scene.things if thing.name in track.poses and thing.name not in (tool, scene.target, *track.put)]
-    ways = {t.name: np.linalg.norm(np.diff([middle(t, pose) for pose in track.poses[t.name][[0, -1]]], axis=0)) for t in others}
-    return {name: float(way) for name, way in ways.items() if way > MOVED}
+    ways = {thing.name: _left_by(thing, *track.poses[thing.name][[0, -1]]) for thing in others}
+    return {name: way for name, way in ways.items() if way > MOVED}
+
+
+def _left_by(thing: Thing, first: Array, last: Array) -> float:
+    place = Place(thing.item.mesh.vertices, first, middle(thing, first), PLANE[:3])
+    return place.left_by(last, middle(thing, last))
 
 
 def nearest(names: Mapping[str, Array], place: Array) -> str:

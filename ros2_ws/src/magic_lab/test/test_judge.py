@@ -109,6 +109,15 @@ def test_a_cup_hung_by_its_handle_passes():
         moves = [(0, {}), (1, {"tool_1": hung}), (3.5, {"tool_1": hung, "beside": shifted(beside.world_from_object, way)})]
         found = judge(s, "tool_1", track(s, moves, hand))
         assert found.code == code and ("beside by 30 mm" in found.message) == (code != Code.OK)
+    # Nor where a bar beside it was turned about its middle.
+    bar = make("peg", 1, length=0.12, side=0.02).as_object("beside", beside.world_from_object)
+    s = replace(s, things=(*s.things[:-1], Thing(bar)))
+    about, angle = transforms.make(translation=bar.mesh.bounds.mean(axis=0)), np.radians(30.0)
+    turned = bar.world_from_object @ about @ transforms.from_rpy(0, 0, angle) @ transforms.inverse(about)
+    moves = [(0, {}), (1, {"tool_1": hung}), (3.5, {"tool_1": hung, "beside": turned})]
+    found = judge(s, "tool_1", track(s, moves, hand))
+    assert found.code == Code.OBSTACLE_PUSHED
+    assert f"beside by {60 * np.sin(angle) + 10 * np.cos(angle) - 10:.0f} mm" in found.message
 
 
 def test_a_pull_ends_with_the_tool_and_not_with_what_rolls_on():
