@@ -23,8 +23,8 @@ GAP, LIFTED, COLOR, BESIDE = 0.020, 0.012, 0.06, 7
 PART, LOOP = 0.2, 0.5
 #: A hole of so many pixels, of whose rim either has such a share, closes a loop; a strip is so wide at most, as a mean, at a focal length of 615.
 HOLE, RIM, STRIP = 10, 0.2, 4.0
-#: Of the pixels at which two parts meet in a bar such a share has no depth of its own.
-LOST = 0.5
+#: Of the pixels at which two parts meet in a bar such a share has no depth of its own; so long, m, a bar may be that has none, where several pictures show it.
+LOST, LOST_BAR = 0.5, 0.040
 #: A place is seen to be empty where a picture shows neither there and depth goes on behind it by so many metres; between two things most places are.
 EMPTY, FREE = 0.004, 0.3
 
@@ -55,15 +55,17 @@ def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.i
             if min(len(one.points), len(two.points)) < 20 or float(np.linalg.norm(one.shade - two.shade)) > COLOR:
                 continue
             ways, gap = _ways(one, two)
-            if gap > GAP:
+            if gap > LOST_BAR:
                 continue
             half, small = sizes[label] < LOOP * sizes[other], sizes[label] < PART * sizes.max() and sizes[label] < PART * sizes[other]
-            if (
-                (small and _hangs(one, two))
-                or _bar(labels, looks, label, other)
-                or (
-                    ((half and _loop(labels, label, other)) or (small and _strip(labels, looks, label, other)))
-                    and not _seen_between(ways, labels, looks, (label, other))
+            if _bar(labels, looks, label, other) or (
+                gap <= GAP
+                and (
+                    (small and _hangs(one, two))
+                    or (
+                        ((half and _loop(labels, label, other)) or (small and _strip(labels, looks, label, other)))
+                        and not _seen_between(ways, labels, looks, (label, other))
+                    )
                 )
             ):
                 owner[label] = other
@@ -165,11 +167,11 @@ def _strip(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, oth
 
 
 def _bar(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, other: int) -> bool:
-    """Whether two labels meet in a picture in a thin bar that has lost its depth there, and what of them has its own is near each other: there each pixel has
-    the label of the nearest that has depth, and nothing in space parts them."""
+    """Whether two labels meet in a picture in a thin bar that has lost its depth there, and what of them has its own is near each other, less near where
+    all of several pictures show them meet so: there each pixel has the label of the nearest that has depth, and nothing in space parts them."""
     from scipy.spatial import cKDTree
 
-    met = False
+    met, shown = 0, 0
     told: tuple[list[NDArray[np.float32]], ...] = ([], [])
     for image, look in zip(labels, looks, strict=True):
         cut = _around(np.where(image == other, label, image), label, 2)
@@ -183,6 +185,7 @@ def _bar(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, other
             rows, columns = np.nonzero(part & ~lost)
             step = max(1, len(rows) // 4000)
             points.append(look.points(rows[::step] + cut[0].start, columns[::step] + cut[1].start))
+        shown += parts[0].any() and parts[1].any()
         seam = (cv2.dilate(parts[0].view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & parts[1]
         if not seam.any() or float(lost[seam].mean()) < LOST:
             continue
@@ -190,11 +193,11 @@ def _bar(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, other
         within = cv2.distanceTransform(np.pad(both, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         near = cv2.distanceTransform((~seam).view(np.uint8), cv2.DIST_L2, 3) <= width
         # One of them is thin all about the seam: two bodies that meet with their corners are no bar.
-        met |= min(float(within[near & part].max()) for part in parts) <= width / 2
+        met += min(float(within[near & part].max()) for part in parts) <= width / 2
     if not met:
         return False
     one, two = (np.concatenate(points) for points in told)
-    return len(one) > 0 and len(two) > 0 and float(cKDTree(two).query(one)[0].min()) <= GAP
+    return len(one) > 0 and len(two) > 0 and float(cKDTree(two).query(one)[0].min()) <= (LOST_BAR if met == shown > 1 else GAP)
 
 
 def _ways(part: _Part, other: _Part) -> tuple[NDArray[np.float32], float]:

@@ -45,12 +45,12 @@ def _total(values: NDArray[np.float32]) -> NDArray[np.float32]:
 DARKEST = 0.45
 
 
-def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-    """How far each pixel's colour is from the table's around it, in squared standard deviations, the same where darkness
-    may be a shadow's (both (H, W)), and the threshold of notice.
+def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How far each pixel's colour is from the table's around it, in squared standard deviations, and the same where darkness
+    may be a shadow's (both (H, W)).
 
-    The table's colour and its spread are local means over the pixels of ``table`` (a wooden grain has a large
-    spread, so nothing stands out from it lightly); the threshold is what 99.7 % of the table stays below, at least 25.
+    The table's colour and its spread are local means over the pixels of ``table``: a wooden grain has a large
+    spread, so nothing stands out from it lightly.
     """
     lab = cv2.cvtColor(cv2.GaussianBlur(looked.frame.color, (3, 3), 0), cv2.COLOR_RGB2LAB)
     small = cv2.resize(lab, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -78,9 +78,54 @@ def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np
             cv2.accumulateProduct(less * less, scale, shaded)
         offset *= offset
         cv2.accumulateProduct(offset, scale, distance)
-    sample = np.flatnonzero(table)
-    threshold = max(25.0, float(np.percentile(np.take(distance, sample[::7]), 99.7))) if len(sample) > 500 else np.inf
-    return distance, shaded, threshold
+    return distance, shaded
+
+
+#: From so many squared standard deviations on a colour is another than the table's, and where no shadow would explain it one that may be.
+OTHER, FAINT = 25.0, 9.0
+#: The strip in which a thing is mirrored at its foot and has its depth carried to is so many pixels wide at most, at a focal length of 615.
+MIRRORED = 12
+
+
+def notice(distance: NDArray[np.float32], sample: NDArray[np.int64]) -> float:
+    """What the distance (H, W) of 99.7 % of a ``sample`` of the table (N,) stays below."""
+    return float(np.percentile(np.take(distance, sample), 99.7))
+
+
+def lifted(other: NDArray[np.bool_], looked: Looked, zero: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W): pixels of another colour (``other``) around which those of another colour are a little above the table on the average of a window: a
+    thin thing.  A shadow or a print lies at 0.  ``zero``: heights, m, 0 without depth."""
+    near = other & np.isfinite(looked.heights) & (zero < 0.03)
+    total = cv2.blur(np.where(near, looked.raw, np.float32(0)), (9, 9), borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(near.astype(np.float32), (9, 9), borderType=cv2.BORDER_CONSTANT)
+    return other & (share * np.float32(81) > 8) & (total > share * np.maximum(np.float32(0.0015), looked.sigma * np.float32(1.2)))
+
+
+#: What is of a faintly other colour is so many metres above the table as a whole, so many times the noise of one pixel, and so many times that of the mean;
+#: noise is alike in so many pixels.
+PLATE, ABOVE, SURE, GRAIN = 0.002, 1.2, 5.0, 25.0
+
+
+def _plates(faint: NDArray[np.bool_], core: NDArray[np.bool_], looked: Looked) -> NDArray[np.bool_]:
+    """(H, W): what is of a colour not far from the table's (``faint``) but above it as a whole: a flat thing whose own pixels are as low as the noise.
+
+    It is broader than the strip in which a thing of the ``core`` (H, W) is mirrored at its foot, to which depth is carried.
+    """
+    size = 2 * round(0.5 * MIRRORED * looked.frame.intrinsics.fx / 615) + 1
+    broad = cv2.morphologyEx((faint | core).view(np.uint8), cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    _, regions, stats, _ = cv2.connectedComponentsWithStats((broad.view(bool) & ~core).view(np.uint8), connectivity=4)
+    result = np.zeros_like(core)
+    for label, (x, y, w, h, area) in enumerate(stats[1:], 1):
+        if area < size**2:
+            continue
+        cut = (slice(y, y + h), slice(x, x + w))
+        mine = regions[cut] == label
+        heights, noise = looked.raw[cut][mine], float(np.median(looked.sigma[cut][mine]))
+        heights = heights[np.isfinite(heights)]
+        error = noise * np.sqrt(GRAIN / max(len(heights), 1))
+        if 2 * len(heights) > area and float(heights.mean()) > max(PLATE, ABOVE * noise, SURE * error):
+            result[cut] |= mine
+    return result
 
 
 def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -98,16 +143,11 @@ def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_
     table = _outside(valid & (np.abs(zero) < limit) & inside & ~around, raised)
     if np.count_nonzero(table) < 500:
         return raised, np.zeros_like(raised)
-    distance, shaded, threshold = color_distance(looked, table)
-    if not np.isfinite(threshold):
-        return raised, np.zeros_like(raised)
-    other = (distance > threshold) & inside
-    # Of another colour and a little above the table on the average of a window: a thin thing.  A shadow or a print lies at 0.
-    near = other & valid & (zero < 0.03)
-    total = cv2.blur(np.where(near, looked.raw, np.float32(0)), (9, 9), borderType=cv2.BORDER_CONSTANT)
-    share = cv2.blur(near.astype(np.float32), (9, 9), borderType=cv2.BORDER_CONSTANT)
-    thin = other & (share * np.float32(81) > 8) & (total > share * np.maximum(np.float32(0.0015), looked.sigma * np.float32(1.2)))
-    core = raised | thin
+    distance, shaded = color_distance(looked, table)
+    sample = np.flatnonzero(table)[::7]
+    other = (distance > max(OTHER, notice(distance, sample))) & inside
+    core = raised | lifted(other, looked, zero)
+    core |= _plates((shaded > max(FAINT, notice(shaded, sample))) & (distance > FAINT) & inside, core, looked)
     color, depth, focal = looked.frame.color, looked.frame.depth, looked.frame.intrinsics.fx
 
     def of(core: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:

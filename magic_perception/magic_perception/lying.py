@@ -85,8 +85,8 @@ class Laid:
 
 def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
     """What a lying thing is like, seen from above.  Raises ``RECONSTRUCTION_FAILED`` where nothing is left of its outline."""
-    points = surfaces(sights, 2)[0]
-    points = points[~_passed(points, sights, noise)]
+    seen = surfaces(sights, 2)[0]
+    points = seen[~_passed(seen, sights, noise)]
     if len(points) < 20:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "points of one object that no camera sees past", len(points), "at least 20")
     grid = height_map(points, parameters.resolution)
@@ -98,8 +98,12 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
     sample = grid.top[ridge] if ridge.sum() > 30 else grid.top[occupied]
     low, middle, high = np.percentile(sample, [8, 60, 96])
     flat = high - low < max(0.004, 0.2 * high, 3.0 * noise)
-    centres = grid.centres()
     thickness = float(max(middle if flat else high, 0.002))
+    slim = flat and thickness < SLIM
+    if slim:  # a rod is seen past by each of two cameras that do not agree to its width where it is
+        grid = height_map(seen, parameters.resolution)
+        occupied = np.isfinite(grid.top)
+    centres = grid.centres()
     if flat and thickness < 0.06:
         columns = [
             np.concatenate([centres, np.full((*centres.shape[:2], 1), z)], axis=-1)
@@ -108,6 +112,8 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
         field = carve(sights, columns)
         near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
         field = cv2.GaussianBlur(field * near, (0, 0), 0.8)
+        if slim:
+            field = np.maximum(field, polygons.smooth_field(_lost(sights, grid, field > 0.5), 0.8))
     else:
         # Smooth over 3 mm, over the thing's own cells only.
         weight = cv2.GaussianBlur(occupied.astype(np.float32), (0, 0), 2.0)
@@ -135,14 +141,18 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
     return Laid(grid, _large(parts), False, thickness, False, top, np.clip(foot, 0, top - 0.001), thin)
 
 
-#: What is smaller, m^2, is no part of a thing.
-LEAST = 4e-5
+#: What is smaller, m^2, is no part of a thing, nor what has no more than this share of the largest part's area.
+LEAST, CRUMB = 4e-5, 0.08
 #: A column is looked at in so many places for each metre of it.
 PLACES = 400
 #: What a ray comes down from by more than this, m, and three times the noise, it passes through.
 PAST = 0.005
 #: The share of a column that cameras see empty from which nothing stands there.
 EMPTY = 0.4
+#: Of what is thinner, m, parts may be lost for want of whole columns; of what is thicker it is the round sides that have none down to the table.
+SLIM = 0.012
+#: Masks of two cameras disagree by so many pixels; what stands out from the rest by so much, m, is no smeared rim, and is torn by gaps of so much.
+ROOM, STICKS, TORN = 2, 0.010, 0.010
 #: Smear of depth carries a thing so far; in its corners, into which a disc of that radius does not reach, farther, m.
 FRINGE, SMEAR, CORNER = 0.004, 0.012, 0.06
 
@@ -175,6 +185,30 @@ def _upheld(sights: list[Sight], grid: Grid, top: NDArray[np.float32], noise: fl
     return kept, nearest(top * shares[np.argmin(empty, axis=0)].astype(np.float32), kept)
 
 
+def _lost(sights: list[Sight], grid: Grid, carved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells (rows, columns) of the map of what stands out from what was carved of a flat thing and is missing in it, with what joins the two.
+
+    A rod that is hardly as wide as the thing is thick leaves no whole column in the masks of two cameras from either side, or crumbs of some, the less so
+    the farther their calibration is off; but each of them saw it.  What stands out by less is the rim, as it is smeared.
+    """
+    _, regions, stats, _ = cv2.connectedComponentsWithStats(carved.view(np.uint8), connectivity=8)
+    large = np.append(False, stats[1:, cv2.CC_STAT_AREA] > CRUMB * stats[1:, cv2.CC_STAT_AREA].max(initial=0))
+    away = _away(large[regions]) * grid.cell
+    missing = np.isfinite(grid.top) & ~carved
+    if not np.any(missing & (away > STICKS)):
+        return np.zeros_like(missing)
+    points = np.concatenate([grid.centres(), nearest(grid.top, np.isfinite(grid.top))[..., None]], axis=-1)
+    seen = np.ones_like(missing)
+    for sight in sights:
+        wide = cv2.dilate((sight.mask | sight.hidden).view(np.uint8), np.ones((2 * ROOM + 1,) * 2, np.uint8)).astype(np.float32)
+        seen &= ~(sight.look_up(points, wide) < 0.5)
+    _, regions = cv2.connectedComponents((missing & seen & (away > FRINGE)).view(np.uint8), connectivity=8)
+    out = np.isin(regions, np.unique(regions[missing & seen & (away > STICKS)])) & (regions > 0)
+    # Where the heights of the two cameras contradict each other it is torn.
+    mended = _closed(carved | (missing & seen), 0.5 * TORN / grid.cell)
+    return mended & seen & ~carved & (_away(out) * grid.cell <= FRINGE + 2 * grid.cell)
+
+
 def _away(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """How far each cell is from those of a mask, cells."""
     return cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5) if mask.any() else np.full(mask.shape, np.inf, np.float32)
@@ -201,7 +235,7 @@ def _large(parts: list[Polygon]) -> list[Polygon]:
     """Those of a thing's parts that are no crumbs beside the first; raises ``RECONSTRUCTION_FAILED`` where there is none."""
     if not parts:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "outline of one object", "empty", "an area of at least 0.4 square centimetres")
-    return [part for part in parts if part.area > 0.08 * parts[0].area]
+    return [part for part in parts if part.area > CRUMB * parts[0].area]
 
 
 def build_lying(laid: Laid) -> Reconstruction:

@@ -71,18 +71,20 @@ def test_a_neighbour_is_a_thing_of_its_own(meshes):
 
 
 @pytest.mark.parametrize(
-    ("width", "lost", "owner"),
+    ("width", "lost", "names", "owner"),
     [
-        pytest.param(0.008, 0.015, 1, id="a thin bar without depth where the labels meet"),
-        pytest.param(0.008, 0.0, 2, id="depth tells where the second begins"),
-        pytest.param(0.008, 0.035, 2, id="what has depth is far from each other"),
-        pytest.param(0.040, 0.015, 2, id="no thin bar"),
+        pytest.param(0.008, 0.015, ("left", "right"), 1, id="a thin bar without depth where the labels meet"),
+        pytest.param(0.008, 0.0, ("left", "right"), 2, id="depth tells where the second begins"),
+        pytest.param(0.008, 0.035, ("left",), 2, id="what has depth is far from each other"),
+        pytest.param(0.008, 0.035, ("left", "right"), 1, id="it is far, but both pictures show them meet"),
+        pytest.param(0.008, 0.050, ("left", "right"), 2, id="it is too far for that"),
+        pytest.param(0.040, 0.015, ("left", "right"), 2, id="no thin bar"),
     ],
 )
-def test_a_bar_that_has_lost_its_depth_where_it_meets_a_thing_belongs_to_it(width, lost, owner):
+def test_a_bar_that_has_lost_its_depth_where_it_meets_a_thing_belongs_to_it(width, lost, names, owner):
     rod = scenes.placed(mesh(trimesh.creation.box([0.07, width, 0.008]), BLUE), 0.46 - 0.035, 0.0)
     looks, labels = [], []
-    for i, name in enumerate(("left", "right")):
+    for i, name in enumerate(names):
         frame, ids = scenes.capture([block(), rod], name, seed=i)
         seen, image = look(frame, PLANE, np.eye(4), Parameters()), (ids + 1).astype(np.int32)
         near = seen.points(*np.mgrid[: image.shape[0], : image.shape[1]])[..., 0]
