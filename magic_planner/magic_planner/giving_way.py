@@ -33,9 +33,9 @@ from magic_planner.collision import Body, grown, hull, outermost, padded, solid_
 
 Array = NDArray[np.float64]
 #: Gap kept between the tool and what it gives way to, metres: of a tool that is where it is led, and of one in a gripper, in
-#: which it shifts and turns a little when it is gripped and pushed.
+#: which it shifts and turns a little when it is gripped and pushed; there at most, however badly it was seen.
 GAP = 0.001
-GAP_IN_HAND = 0.004
+GAP_IN_HAND, WIDEST_GAP = 0.004, 0.008
 #: Largest displacement, metres: a tool that would have to give way further does something else than was shown.
 MOST = 0.10
 #: Pieces whose boxes are nearer than this, metres, bound the displacement, which changes by less from one pose to the next.
@@ -53,6 +53,11 @@ BLOCK = 256
 CORNERS = 40
 #: A face is of use only if its normal lies in the plane of the displacement to this share.
 IN_PLANE = 0.5
+
+
+def gap_of(tool: SceneObject, variant: str) -> float:
+    """The gap for a tool, metres, that a floating gripper (``fg``) leads or an arm holds: one whose surface is stated to be off comes so much nearer."""
+    return GAP if variant == "fg" else min(GAP_IN_HAND + tool.surface_error, WIDEST_GAP)
 
 
 @dataclass(frozen=True)

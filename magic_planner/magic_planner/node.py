@@ -22,7 +22,7 @@ from magic_core.robot import Description, RobotConfig
 from magic_core.threads import one_thread
 from magic_interfaces.action import PlanMotion
 from magic_planner.budget import Budget
-from magic_planner.giving_way import GAP, GAP_IN_HAND
+from magic_planner.giving_way import gap_of
 from magic_planner.object_motion import plan_tool_motion, warm_up
 from magic_planner.request import Problem
 
@@ -150,8 +150,7 @@ class PlannerNode(Node):
         candidate = convert.candidate_from_msg(goal.candidate)
         table = convert.plane_from_msg(goal.table)
         reflection = goal.reflection or "keep"
-        gap = GAP_IN_HAND if goal.variant == "arm" else GAP
-        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap)
+        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap_of(tool, goal.variant))
         budget.check("motion")
         if goal.variant == "fg":
             if goal.attempt:

@@ -12,7 +12,7 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.shapes import make
 from magic_planner.collision import Body
-from magic_planner.giving_way import GAP, IN_PLANE, MOST, NEAR, Pieces, give_way, nearest, separations
+from magic_planner.giving_way import GAP, GAP_IN_HAND, IN_PLANE, MOST, NEAR, WIDEST_GAP, Pieces, gap_of, give_way, nearest, separations
 from magic_planner.object_motion import plan_tool_motion
 
 FAR_BELOW = np.array([0.0, 0.0, 1.0, 5.0])
@@ -188,3 +188,16 @@ def test_a_start_in_an_obstacle_is_refused_and_not_mended():
     with pytest.raises(MagicError) as error:
         plan_tool_motion(scenes.pulling(), tool, target, candidate, obstacles=(block,))
     assert error.value.code == Code.PATH_IN_COLLISION and "block" in str(error.value)
+
+
+def test_a_tool_that_is_badly_known_keeps_farther_off():
+    tool = cube()
+    assert gap_of(tool, "fg") == GAP and gap_of(tool, "arm") == GAP_IN_HAND
+    assert gap_of(dataclasses.replace(tool, surface_error=0.002), "arm") == pytest.approx(GAP_IN_HAND + 0.002)
+    assert gap_of(dataclasses.replace(tool, surface_error=0.05), "arm") == WIDEST_GAP < NEAR
+    # It passes a wall that is as far below its way as that.
+    floor = wall([0.4, 0.1, 0.02], [0.15, 0.0, -0.032])
+    for off in (0.0, 0.002):
+        off_by = dataclasses.replace(tool, surface_error=off)
+        path = give_way(line([-0.3, 0, -0.001], [0.5, 0, -0.001]), off_by, [floor], ACROSS, FAR_BELOW, 0.001, gap=gap_of(off_by, "arm"))
+        assert path[len(path) // 2, 2, 3] - 0.02 - -0.022 == pytest.approx(GAP_IN_HAND + off, abs=3e-4)

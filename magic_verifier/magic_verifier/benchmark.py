@@ -23,7 +23,7 @@ from magic_core.workers import Workers
 from magic_planner.arm import ArmPlanner
 from magic_planner.benchmark import TASKS, Case, make_case
 from magic_planner.budget import Budget
-from magic_planner.giving_way import GAP, GAP_IN_HAND
+from magic_planner.giving_way import gap_of
 from magic_planner.object_motion import plan_tool_motion
 from magic_planner.request import Problem
 from magic_planner.robot import Robot
@@ -70,7 +70,7 @@ def measured(task: Task, name: str, count: int, pool: Workers) -> Timing | None:
 def planned(strategy: Strategy, case: Case, variant: str, planner: ArmPlanner | None) -> MotionPlan:
     """The motion of a case; planner: of the variant arm.  Raises what planning does."""
     scene = (strategy, case.tool, case.target, case.candidate, "keep")
-    motion = plan_tool_motion(*scene, TABLE, case.obstacles, GAP if variant == "fg" else GAP_IN_HAND)
+    motion = plan_tool_motion(*scene, TABLE, case.obstacles, gap_of(case.tool, variant))
     if planner is None or variant == "fg":
         return MotionPlan("fg", motion)
     return planner.solve(Problem(*scene, motion, TABLE, case.obstacles), budget=Budget(10.0))
