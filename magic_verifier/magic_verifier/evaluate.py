@@ -223,14 +223,15 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
 def _try_all(
     options: Options, strategy: Strategy, problem: _Problem, candidates: Sequence[Any], answer: dict[str, Any], runs: list[_Tried]
 ) -> None:
-    """Plan and verify candidates, those that promise most first, until one passes; each is told in the answer, and its motions are put to ``runs``."""
-    from magic_server.pipeline import Agenda
+    """Plan and verify candidates, those that promise most first, until one passes surely enough; each is told in the answer, and its motions are put
+    to ``runs``, that which is taken last."""
+    from magic_server.pipeline import Agenda, Choice
 
     most = 1 if options.method == ONLY_BEST else None
     attempts = ARM_ATTEMPTS if options.variant == "arm" and most is None else 1
-    agenda = Agenda(candidates[:most], strategy.reflections[:most], attempts)
+    agenda, choice = Agenda(candidates[:most], strategy.reflections[:most], attempts), Choice()
     entries: dict[tuple[int, str], dict[str, Any]] = {}
-    while not answer["success"] and (following := agenda.next()) is not None:
+    while not choice.over and (following := agenda.next()) is not None:
         promise, trial = following
         tool, name = problem.tool(trial.candidate.tool_id)
         entry, run = _try(options, _strategy(options, name), trial, tool, name, problem, answer)
@@ -243,8 +244,12 @@ def _try_all(
         elif entry["stage"] == "verify":  # where no further grasp is found, what the last one came to says more
             entries[key].update(entry)
         entries[key]["attempts"] = trial.attempt + 1
-        answer["success"] = entry["code"] == Code.OK.name
+        passed = run if run is not None and run.verdict.success else None
+        choice.tried(passed, passed.verdict.success_rate if passed is not None else 0.0)
         agenda.failed(promise, trial, Code[entry["code"]])
+    if choice.best is not None:
+        answer["success"] = True
+        runs.sort(key=lambda run: run is choice.best)
 
 
 def _candidates(options: Options, strategy: Strategy, problem: _Problem, top_k: int) -> tuple[Sequence[Any], str]:
@@ -319,7 +324,7 @@ def _try(
 ) -> tuple[dict[str, Any], _Tried | None]:
     """Plan and verify one trial: what is stored of it, and the motion if there was one; the answer's seconds and simulations go on."""
     from magic_planner.budget import Budget
-    from magic_planner.giving_way import GAP, GAP_IN_HAND
+    from magic_planner.giving_way import gap_of
     from magic_planner.object_motion import plan_tool_motion
     from magic_planner.request import Problem
     from magic_verifier.verification import Proposal, verify_proposal
@@ -328,8 +333,7 @@ def _try(
     candidate, reflection = trial.candidate, trial.reflection
     target, obstacles, table = problem.target, problem.obstacles[tool.id], problem.table
     try:
-        gap = GAP_IN_HAND if options.variant == "arm" else GAP
-        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap)
+        motion = plan_tool_motion(strategy, tool, target, candidate, reflection, table, obstacles, gap_of(tool, options.variant))
         if options.variant == "arm":
             given = (strategy, tool, target, candidate, reflection, motion, table, obstacles)
             budget = Budget(PLANNING_TIME, clock=time.process_time)

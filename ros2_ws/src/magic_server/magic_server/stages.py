@@ -116,11 +116,11 @@ class Stages:
         self._seen: SceneObjectArray | None = None  # the same objects as they came
         self._scene: SceneObjectArray | None = None
         self._matches: pipeline.Matches | None = None
-        self._last_goal: VerifyMotion.Goal | None = None
+        #: What the verifier was asked and the code of its answer, of motions that passed and of the last one, by their marks.
+        self._judged: dict[bytes, tuple[VerifyMotion.Goal, int]] = {}
         self._meanwhile: Callable[[], None] = lambda: None  # begun once, while the verifier is at work
         #: Motions for the same task that the verifier was asked for.
         self.tried = tried
-        self._last_code = 0
 
     @property
     def scene(self) -> SceneObjectArray:
@@ -461,10 +461,10 @@ class Stages:
         with self._minding(server.verifier):
             answer = server.verifier.call(goal, timeout, self._token, server.settings.presence, server.settings.grace, accepted=meanwhile)
         result = answer.result
-        self._last_goal, self._last_code = goal, result.code
         code = code_of(result.code)
         if code == Code.OK and not result.success:
             code = Code.GOAL_NOT_REACHED
+        self._judged = {mark: asked for mark, asked in self._judged.items() if asked[1] == Code.OK} | {mark_of(plan): (goal, result.code)}
         message = pipeline.with_metrics(result.message, list(zip(result.metric_names, result.metric_values)))
         return Verdict(
             code,
@@ -483,14 +483,16 @@ class Stages:
         """What the tool of a trial was taken to weigh: no camera sees it, and a verdict rests on it."""
         return masses.sentence(strategy, conversions.object_from_msg(self._tool_of(trial), pictures=False), request.tool_mass)
 
-    def film(self, outcome_code: Code) -> Image | None:
-        """The film strip of the last simulation: the verifier draws it from what it recorded when it gets the same goal again.
+    def film(self, outcome: pipeline.Outcome) -> Image | None:
+        """The film strip of the motion that a run ended with, or of the last that it simulated: the verifier draws it from what it recorded when
+        it gets the same goal again.
 
         Drawing may cost more than simulating, and only one of a run's simulations is looked at.
         """
-        server, goal = self._server, self._last_goal
-        if goal is None or outcome_code in pipeline.FATAL:
+        server = self._server
+        if not self._judged or outcome.code in pipeline.FATAL:
             return None
+        goal, code = self._judged[mark_of(outcome.plan) if outcome.verified else next(reversed(self._judged))]
         goal.want_film = True
         around = {o.id for o in goal.obstacles}
         goal.obstacles = [light(o, cloud=False, surface=True) for o in self.scene.objects if o.id in around]
@@ -499,10 +501,8 @@ class Stages:
         except MagicError as error:
             server.get_logger().warning(f"no film: {error.message}")
             return None
-        if result.code != self._last_code:  # another client came in between, and the repetition took too long, for one
-            server.get_logger().warning(
-                f"no film: asked for it, the verifier answered {result.code} instead of {self._last_code}: {result.message}"
-            )
+        if result.code != code:  # another client came in between, and the repetition took too long, for one
+            server.get_logger().warning(f"no film: asked for it, the verifier answered {result.code} instead of {code}: {result.message}")
             return None
         return result.film if len(result.film.data) else None
 

@@ -521,7 +521,7 @@ class StrategyServer(LifecycleNode):
             result.notes = [*result.notes, weight or stages.weight(asked.request, outcome.reports[-1].trial, strategy)]
         self._show(stages, outcome)
         if goal.want_pictures:
-            result.film = stages.film(outcome.code) or Image()
+            result.film = stages.film(outcome) or Image()
         ending = f"{goal.strategy} ({goal.variant}) ended with {Code(result.code).name}: {result.message}"
         if result.code == Code.OK:  # rclpy wants one severity for one line of code
             self.get_logger().info(ending)

@@ -50,7 +50,8 @@ class Script:
         self.now += self.cost
         assert plan == ("plan", trial.index, trial.attempt)
         self.calls.append(("verify", trial.index, trial.reflection, trial.attempt))
-        return Verdict(self._verify(trial), "judged")
+        said = self._verify(trial)
+        return said if isinstance(said, Verdict) else Verdict(said, "judged")
 
 
 def execute(script, variant="fg", timeout=100.0, reflections=("keep", "turn"), simulatable=True, allow=False, attempts=2, **kwargs):
@@ -69,6 +70,51 @@ def test_stops_at_the_first_success():
     assert outcome.plan == ("plan", 1, 0)
     assert [(r.trial.index, r.stage, r.code) for r in outcome.reports] == [(0, "verify", Code.DRIFT), (1, "verify", Code.OK)]
     assert (outcome.tool_id, outcome.target_id, outcome.features) == ("tool", "target", "script")
+
+
+def passed(share):
+    return Verdict(Code.OK, f"passed {share}", success_rate=share, rollouts=21)
+
+
+def test_a_surer_motion_is_taken_before_one_that_passed_with_failures():
+    script = Script([candidate()] * 4, verify=lambda t: passed([0.9, 0.95, 1.0, 1.0][t.index]))
+    outcome = execute(script)
+    assert (outcome.plan, outcome.message, outcome.verdict.success_rate) == (("plan", 2, 0), "passed 1.0", 1.0)
+    assert [t[0] for t in tried(script)] == [0, 1, 2]
+    # Where none is surer it is taken after all, and its report is the last.
+    script = Script([candidate()] * 9, verify=lambda t: passed(0.9) if t.index in (1, 3) else Code.DRIFT)
+    outcome = execute(script)
+    assert (outcome.code, outcome.verified, outcome.plan, outcome.message) == (Code.OK, True, ("plan", 1, 0), "passed 0.9")
+    assert [t[0] for t in tried(script)] == list(range(2 + pipeline.Choice.MORE))
+    assert [r.trial.index for r in outcome.reports] == [0, 2, 3, 4, 5, 1]
+    # So it is where there is nothing else to try, or the rest cannot be planned.
+    assert execute(Script([candidate()], verify=lambda t: passed(0.9))).plan == ("plan", 0, 0)
+    script = Script([candidate()] * 3, plan=lambda t: Code.OK if t.index == 0 else Code.NO_PATH, verify=lambda t: passed(0.9))
+    assert execute(script).plan == ("plan", 0, 0)
+
+
+def test_the_end_of_the_time_takes_what_has_passed_till_then():
+    script = Script([candidate()] * 5, verify=lambda t: passed(0.9), cost=2.0)
+    outcome = execute(script, timeout=9.0)
+    assert (outcome.code, outcome.plan) == (Code.OK, ("plan", 0, 0)) and script.now <= 10.0
+
+    def late(trial):
+        if trial.index == 1:
+            raise MagicError(Code.SERVER_TIMEOUT, "late")
+        return passed(0.9)
+
+    outcome = execute(Script([candidate()] * 3, verify=late))
+    assert (outcome.code, outcome.plan) == (Code.OK, ("plan", 0, 0))
+    assert [r.code for r in outcome.reports] == [Code.SERVER_TIMEOUT, Code.OK]
+
+    # What makes verdicts doubtful ends the run all the same.
+    def broken(trial):
+        if trial.index == 1:
+            raise MagicError(Code.NOT_ALONE, "two verifiers")
+        return passed(0.9)
+
+    outcome = execute(Script([candidate()] * 3, verify=broken))
+    assert (outcome.code, outcome.verified, outcome.plan) == (Code.NOT_ALONE, False, None)
 
 
 def test_reflections_only_for_mirrored_matches():
