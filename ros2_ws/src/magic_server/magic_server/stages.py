@@ -116,8 +116,8 @@ class Stages:
         self._seen: SceneObjectArray | None = None  # the same objects as they came
         self._scene: SceneObjectArray | None = None
         self._matches: pipeline.Matches | None = None
-        #: What the verifier was asked and the code of its answer, of motions that passed and of the last one, by their marks.
-        self._judged: dict[bytes, tuple[VerifyMotion.Goal, int]] = {}
+        #: What the verifier was asked and the code of its answer, of motions that passed and of the last one, by their trials.
+        self._judged: dict[tuple[int, str, int], tuple[VerifyMotion.Goal, int]] = {}
         self._meanwhile: Callable[[], None] = lambda: None  # begun once, while the verifier is at work
         #: Motions for the same task that the verifier was asked for.
         self.tried = tried
@@ -464,7 +464,8 @@ class Stages:
         code = code_of(result.code)
         if code == Code.OK and not result.success:
             code = Code.GOAL_NOT_REACHED
-        self._judged = {mark: asked for mark, asked in self._judged.items() if asked[1] == Code.OK} | {mark_of(plan): (goal, result.code)}
+        self._judged = {made: asked for made, asked in self._judged.items() if asked[1] == Code.OK}
+        self._judged[trial.index, trial.reflection, trial.attempt] = goal, result.code
         message = pipeline.with_metrics(result.message, list(zip(result.metric_names, result.metric_values)))
         return Verdict(
             code,
@@ -492,7 +493,8 @@ class Stages:
         server = self._server
         if not self._judged or outcome.code in pipeline.FATAL:
             return None
-        goal, code = self._judged[mark_of(outcome.plan) if outcome.verified else next(reversed(self._judged))]
+        trial = outcome.reports[-1].trial
+        goal, code = self._judged[(trial.index, trial.reflection, trial.attempt) if outcome.verified else next(reversed(self._judged))]
         goal.want_film = True
         around = {o.id for o in goal.obstacles}
         goal.obstacles = [light(o, cloud=False, surface=True) for o in self.scene.objects if o.id in around]
