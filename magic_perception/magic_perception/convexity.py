@@ -323,3 +323,60 @@ def _outsides(
                 ):
                     labels[labels == labels[other[0]]] = labels[mine[0]]
     return labels
+
+
+#: Of a part that has a handle such a share of its upright surfaces at least lies within the other's rim, beside it, and of these such a share faces the other way;
+#: chromaticity (R, G, B over their sum) of one thing is alike to so much, and its parts are so near each other, m.  Of an inside alone, or an outside alone, no more
+#: than a tenth faces otherwise.
+HANDLED, FACING, ALIKE, TOUCHING, ALONE = 0.1, 0.6, 0.06, 0.012, 0.1
+
+
+def with_handles(
+    points: NDArray[np.floating],
+    normal: NDArray[np.floating],
+    labels: NDArray[np.int64],
+    heights: NDArray[np.floating],
+    rgb: NDArray[np.floating],
+) -> NDArray[np.int64]:
+    """Labels (N,) with the parts of a bowl joined of which one hangs together with a long handle, as those of ladles and pans do.
+
+    A round inside that shows no outside, or a round outside that shows no inside, goes on in a part of the same colour (``rgb``, (N, 3)) that touches it: in what of that lies
+    beside its rim and faces the other way, or is more of the inside.  :func:`insides` asks it of parts that are one side of a bowl alone.
+    """
+    from scipy.spatial import cKDTree
+
+    from magic_perception.primitives import fit_circle
+
+    labels = labels.copy()
+    upright = np.isfinite(normal[:, 0]) & (np.abs(normal[:, 2]) < 0.8)
+    members = [np.nonzero((labels == i) & upright)[0] for i in np.unique(labels[labels >= 0])]
+    members = [m[:: max(1, len(m) // 1500)] for m in members if len(m) > 200]
+    shades = [np.median(rgb[m] / np.maximum(rgb[m].sum(axis=1, keepdims=True), 1), axis=0) for m in members]
+    for mine, shade in zip(members, shades, strict=True):
+        centre, radius = fit_circle(points[mine, :2].astype(float))
+        away = points[mine, :2] - centre
+        distance = np.linalg.norm(away, axis=1)
+        outward = float(np.mean(np.sum(normal[mine, :2] * away, axis=1) > 0))
+        if not 0.02 < radius < 0.2 or np.mean(np.abs(distance - radius) < 0.3 * radius) < MOST or ALONE < outward < 1 - ALONE:
+            continue
+        rim, top = float(np.percentile(distance, 97)), float(np.percentile(heights[mine], 97))
+        tree = cKDTree(points[labels == labels[mine[0]]])
+        for other, like in zip(members, shades, strict=True):
+            if labels[other[0]] == labels[mine[0]] or np.linalg.norm(shade - like) > ALIKE:
+                continue
+            away = points[other, :2] - centre
+            far = np.linalg.norm(away, axis=1)
+            within = far < 1.1 * rim
+            # What lies in a bowl lies in its middle as well.
+            if (
+                within.mean() < HANDLED
+                or np.median(far[within]) < BESIDE_RIM * rim
+                or np.percentile(heights[other][within], 97) > top + 0.012
+            ):
+                continue
+            faces = float(np.mean(np.sum(normal[other[within], :2] * away[within], axis=1) > 0))
+            # More of an inside is told by facing the middle: nothing that stands in it by itself does.
+            fits = 1 - faces > FACING if outward > 0.5 else faces > FACING or 1 - faces > INWARD
+            if fits and tree.query(points[labels == labels[other[0]]])[0].min() < TOUCHING:
+                labels[labels == labels[other[0]]] = labels[mine[0]]
+    return labels

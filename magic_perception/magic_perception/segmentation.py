@@ -87,7 +87,8 @@ def _parted(found: Clusters, seen: Surfaces, judge: Judge) -> NDArray[np.int64]:
         for number in range(1, int(part.max()) + 1):
             instance[mine[part == number]] = following
             following += 1
-    return convexity.insides(found.cloud, seen.normal, instance, seen.heights)
+    instance = convexity.insides(found.cloud, seen.normal, instance, seen.heights)
+    return convexity.with_handles(found.cloud, seen.normal, instance, seen.heights, seen.rgb)
 
 
 def _borne(looks: list[Looked], found: Clusters, seen: Surfaces, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:

@@ -254,3 +254,38 @@ def test_the_outside_of_a_bowl_belongs_to_its_inside_though_little_of_it_shows()
         np.vstack([wall, egg]), np.vstack([-way, way]), np.repeat([0, 1], len(wall)), np.concatenate([wall[:, 2], egg[:, 2]])
     )
     assert apart.max() == 1
+
+
+def ladle():
+    """Points and normals (N, 3) of a bowl's inside, of its near wall's outside with a long handle, and of an egg that lies in it at the wall."""
+    turn, up = (a.ravel() for a in np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(0, 1, 16), indexing="ij"))
+    way = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
+    wall = np.column_stack([(0.03 + 0.02 * up)[:, None] * way[:, :2], 0.03 + 0.05 * up])
+    near = np.cos(turn) < -0.3
+    along, around = (a.ravel() for a in np.meshgrid(np.linspace(-0.30, -0.055, 90), np.linspace(0.2, 2.9, 8), indexing="ij"))
+    side = np.column_stack([np.zeros_like(around), np.cos(around), np.sin(around)])
+    bar = np.column_stack([along, 0.006 * side[:, 1], 0.07 + 0.006 * side[:, 2]])
+    egg = np.column_stack([0.030 + 0.015 * way[:, 0], 0.015 * way[:, 1], 0.04 + 0.025 * up])
+    return (wall, -way), (np.vstack([wall[near] + 0.003 * way[near], bar]), np.vstack([way[near], side])), (egg, way)
+
+
+def test_the_parts_of_a_ladle_s_bowl_are_one_though_its_handle_belongs_to_one_of_them():
+    inside, handled, egg = ladle()
+    red, blue = (180.0, 40.0, 40.0), (40.0, 60.0, 180.0)
+
+    def one(first, second, colors=(red, red)):
+        points, normal = (np.vstack([first[i], second[i]]) for i in range(2))
+        labels = np.repeat([0, 1], [len(first[0]), len(second[0])])
+        return (
+            convexity.with_handles(points, normal, labels, points[:, 2], np.repeat(colors, [len(first[0]), len(second[0])], axis=0)).max()
+            == 0
+        )
+
+    assert one(inside, handled)
+    # So they are where a part of the inside is the handle's.
+    half, bar = inside[0][:, 0] < 0.0, tuple(x[-720:] for x in handled)
+    assert one(tuple(x[~half] for x in inside), tuple(np.vstack([b, a[half]]) for a, b in zip(inside, bar, strict=True)))
+    assert not one(inside, handled, (red, blue))
+    # Nor is it so of what lies in the bowl, or touches it from without.
+    assert not one(inside, egg)
+    assert not one(inside, (bar[0] + [0.006, 0.0, 0.0], bar[1]))
