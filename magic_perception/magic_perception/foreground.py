@@ -120,6 +120,9 @@ def _plates(faint: NDArray[np.bool_], core: NDArray[np.bool_], looked: Looked) -
             continue
         cut = (slice(y, y + h), slice(x, x + w))
         mine = regions[cut] == label
+        # Broad without the core, whose fringe it may be.
+        if cv2.distanceTransform(np.pad(mine, 1).view(np.uint8), cv2.DIST_L2, 3).max() < size // 2:
+            continue
         heights, noise = looked.raw[cut][mine], float(np.median(looked.sigma[cut][mine]))
         heights = heights[np.isfinite(heights)]
         error = noise * np.sqrt(GRAIN / max(len(heights), 1))
