@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import clusters, seams
+from magic_perception.attached import COLOR, shade
 
 
 def normals(points: NDArray[np.float32], eye: NDArray[np.float64], size: int = 7) -> NDArray[np.float32]:
@@ -282,6 +283,13 @@ def insides(
 WALL, MOST, INWARD, OUTWARD, WITHIN, BESIDE_RIM = 0.004, 0.6, 0.8, 0.75, 0.7, 0.75
 
 
+def _walls(normal: NDArray[np.floating], labels: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """The upright points of each label that has enough of them, thinned, by their numbers."""
+    upright = np.isfinite(normal[:, 0]) & (np.abs(normal[:, 2]) < 0.8)
+    members = [np.nonzero((labels == i) & upright)[0] for i in np.unique(labels[labels >= 0])]
+    return [m[:: max(1, len(m) // 1500)] for m in members if len(m) > 200]
+
+
 def _outsides(
     points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]
 ) -> NDArray[np.int64]:
@@ -292,9 +300,7 @@ def _outsides(
     """
     from magic_perception.primitives import fit_circle, likeliest_circle
 
-    upright = np.isfinite(normal[:, 0]) & (np.abs(normal[:, 2]) < 0.8)
-    members = [np.nonzero((labels == i) & upright)[0] for i in np.unique(labels[labels >= 0])]
-    members = [m[:: max(1, len(m) // 1500)] for m in members if len(m) > 200]
+    members = _walls(normal, labels)
     for mine in members:
         top = float(np.percentile(heights[mine], 97))
         place = np.column_stack([points[mine, :2], heights[mine]]).astype(float)
@@ -326,9 +332,8 @@ def _outsides(
 
 
 #: Of a part that has a handle such a share of its upright surfaces at least lies within the other's rim, beside it, and of these such a share faces the other way;
-#: chromaticity (R, G, B over their sum) of one thing is alike to so much, and its parts are so near each other, m.  Of an inside alone, or an outside alone, no more
-#: than a tenth faces otherwise.
-HANDLED, FACING, ALIKE, TOUCHING, ALONE = 0.1, 0.6, 0.06, 0.012, 0.1
+#: parts of one thing are so near each other, m.  Of an inside alone, or an outside alone, no more than a tenth faces otherwise.
+HANDLED, FACING, TOUCHING, ALONE = 0.1, 0.6, 0.012, 0.1
 
 
 def with_handles(
@@ -347,12 +352,9 @@ def with_handles(
 
     from magic_perception.primitives import fit_circle
 
-    labels = labels.copy()
-    upright = np.isfinite(normal[:, 0]) & (np.abs(normal[:, 2]) < 0.8)
-    members = [np.nonzero((labels == i) & upright)[0] for i in np.unique(labels[labels >= 0])]
-    members = [m[:: max(1, len(m) // 1500)] for m in members if len(m) > 200]
-    shades = [np.median(rgb[m] / np.maximum(rgb[m].sum(axis=1, keepdims=True), 1), axis=0) for m in members]
-    for mine, shade in zip(members, shades, strict=True):
+    labels, members = labels.copy(), _walls(normal, labels)
+    shades = [shade(rgb[m]) for m in members]
+    for mine, color in zip(members, shades, strict=True):
         centre, radius = fit_circle(points[mine, :2].astype(float))
         away = points[mine, :2] - centre
         distance = np.linalg.norm(away, axis=1)
@@ -362,7 +364,7 @@ def with_handles(
         rim, top = float(np.percentile(distance, 97)), float(np.percentile(heights[mine], 97))
         tree = cKDTree(points[labels == labels[mine[0]]])
         for other, like in zip(members, shades, strict=True):
-            if labels[other[0]] == labels[mine[0]] or np.linalg.norm(shade - like) > ALIKE:
+            if labels[other[0]] == labels[mine[0]] or np.linalg.norm(color - like) > COLOR:
                 continue
             away = points[other, :2] - centre
             far = np.linalg.norm(away, axis=1)

@@ -306,8 +306,8 @@ class Choice:
         """Whether nothing further is tried."""
         return self.best is not None and (self._rate >= 1.0 or self._more == 0)
 
-    def tried(self, motion: Any = None, rate: float = 1.0) -> None:
-        """A trial is over: it came to a ``motion`` that passed with this share of its rollouts, or to none."""
+    def tried(self, motion: Any, rate: float) -> None:
+        """A trial is over: it came to a ``motion`` that passed with this share of its rollouts, or to none (``None``)."""
         if self.best is not None:
             self._more -= 1
         if motion is not None and rate > self._rate:
