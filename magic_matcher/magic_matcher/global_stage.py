@@ -29,11 +29,14 @@ ACROSS = 0.25
 class Reference:
     """The demonstration's contact as the backends see it.
 
-    pixel (2,) on the tool's contour in ``view``; normal (2,) unit, outward; concave: its
-    sign; target_radius: radius in pixels of ``view`` of the object touched there (the
-    target's curvature at p_O), ``None`` where it is unknown; contour: of view.mask; let_go:
-    the tool stays at the target, held by it alone; straight: it is led
-    along the contact's normal as long as it acts on the target.
+    Attributes
+    ----------
+    pixel, normal : (2,) on the tool's contour in ``view``, and (2,) unit, outward.
+    concave, radius : its sign, and its radius of curvature, px.
+    target_radius : px of ``view``, of the object touched there (the target's curvature at p_O); ``None`` where it is unknown.
+    contour : of view.mask.
+    let_go : the tool stays at the target, held by it alone.
+    straight : it is led along the contact's normal as long as it acts on the target.
     """
 
     view: CanonicalView

@@ -58,9 +58,19 @@ ANOTHER_WAY, PRESENT_WAY = np.deg2rad(45.0), np.deg2rad(5.0)
 
 @dataclass(frozen=True)
 class MatchResult:
-    """candidates best first (of all tools together); heatmap (H, W) float32 0..1 over the view
-    of the best candidate's tool, ``None`` unless asked for; views: the view in which its
-    best candidates were found, for each tool id (:func:`magic_core.views.view_of_contact` gives the view of each); target_id: '' where the target came as a view or there was none; refused: why other tools have no candidate."""
+    """What a match found.
+
+    Attributes
+    ----------
+    candidates : best first, of all tools together.
+    heatmap : (H, W) float32 0..1 over the view of the best candidate's tool; ``None`` unless asked for.
+    views : the view in which its best candidates were found, for each tool id; :func:`magic_core.views.view_of_contact` gives the view of
+        each.
+    target_id : empty where the target came as a view or there was none.
+    features : the backend's name.
+    seconds : by the clock.
+    refused : why other tools have no candidate.
+    """
 
     candidates: tuple[ContactCandidate, ...]
     heatmap: NDArray[np.float32] | None

@@ -23,10 +23,16 @@ DOWN = np.deg2rad(20.0)
 class Tool:
     """A tool to consider: its id, the view in which contacts are matched, and what draws further ones, where it can be turned.
 
-    askew: the view is not square to the tool, and stands back behind the others.  seen_share: how much of its surface was seen;
-    unseen_side: the level direction (2,), in the world, that the rest of it faces, where that is known.  told_in: the view in which what is
-    found in ``view`` is told, where that is another.  up (3,): the vertical, in the object's frame, of what cameras saw as it lies, and in a
-    cut shows sides that none of them saw; ``None``: all sides are known.  mesh: on whose surface contacts are put, ``None`` where there are pictures alone.
+    Attributes
+    ----------
+    others : draws the further views.
+    askew : the view is not square to the tool, and stands back behind the others.
+    seen_share : how much of its surface was seen.
+    unseen_side : the level direction (2,), in the world, that the rest of it faces, where that is known.
+    told_in : the view in which what is found in ``view`` is told, where that is another.
+    mesh : on whose surface contacts are put; ``None`` where there are pictures alone.
+    up : (3,), the vertical, in the object's frame, of what cameras saw as it lies, and in a cut shows sides that none of them saw;
+        ``None``: all sides are known.
     """
 
     id: str

@@ -59,10 +59,13 @@ PRIOR = np.array([0.03, 0.03, 0.03])
 class Disagreement:
     """How camera ``second`` sees the world displaced from where ``first`` does.
 
-    offset: by how much, m, in the middle of the things that both see, and angle, rad: the likeliest ones; errors: their standard errors.
-    sure: how much of both, m and rad, is more than chance: what the tables tell, and of the things what is believed of them.
-    motion (3,): what of that is left once each camera's table is the common plane: shifts in m along x and y of the table frame, and a turn in
-    rad about ``centre`` (3,), that carry what ``second`` sees to where ``first`` does.
+    Attributes
+    ----------
+    offset, angle : by how much, m, in the middle of the things that both see, and rad: the likeliest ones.
+    errors : their standard errors.
+    sure : how much of both, m and rad, is more than chance: what the tables tell, and of the things what is believed of them.
+    motion, centre : (3,), what is left once each camera's table is the common plane: shifts in m along x and y of the table frame, and a
+        turn in rad about ``centre`` (3,), that carry what ``second`` sees to where ``first`` does.
     """
 
     first: str

@@ -25,13 +25,24 @@ from magic_perception.segmenters import SEGMENTERS
 class Settings:
     """What the node is told; times in s.
 
-    cameras: their names.  frame: of the results.  skew: a camera's newest frame may be older than the newest of all by this; patience: a camera may be silent for
-    so long; max_age: frames may be so old by the node's clock, 0: any.  aligned: depth is registered to colour by the driver.  count: frames of a camera at rest
-    that are averaged.
-    transform_timeout: the transform at an image's stamp is waited for so long.  tolerance: the stamps of colour and depth differ by no more.  period: between two
-    scenes, at least.  depth_unit: what 1 in a depth image is, empty: what its encoding says.  segmenter, weights, device: what finds masks, and where it runs.
-    algorithm: what :func:`magic_perception.pipeline.perceive` is told.  extrinsics: world_from_camera (4, 4) of the cameras whose pose does not come from TF.
-    keyframes: earlier views that are kept at most; keyframe_age: for how long.  workers: processes that perceive, this one among them.
+    Attributes
+    ----------
+    cameras : their names.
+    frame : of the results.
+    skew : a camera's newest frame may be older than the newest of all by this.
+    patience : a camera may be silent for so long.
+    max_age : frames may be so old by the node's clock; 0: any.
+    aligned : depth is registered to colour by the driver.
+    count : frames of a camera at rest that are averaged.
+    transform_timeout : the transform at an image's stamp is waited for so long.
+    tolerance : the stamps of colour and depth differ by no more.
+    period : between two scenes, at least.
+    depth_unit : what 1 in a depth image is; empty: what its encoding says.
+    segmenter, weights, device : what finds masks, and where it runs.
+    algorithm : what :func:`magic_perception.pipeline.perceive` is told.
+    extrinsics : world_from_camera (4, 4) of the cameras whose pose does not come from TF.
+    keyframes, keyframe_age : earlier views that are kept at most, and for how long.
+    workers : processes that perceive, this one among them.
     """
 
     cameras: tuple[str, ...]

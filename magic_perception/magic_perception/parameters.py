@@ -16,27 +16,30 @@ WORKSPACE = {"region_low": (0.15, -0.6, -0.05), "region_high": (0.95, 0.6, 0.5)}
 
 @dataclass(frozen=True)
 class Parameters:
-    """What :func:`magic_perception.pipeline.perceive` may be told; lengths in metres.
+    """What :func:`magic_perception.pipeline.perceive` may be told; lengths in m.
 
-    region_low, region_high (3,): the workspace box; x and y in the world frame, z above the table that was found; what is
-    outside is not looked at.  A table farther than -region_low[2] from the world's z = 0 is used and said.
-    table_tilt: largest angle in degrees between the table's normal and the world's up.
-    table_band: points this near to a plane hypothesis agree with it.
-    snap_height, snap_tilt: a table found this near (metres, degrees) to the plane z = 0 is taken to be that plane,
-    and the cameras' small errors of calibration are taken out; 0 turns it off.
-    min_height: least height above the table that depth alone may call an object.
-    min_pixels, min_extent: smaller things are noise.  max_extent: what is longer and cut by the picture or the region is no thing
-    on the table.
-    cluster_eps, cluster_points: DBSCAN's radius and neighbours on the thinned cloud.
-    known_margin: points this near to a known object belong to it.
-    resolution: cell of the occupancy grids that outlines come from.
-    wall: assumed wall thickness of things that are seen to be hollow from above.
-    use_color: refine masks by the colour difference to the table.
-    arm_offset: cameras that see the arm farther than this from where its joints put it are refused, and by less what they see is moved; 0: neither.
-    split: part touching objects where what is measured at a concave seam, or at an upright plane between colours, says that they are two
-    (:mod:`magic_perception.seams`, :mod:`magic_perception.cuts`).
-    max_objects: the largest ones are kept.
-    method: ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
+    Attributes
+    ----------
+    region_low, region_high : (3,), the workspace box; x and y in the world frame, z above the table that was found.  What is outside is not
+        looked at.  A table farther than -region_low[2] from the world's z = 0 is used and said.
+    table_tilt : degrees, the largest angle between the table's normal and the world's up.
+    table_band : points this near to a plane hypothesis agree with it.
+    snap_height, snap_tilt : a table found this near (m, degrees) to the plane z = 0 is taken to be that plane, and the cameras' small errors
+        of calibration are taken out; 0 turns it off.
+    min_height : least height above the table that depth alone may call an object.
+    min_pixels, min_extent : smaller things are noise.
+    max_extent : what is longer and cut by the picture or the region is no thing on the table.
+    cluster_eps, cluster_points : DBSCAN's radius and neighbours on the thinned cloud.
+    known_margin : points this near to a known object belong to it.
+    resolution : cell of the occupancy grids that outlines come from.
+    wall : assumed wall thickness of things that are seen to be hollow from above.
+    use_color : refine masks by the colour difference to the table.
+    arm_offset : cameras that see the arm farther than this from where its joints put it are refused, and by less what they see is moved;
+        0: neither.
+    split : part touching objects where what is measured at a concave seam, or at an upright plane between colours, says that they are two
+        (:mod:`magic_perception.seams`, :mod:`magic_perception.cuts`).
+    method : ``completed``, or ``paper`` for the plain projection and alpha shape of the paper.
+    max_objects : the largest ones are kept.
     """
 
     region_low: tuple[float, float, float] = (-np.inf, -np.inf, -0.05)

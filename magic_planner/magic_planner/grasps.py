@@ -32,14 +32,22 @@ LEVEL = 0.17
 
 @dataclass(frozen=True)
 class GraspSettings:
-    """agreement: least cosine between the inward normal at one finger and the outward normal at the other.
-    samples: surface points tried.  pairs: antipodal pairs kept of them.
-    angles: approach directions about the closing axis.  poses: hand poses tested in one lot, enough: how many of them have to be clear
-    for no further lot to be tested.  looked: hand poses whose pads are
-    looked at.  standoff: metres of straight way to the grasp.  clearance: metres kept between hand and table.
-    margin: metres left on each side of the object in the open hand.  away: metres
-    around the contact in which no finger is placed.  force (N, what the contact pushes with) and density (kg/m^3) of the slip
-    estimate; grip_force: newtons of each finger; friction: coefficient between pad and tool."""
+    """How grasps are drawn and ranked.
+
+    Attributes
+    ----------
+    agreement : least cosine between the inward normal at one finger and the outward normal at the other.
+    samples, pairs : surface points tried, and antipodal pairs kept of them.
+    poses, enough : hand poses tested in one lot, and how many of them have to be clear for no further lot to be tested.
+    looked : hand poses whose pads are looked at.
+    standoff : m of straight way to the grasp.
+    angles : approach directions about the closing axis.
+    clearance : m kept between hand and table.
+    margin : m left on each side of the object in the open hand.
+    away : m around the contact in which no finger is placed.
+    force, density : N, what the contact pushes with, and kg/m^3 of the tool, for the slip estimate.
+    grip_force, friction : N of each finger, and coefficient between pad and tool.
+    """
 
     agreement: float = 0.9
     samples: int = 500

@@ -26,14 +26,24 @@ STAGES = ("motion", "grasp", "task", "approach", "lift", "transfer", "retreat", 
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """key_length, key_angle: spacing of the poses at which grasps are compared.  lots: how many are compared at once, the best ones
-    first; closer: the same where none of these serves and more are looked for.  tries: plans that may fail after the hand has come to
-    its grasp; quick_tries: those that may fail before, by arm and tool along the task or on the way to the grasp, of each lot.  standoff: metres before the grasp from which the hand comes straight.
-    lift, retreat: metres.  room: metres about a tool that is
-    carried, and about all that the empty hand passes.  dwell: seconds for the fingers to close or open.  jump: largest joint step between
-    neighbouring key poses, rad.  time_step of the result, s.  free_time: seconds for one search of a free path (it
-    takes some 30 ms; the limit is wide so that a loaded machine finds the same path).  searches: how many of a request may fail, of those
-    that keep room about things and of the others."""
+    """How an arm's motion is searched for.
+
+    Attributes
+    ----------
+    key_length, key_angle : m and rad, spacing of the poses at which grasps are compared.
+    lots : how many grasps are compared at once, the best ones first.
+    closer : the same where none of these serves and more are looked for.
+    tries : plans that may fail after the hand has come to its grasp.
+    quick_tries : those of each lot that may fail before, by arm and tool along the task or on the way to the grasp.
+    standoff : m before the grasp from which the hand comes straight.
+    lift, retreat : m up with the tool, and back from it after a release.
+    room : m about a tool that is carried, and about all that the empty hand passes.
+    dwell : s for the fingers to close or open.
+    jump : rad, the largest joint step between neighbouring key poses.
+    time_step : s, of the result.
+    free_time : s for one search of a free path.  It takes some 0.03 s; the limit is wide so that a loaded machine finds the same path.
+    searches : how many of a request may fail, of those that keep room about things and of the others.
+    """
 
     key_length: float = 0.02
     key_angle: float = np.deg2rad(8.0)
@@ -65,9 +75,12 @@ class Branch:
 class Problem:
     """What the arm is asked for, and all that its plan is a function of: to take a tool that lies in the world along ``motion``.
 
-    candidate, reflection: the contacts for which the motion was made, as :func:`magic_planner.object_motion.plan_tool_motion` had them.
-    table (4,): plane with its unit normal up.  start (J,): where the arm is (``None``: home).  attempt: 0 for the best grasp, n for the n-th
-    next that differs from those before.
+    Attributes
+    ----------
+    candidate, reflection : the contacts for which the motion was made, as :func:`magic_planner.object_motion.plan_tool_motion` had them.
+    table : (4,), plane with its unit normal up.
+    start : (J,), where the arm is; ``None``: home.
+    attempt : 0 for the best grasp, n for the n-th next that differs from those before.
     """
 
     strategy: Strategy

@@ -38,16 +38,21 @@ UNKNOWN_SIZE = 0.1
 class ArmOptions:
     """Controller and gripper.
 
-    stiffness Nm/rad and damping Nms/rad (N/m and Ns/m where a joint slides) of the arm's joint drives, one for
-    each joint or one for all (the defaults are those of Franka's joint impedance controller, near critical
-    damping); armature kg m^2 is what the geared motors add to each joint's inertia; grip_force N with which each
-    finger presses on what it has closed on; finger_stiffness N/m couples the two fingers, which a belt does in
-    the real hand, and finger_armature kg is what its gears add to each of them; closing_speed m/s of each free
-    finger; quiet s for which the fingers must stand still before they have closed on nothing, closing_time s after
-    which they have anyway.  past m: not the belt but a drive for each finger closes the hand, sent so far past
-    where the fingers meet while the arm goes on, and nothing but the engine's contacts holds the tool: what the hands
-    of other simulators do, not real ones.  command_period s: each command stays for so long, 0 for every step of the
-    simulation: by what it jumps the arm jerks.  effort Nm (N) that each drive of the arm gives at most, 0 for the URDF's.
+    Attributes
+    ----------
+    stiffness, damping : Nm/rad and Nms/rad (N/m and Ns/m where a joint slides) of the arm's joint drives, one for each joint or one for
+        all.  The defaults are those of Franka's joint impedance controller, near critical damping.
+    armature : kg m^2 that the geared motors add to each joint's inertia.
+    grip_force : N with which each finger presses on what it has closed on.
+    finger_stiffness : N/m that couple the two fingers, as a belt does in the real hand.
+    finger_armature : kg that its gears add to each of them.
+    closing_speed : m/s of each free finger.
+    finger_friction : of the pads.
+    quiet, closing_time : s for which the fingers must stand still before they have closed on nothing, and s after which they have anyway.
+    past : m; where it is given, not the belt but a drive for each finger closes the hand, sent so far past where the fingers meet while the
+        arm goes on, and nothing but the engine's contacts holds the tool: what the hands of other simulators do, not real ones.
+    command_period : s for which each command stays, 0 for every step of the simulation; by what it jumps the arm jerks.
+    effort : Nm (N) that each drive of the arm gives at most; 0: the URDF's.
     """
 
     stiffness: tuple[float, ...] = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)

@@ -52,14 +52,19 @@ DYNAMIC = "dynamic"
 class Settings:
     """Numbers of the solver.
 
-    frequency in Hz; contact_offset in metres: pairs nearer than twice this are
-    solved (PhysX's default of 10 mm makes things of 20 mm hover and stick);
-    restitution counts where bodies meet faster than bounce_threshold (m/s);
-    max_depenetration_speed in m/s: how fast an initial overlap is pushed apart;
-    angular_damping in 1/s; rolling_damping, the same for balls, stands for the rolling
-    resistance that PhysX does not have (5 / s slows a ball of 0.1 m/s by 0.14 m/s^2, a
-    coefficient of rolling resistance of 0.015);
-    max_speed (m/s) and max_distance (m from the origin) bound what is believable.
+    Attributes
+    ----------
+    frequency : steps a second.
+    position_iterations, velocity_iterations : of the solver in each step.
+    contact_offset, rest_offset : m; pairs nearer than twice the contact offset are solved.  PhysX's default of 10 mm makes things of 20 mm
+        hover and stick.
+    restitution, bounce_threshold : restitution counts where bodies meet faster than the threshold, m/s.
+    max_depenetration_speed : m/s at which an initial overlap is pushed apart.
+    linear_damping, angular_damping : 1/s.
+    rolling_damping : 1/s, for balls; stands for the rolling resistance that PhysX does not have.  5 / s slows a ball of 0.1 m/s by
+        0.14 m/s^2, a coefficient of rolling resistance of 0.015.
+    max_speed, max_distance : m/s, and m from the origin; they bound what is believable.
+    gravity : m/s^2.
     """
 
     frequency: float = 240.0

@@ -64,12 +64,16 @@ class ArmSeen:
 class RgbdFrame:
     """One colour image with depth registered to it.
 
-    color (H, W, 3) uint8 RGB; depth (H, W) float32 metres, NaN where there is
-    none; world_from_camera (4, 4) pose of the colour optical frame; stamp in seconds.
-    blind (H, W) bool: something that is no part of the scene (the robot) stands before
-    it there, so that the pixel tells nothing, neither of things nor of free space.
-    held (H, W) uint8: :data:`SURELY` where what the robot holds is seen, :data:`NEARLY` where it may be, else 0.
-    arm: how the arm was seen before it was cut out, where that was measured.
+    Attributes
+    ----------
+    color : (H, W, 3) uint8 RGB.
+    depth : (H, W) float32 m, NaN where there is none.
+    world_from_camera : (4, 4), pose of the colour optical frame.
+    stamp : s.
+    blind : (H, W) bool, something that is no part of the scene (the robot) stands before it there, so that the pixel tells nothing, neither
+        of things nor of free space.
+    held : (H, W) uint8, :data:`SURELY` where what the robot holds is seen, :data:`NEARLY` where it may be, else 0.
+    arm : how the arm was seen before it was cut out, where that was measured.
     """
 
     color: NDArray[np.uint8]

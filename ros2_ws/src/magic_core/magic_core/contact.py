@@ -28,13 +28,15 @@ SHARP = 0.2
 class Contact:
     """One contact point on one object (p_T or p_O of the paper).
 
-    pixel (2,) float (u, v) in the canonical view; normal (2,) unit, outward, in
-    picture coordinates (u right, v down); radius r of curvature in metres (inf on
-    a straight edge); concave: the centre of curvature lies outside the material;
-    scale: the motion functional scale s_j in metres; object_from_contact (4, 4): its origin is as
-    deep along z as the surface is where the mesh is known, else on the view's plane; surface: the
-    point of the mesh with its normal and both principal curvatures, ``None`` where there is no mesh
-    or it has an edge there.
+    Attributes
+    ----------
+    pixel : (2,) float (u, v) in the canonical view.
+    normal : (2,) unit, outward, in picture coordinates (u right, v down).
+    radius : r of curvature, m; inf on a straight edge.
+    concave : the centre of curvature lies outside the material.
+    scale : the motion functional scale s_j, m.
+    object_from_contact : (4, 4); its origin is as deep along z as the surface is where the mesh is known, else on the view's plane.
+    surface : the point of the mesh with its normal and both principal curvatures; ``None`` where there is no mesh or it has an edge there.
     """
 
     pixel: NDArray[np.float64]
@@ -70,13 +72,15 @@ class Companion:
 class ContactCandidate:
     """A proposed contact on a new tool, with the contact on the target that it would meet.
 
-    rotation (radians, 0..2 pi) and flipped: the in-plane turn of the reference view,
-    and whether it was mirrored, under which the reference looked most like the new
-    tool.  s_dino is the global score, s_curv the local one, score their combination.
-    tool_from_reference (4, 4) carries the reference tool's frame onto the new tool's
-    frame by aligning the contact frames.  companions: the further contacts of a strategy
-    with several, in its order; score is then that of all together.  turn: by how much (rad) target's contact and motion are
-    turned about the vertical from how the strategy has them, as something stands in the way of that.
+    Attributes
+    ----------
+    rotation, flipped : the in-plane turn of the reference view (rad, 0..2 pi), and whether it was mirrored, under which the reference looked
+        most like the new tool.
+    s_dino, s_curv, score : the global score, the local one, and their combination.
+    tool_from_reference : (4, 4), carries the reference tool's frame onto the new tool's frame by aligning the contact frames.
+    companions : the further contacts of a strategy with several, in its order; score is then that of all together.
+    turn : rad, by which target's contact and motion are turned about the vertical from how the strategy has them, as something stands in
+        the way of that.
     """
 
     tool_id: str

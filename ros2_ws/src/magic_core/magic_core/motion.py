@@ -57,10 +57,13 @@ class ToolMotion:
 class ArmMotion:
     """A joint trajectory with the moments at which the gripper closes and opens.
 
-    times (N,) seconds from 0; positions, velocities, accelerations (N, J) in rad,
-    rad/s, rad/s^2 for joint_names; tool_from_tcp (4, 4) the grasp; grasp_width the
-    opening in metres when closed on the tool; grasp_time and release_time seconds
-    from the start (``None``: the tool stays in hand).
+    Attributes
+    ----------
+    times : (N,) s from 0.
+    positions, velocities, accelerations : (N, J) in rad, rad/s, rad/s^2, of ``joint_names``.
+    tool_from_tcp : (4, 4), the grasp.
+    grasp_width : m between the fingers when closed on the tool.
+    grasp_time, release_time : s from the start; no release time: the tool stays in hand.
     """
 
     times: NDArray[np.float64]

@@ -39,14 +39,20 @@ ALONG = 0.99
 class RobotConfig:
     """Which arm and gripper, and how fast.
 
-    urdf, srdf: files; empty: the Panda of the package ``example-robot-data``.  package_root: what
-    ``package://`` in the URDF stands for; empty: the folder above the URDF in which a mesh is found, else
-    the share folder of the ROS package.  move_group: the link between the fingertips, z out of the hand.
-    closing_axis: along which axis of that link the fingers close.  opening: metres between the open fingers.
-    home: joint positions.  acceleration, jerk: limits in rad/s^2 and rad/s^3, one for each joint or one for all.  scales: share
-    of the limits used.  preset: whose published limits hold besides the URDF's (:mod:`magic_core.joint_limits`); empty: the Panda's
-    where there is no URDF either, else nobody's.  base_frame: the name that objects, trajectories and TF have for the frame of the URDF's root
-    link; empty: that link's own name.
+    Attributes
+    ----------
+    urdf, srdf : files; empty: the Panda of the package ``example-robot-data``.
+    package_root : what ``package://`` in the URDF stands for; empty: the folder above the URDF in which a mesh is found, else the share
+        folder of the ROS package.
+    move_group : the link between the fingertips, z out of the hand.
+    closing_axis : along which axis of that link the fingers close.
+    opening : m between the open fingers.
+    home : (J,) joint positions.
+    acceleration, jerk : limits in rad/s^2 and rad/s^3, one for each joint or one for all.
+    velocity_scale, acceleration_scale, jerk_scale : share of the limits that is used.
+    base_frame : the name that objects, trajectories and TF have for the frame of the URDF's root link; empty: that link's own name.
+    preset : whose published limits hold besides the URDF's (:mod:`magic_core.joint_limits`); empty: the Panda's where there is no URDF
+        either, else nobody's.
     """
 
     urdf: str = ""
@@ -136,12 +142,18 @@ def panda_folder() -> Path:
 class Description:
     """An arm with a parallel gripper as its URDF and SRDF give it; raises BAD_REQUEST with what is wrong with them.
 
-    arm: the moving joints from the root to the move group, in order, their ranges no wider than half a turn either side of home:
-    a turn more is the same to the hand, and takes a planner round in circles.  fingers: two sliding joints beyond the last of these,
-    closed (2,) and opened (2,) their positions in metres.  finger_links: what moves with the fingers; foot: what never moves.
-    base: the root link; base_frame: what its frame is called outside the URDF, the frame of everything that is planned and
-    verified.  root: the URDF's own element.  masses: of each link that has one, kg, and its centre (3,), m in the link's frame.  moving: names of the joints of arm and fingers; others (a head, a second arm) are held at zero.  disabled: pairs of links that
-    may touch.
+    Attributes
+    ----------
+    root : the URDF's own element.
+    base, base_frame : the root link, and what its frame is called outside the URDF: the frame of everything that is planned and verified.
+    arm : the moving joints from the root to the move group, in order, their ranges no wider than half a turn either side of home: a turn
+        more is the same to the hand, and takes a planner round in circles.
+    fingers : two sliding joints beyond the last of these.
+    closed, opened : (2,) m, their positions.
+    moving : names of the joints of arm and fingers; others (a head, a second arm) are held at zero.
+    finger_links, foot : what moves with the fingers; what never moves.
+    masses : of each link that has one, kg, and its centre (3,), m in the link's frame.
+    disabled : pairs of links that may touch.
     """
 
     def __init__(self, config: RobotConfig | None = None) -> None:

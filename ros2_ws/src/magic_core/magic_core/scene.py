@@ -27,16 +27,19 @@ SCALES = 1e-7, 10.0
 class CanonicalView:
     """An orthographic picture of one object in its canonical pose (paper, III-A).
 
-    The view frame is an optical frame: x right, y down, z into the picture.  Its
-    origin is the image's centre, pixel ((W - 1) / 2, (H - 1) / 2), on the plane
-    through the middle of the object, the plane in which contacts are modelled.
+    The view frame is an optical frame: x right, y down, z into the picture.  Its origin is the image's centre, pixel
+    ((W - 1) / 2, (H - 1) / 2), on the plane through the middle of the object, the plane in which contacts are modelled.
 
-    image (H, W, 3) uint8 RGB, black background; mask (H, W) bool; depth (H, W)
-    float32 metres along z from the view plane (negative: nearer to the eye), NaN
-    off the object; metres_per_pixel; object_from_view (4, 4).  ``kind`` is ``top``
-    (seen from above), ``side`` (the side that shows the handle or the hole) or
-    ``section`` (the upright cut along the long axis, drawn as a filled silhouette).
-    ``confidence`` in 0..1 says how clearly this view was the canonical one.
+    Attributes
+    ----------
+    image : (H, W, 3) uint8 RGB, black background.
+    mask : (H, W) bool, the object.
+    metres_per_pixel : scale of the picture; 1 where it is not known.
+    object_from_view : (4, 4).
+    kind : ``top`` (seen from above), ``side`` (the side that shows the handle or the hole) or ``section`` (the upright cut along the long
+        axis, drawn as a filled silhouette).
+    depth : (H, W) float32, m along z from the view plane, negative nearer to the eye; NaN off the object.
+    confidence : 0..1, how clearly this view was the canonical one.
     """
 
     image: NDArray[np.uint8]
@@ -83,20 +86,23 @@ class CanonicalView:
 class SceneObject:
     """One rigid object: what perception saw of it and what it was completed to.
 
-    mesh and pieces are in the object frame; the pieces are convex and together
-    fill the mesh (they are what physics and planning use).  points (N, 3) world
-    metres with colors (N, 3) uint8 are the cleaned cloud.  mask (H, W) bool in the
-    image of ``camera``; picture (h, w, 3) uint8 RGB: that image about it, with a margin.  box_extents (3,) metres along the axes of world_from_box.
-    ``hanging``: it is above the table with nothing below that could carry it: a hand,
-    the arm, a cable, and no thing to plan with.
-    ``source`` is ``camera``, or ``known`` for a calibrated fixture or a given mesh.
-    ``confidence`` 0..1 is the chance, as measured on known scenes, that mask and solid
-    overlap the truth by more than 0.8; ``seen_share`` 0..1 how much of the mesh's surface,
-    what rests on the table left out, a camera saw.  ``surface_error``: the root mean square
-    distance, m, between mesh and true surface, below which it is for five of six things that look
-    like this one; 0 where nobody says.  ``cut_off`` names what keeps a part out
-    of sight: ``picture``, ``region``, ``fixture``, ``robot``, or ids of objects in front; ``unseen``:
-    no camera sees it now, it is remembered.  Such a thing is no whole tool.
+    Attributes
+    ----------
+    mesh, pieces : the closed surface and convex pieces that together fill it, in the object frame; physics and planning use the pieces.
+    world_from_object : (4, 4).
+    view : the canonical view.
+    points, colors : (N, 3) m in the world and (N, 3) uint8, the cleaned cloud.
+    mask : (H, W) bool in the image of ``camera``.
+    picture : (h, w, 3) uint8 RGB, that image about the object, with a margin.
+    world_from_box, box_extents : (4, 4), and (3,) m along its axes.
+    confidence : 0..1, the chance, as measured on known scenes, that mask and solid overlap the truth by more than 0.8.
+    source : ``camera``, or ``known`` for a calibrated fixture or a given mesh.
+    seen_share : 0..1, how much of the mesh's surface a camera saw, what rests on the table left out.
+    cut_off : what keeps a part out of sight: ``picture``, ``region``, ``fixture``, ``robot``, or ids of objects in front; ``unseen``: no
+        camera sees it now, it is remembered.  Such a thing is no whole tool.
+    hanging : it is above the table with nothing below that could carry it (a hand, the arm, a cable), and no thing to plan with.
+    surface_error : m, the root mean square distance between mesh and true surface below which it is for five of six things that look like
+        this one; 0 where nobody says.
     """
 
     id: str
@@ -123,9 +129,12 @@ class SceneObject:
 class Scene:
     """What is on the table at one moment.
 
-    table (4,): the plane a x + b y + c z + d = 0 in world coordinates, unit normal up.
-    camera_offset (metres) and camera_angle (radians): how far the cameras' poses disagree,
-    the worst pair; NaN where it could not be measured.  notes: what there is to say of the scene.
+    Attributes
+    ----------
+    table : (4,), the plane a x + b y + c z + d = 0 in world coordinates, unit normal up.
+    stamp : s.
+    camera_offset, camera_angle : m and rad, how far the cameras' poses disagree, the worst pair; NaN where it could not be measured.
+    notes : what there is to say of the scene, in sentences.
     """
 
     objects: tuple[SceneObject, ...]

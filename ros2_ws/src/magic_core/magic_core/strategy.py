@@ -100,18 +100,24 @@ class Physics:
 class Strategy:
     """The demonstration and how it is to be carried over.
 
-    view: kind of canonical view the contacts are matched in.  mode: ``plan`` goes
-    through the waypoints, ``retarget`` carries the demonstrated trajectory over.
-    target_normal (3,): world direction of the target's outward normal at p_O (the
-    side on which the tool acts); target_view_direction (3,): world direction in which
-    the target is looked at, and with which the tool's view direction is made to agree.
-    target_outline: one of OUTLINES; "cut" has
-    the target drawn as cut through its middle, "feature" has p_O found by the matching that finds p_T, among the places
-    that face the target's normal.  reflections: what to do with mirrored matches, in
-    order of trial: ``keep`` the tool's face or ``turn`` it over.  environment: names
-    and numbers of fixed things around (for the scene set-ups).  contacts: the pairs of
-    contacts after the first.  turned_by: by how much (rad) to either side the target's normal, and with it
-    motion and goal, may be turned about the vertical where something stands in the way (degrees, ``target: turned_by`` in the file).
+    Attributes
+    ----------
+    view : kind of canonical view the contacts are matched in.
+    mode : ``plan`` goes through the waypoints, ``retarget`` carries the demonstrated trajectory over.
+    tool_view, tool_contact : where p_T is on the demonstrated tool.
+    target_view, target_contact : where p_O is on the demonstrated target.
+    target_normal : (3,) in the world, the target's outward normal at p_O: the side on which the tool acts.
+    target_view_direction : (3,) in the world, along which the target is looked at; the tool's view direction is made to agree with it.
+    times, target_from_tool : (T,) s and (T, 4, 4), the demonstrated motion.
+    target_outline : one of OUTLINES; "cut" has the target drawn as cut through its middle, "feature" has p_O found by the matching that
+        finds p_T, among the places that face the target's normal.
+    reflections : what to do with mirrored matches, in order of trial: ``keep`` the tool's face or ``turn`` it over.
+    releases : the tool is let go at the end.
+    simulatable : physics can judge the goal.
+    environment : names and numbers of the fixed things around, for scenes and evaluations.
+    contacts : the pairs of contacts after the first.
+    turned_by : rad, how far to either side the target's normal, and with it motion and goal, may be turned about the vertical where
+        something stands in the way (``target: turned_by`` in the file, degrees).
     """
 
     name: str

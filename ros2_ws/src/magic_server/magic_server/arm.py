@@ -33,14 +33,21 @@ SLOW = 10.0
 class ArmSettings:
     """How a plan is carried out.
 
-    speed: 1 as planned, less: slower by that factor.  start_tolerance: rad that a joint may be off where a move begins.
-    state_age: s that a joint state may be old.  opening: m between the open fingers.  finger_scale: position of the gripper's
-    joint for a metre of opening (0.5 where the joint is one of two fingers).  gripper_command: the gripper's action, of :mod:`magic_server.gripper`; gripper_joint: the
-    joint's name, which ParallelGripperCommand asks for.  squeeze: m that the fingers are told to close
-    beyond the tool's thickness (for drivers that only control position).  effort: of the gripper, N; 0: the driver's own.
-    grasp_tolerance: m that the opening of the closed fingers may differ from the planned one.  presence: s to wait for a
-    server.  path_tolerance, goal_tolerance: rad that a joint may be off its trajectory on the way, and at the end within goal_time s
-    after its time; 0: the controller's own.  They are sent with each move, and the controller ends it where one is exceeded.
+    Attributes
+    ----------
+    speed : 1 as planned, less: slower by that factor.
+    start_tolerance : rad that a joint may be off where a move begins.
+    path_tolerance, goal_tolerance, goal_time : rad that a joint may be off its trajectory on the way, and at the end within so many s after
+        its time; 0: the controller's own.  They are sent with each move, and the controller ends it where one is exceeded.
+    state_age : s that a joint state may be old.
+    opening : m between the open fingers.
+    finger_scale : position of the gripper's joint for a metre of opening; 0.5 where the joint is one of two fingers.
+    squeeze : m that the fingers are told to close beyond the tool's thickness, for drivers that only control position.
+    effort : N of the gripper; 0: the driver's own.
+    grasp_tolerance : m that the opening of the closed fingers may differ from the planned one.
+    presence : s to wait for a server.
+    gripper_command, gripper_joint : the gripper's action, of :mod:`magic_server.gripper`, and the joint's name, which ParallelGripperCommand
+        asks for.
     """
 
     speed: float = 1.0

@@ -81,13 +81,17 @@ class Look:
 class Claim:
     """A motion that is to be published or carried out.
 
-    run: the run that it belongs to.  frames: of its trajectories.  scene: what it was planned for.  verdict: None where physics
-    cannot judge; ``waived`` then says that goal and server both accept that, for the arm alone.
-    joints, start: of an arm's trajectory, and their positions, rad, where the next move begins; both empty without an arm.
-    state_known: whether the plan began where the arm was heard to be; else it began at home.
-    meant: ids of what the motion itself has moved so far; carried: hull of the tool where it was when the newest objects were seen, if the arm has, or had, it in
-    its hand, else None.
-    motion: the motion itself, which the rule does not look into, and mark: what tells it from others, as its verdict has it.
+    Attributes
+    ----------
+    run : the run that it belongs to.
+    frames : of its trajectories.
+    scene : what it was planned for.
+    verdict, waived : ``None`` where physics cannot judge; ``waived`` then says that goal and server both accept that, for the arm alone.
+    joints, start : of an arm's trajectory, and their positions, rad, where the next move begins; both empty without an arm.
+    state_known : whether the plan began where the arm was heard to be; else it began at home.
+    meant : ids of what the motion itself has moved so far.
+    carried : hull of the tool where it was when the newest objects were seen, if the arm has, or had, it in its hand, else ``None``.
+    motion, mark : the motion itself, which the rule does not look into, and what tells it from others, as its verdict has it.
     """
 
     run: str
@@ -108,12 +112,17 @@ class Claim:
 class World:
     """What there is now.
 
-    clock, now: the time, s, by the clock of the stamps and by the monotonic clock.  run: the one at work, empty: none; canceled:
-    whether it was.  servers: by what they do (``verifier`` is one), those who serve it.  scene: the newest, None: none came.
-    joints: what was heard of them, by name.  recorded: the server is told that all comes from a recording, which no time makes
-    older.  replaying: a bag is being played, whose stamps are of another time.  active: the server's lifecycle is in the state
-    active; stopped: an emergency stop has been asked for since it came there.  simulated: the clock of the stamps is a simulation's, which may be slower than any
-    other, so that it alone tells how old a thing is.
+    Attributes
+    ----------
+    clock, now : the time, s, by the clock of the stamps and by the monotonic clock.
+    run, canceled : the run at work, empty: none; whether it was canceled.
+    servers : by what they do (``verifier`` is one), those who serve it.
+    scene : the newest; ``None``: none came.
+    joints : what was heard of them, by name.
+    recorded : the server is told that all comes from a recording, which no time makes older.
+    replaying : a bag is being played, whose stamps are of another time.
+    active, stopped : the server's lifecycle is in the state active; an emergency stop has been asked for since it came there.
+    simulated : the clock of the stamps is a simulation's, which may be slower than any other, so that it alone tells how old a thing is.
     """
 
     clock: float

@@ -18,13 +18,24 @@ from magic_server.arm import ArmSettings
 class Settings:
     """What a run may take, and whether the arm is moved.
 
-    strategies: folder of the strategies, empty: the installed ones.  top_k: candidates where the goal names no number.
-    attempts: grasps for one contact.  repetitions: rollouts of one motion at most, 0: the verifier's own number.  timeout: s for
-    a whole run where the goal says nothing.  presence: s to wait for a server that is not there.  objects, match, plan, verify:
-    s for each.  grace: s that an answer may come late.  required_rate: least lower end of the success rate's interval;
-    objects_age: s that objects may be old, and object_tolerance: m that they may have moved, where a trajectory is published or
-    the arm begins to move.  recorded: what comes in is a recording.  words_weights: of the network that reads open words, empty: none.  autostart: whether the lifecycle begins in
-    its state active, in which alone the arm moves.
+    Attributes
+    ----------
+    strategies : folder of the strategies; empty: the installed ones.
+    top_k : candidates where the goal names no number.
+    attempts : grasps for one contact.
+    repetitions : rollouts of one motion at most; 0: the verifier's own number.
+    timeout : s for a whole run where the goal says nothing.
+    presence : s to wait for a server that is not there.
+    objects, match, plan, verify : s for each.
+    grace : s that an answer may come late.
+    execute, autostart : verified plans are carried out, and the lifecycle begins in its state active, in which alone the arm moves.
+    execute_unverified : with ``execute``, also what simulation cannot judge, where the goal allows it.
+    trajectory_action, gripper_action : names of the controllers' actions.
+    objects_age, object_tolerance : s that objects may be old, and m that they may have moved, where a trajectory is published or the arm
+        begins to move.
+    required_rate : least lower end of the success rate's interval.
+    recorded : what comes in is a recording.
+    words_weights : of the network that reads open words; empty: none.
     """
 
     strategies: str
@@ -54,13 +65,18 @@ class Settings:
 class LoopSettings:
     """What is looked at while a plan is carried out, and what follows.
 
-    look: look at the tool after the lift; watch: look at the scene while the arm moves; judge: look after the task whether the goal
-    is met.  executions, replans: how often the arm begins, and how often a motion is planned anew, at most, of one goal; seconds:
-    after that many nothing is begun again.  look_time: s that a picture of what has just happened is waited for; rest_time: s that
-    the arm is given to come to rest when it is stopped.  tool_shift (m), tool_turn (rad): a tool that is off by no more in the hand is
-    carried on as planned; slip_shift, slip_turn: one that is off by more is given up.  watch_tolerance: m that a thing may move while
-    the arm moves.  accuracy: m to which the middle of a thing is known that is seen twice.  torque_error: to which a joint repeats its
-    torque, Nm (N): with it the tool is weighed where it is looked at; 0: it is not.
+    Attributes
+    ----------
+    look, watch, judge : look at the tool after the lift; at the scene while the arm moves; and after the task whether the goal is met.
+    executions, replans : how often the arm begins, and how often a motion is planned anew, at most, of one goal.
+    seconds : after that many nothing is begun again.
+    look_time : s that a picture of what has just happened is waited for.
+    rest_time : s that the arm is given to come to rest when it is stopped.
+    tool_shift, tool_turn : m and rad; a tool that is off by no more in the hand is carried on as planned.
+    slip_shift, slip_turn : m and rad; one that is off by more is given up.
+    watch_tolerance : m that a thing may move while the arm moves.
+    accuracy : m to which the middle of a thing is known that is seen twice.
+    torque_error : Nm (N) to which a joint repeats its torque: with it the tool is weighed where it is looked at; 0: it is not.
     """
 
     look: bool = True
