@@ -5,6 +5,7 @@ import pytest
 
 from magic_core import shapes, strategy
 from magic_core.contact import Contact, contact_frame
+from magic_matcher import global_stage
 
 
 @pytest.fixture(scope="session")
@@ -32,3 +33,12 @@ def demonstration():
         goal=strategy.Goal("hook"),
         physics=strategy.Physics(),
     )
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """The inner side of an L hook's bend, as the global stage sees it."""
+    shape = shapes.make("l_hook", 3)
+    view = shape.view()
+    contact = shape.contact("inner", view)
+    return global_stage.make_reference(view, contact.pixel, contact.normal)

@@ -7,9 +7,8 @@ import pytest
 
 pytest.importorskip("torch")
 
-from magic_core import shapes
 from magic_core.errors import Code, MagicError
-from magic_matcher import features, global_stage
+from magic_matcher import features
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +36,6 @@ def weights(tmp_path_factory):
     config = transformers.Dinov2Config(hidden_size=32, num_hidden_layers=1, num_attention_heads=4, image_size=224, patch_size=14)
     transformers.Dinov2Model(config).save_pretrained(folder / "dino")
     return folder
-
-
-@pytest.fixture(scope="module")
-def reference():
-    shape = shapes.make("l_hook", 3)
-    view = shape.view()
-    contact = shape.contact("inner", view)
-    return global_stage.make_reference(view, contact.pixel, contact.normal)
 
 
 def made(name, weights, size=256, device="auto"):

@@ -79,14 +79,6 @@ def backend(weights):
 
 
 @pytest.fixture(scope="module")
-def reference():
-    shape = shapes.make("l_hook", 3)
-    view = shape.view()
-    contact = shape.contact("inner", view)
-    return global_stage.make_reference(view, contact.pixel, contact.normal)
-
-
-@pytest.fixture(scope="module")
 def prepared(backend, reference):
     return backend.prepare(reference)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
+from magic_perception.pixels import opened
 
 #: A place has changed since an older frame where a channel of its colour, smoothed, is off by more than this (of 255) and than so many times what the
 #: frames are off by elsewhere, in a blob of so many pixels in both directions; and so have as many pixels around it.
@@ -73,10 +74,10 @@ def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
     (blind, veiled), (held, was_held) = _blind(frame, before), _held(frame, before)
     other = (np.isfinite(frame.depth) != np.isfinite(before.depth)) | _deeper(frame, before)
     return not (
-        _opened(_recolored(frame, before, FAINT), BLOB).any()
-        or _opened(other & ~blind & ~veiled, DEEP_BLOB).any()
-        or _opened(blind != veiled, DEEP_BLOB).any()
-        or _opened(held != was_held, DEEP_BLOB).any()
+        opened(_recolored(frame, before, FAINT), BLOB).any()
+        or opened(other & ~blind & ~veiled, DEEP_BLOB).any()
+        or opened(blind != veiled, DEEP_BLOB).any()
+        or opened(held != was_held, DEEP_BLOB).any()
     )
 
 
@@ -87,7 +88,7 @@ def unchanged_beside_robot(frame: RgbdFrame, before: RgbdFrame) -> bool:
         return False
     robot = np.logical_or.reduce([*_blind(frame, before), *_held(frame, before)])
     beside = cv2.dilate(robot.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) == 0
-    return not (_opened(_recolored(frame, before, FAINT) & beside, BLOB).any() or _opened(_deeper(frame, before) & beside, DEEP_BLOB).any())
+    return not (opened(_recolored(frame, before, FAINT) & beside, BLOB).any() or opened(_deeper(frame, before) & beside, DEEP_BLOB).any())
 
 
 def _comparable(frame: RgbdFrame, before: RgbdFrame) -> bool:
@@ -120,16 +121,12 @@ def _recolored(frame: RgbdFrame, other: RgbdFrame, least: float) -> NDArray[np.b
 
 def _still(frame: RgbdFrame, last: RgbdFrame, spread: float) -> NDArray[np.bool_]:
     """(H, W): where a frame shows what the last one does."""
-    changed = _opened(_recolored(frame, last, CHANGED), BLOB)
+    changed = opened(_recolored(frame, last, CHANGED), BLOB)
     with np.errstate(invalid="ignore"):
-        changed |= _opened(np.abs(frame.depth - last.depth) > spread, FAR_BLOB)
+        changed |= opened(np.abs(frame.depth - last.depth) > spread, FAR_BLOB)
     if changed.any():
         changed = cv2.dilate(changed.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).view(bool)
     for blind in (frame.blind, last.blind):
         if blind is not None:
             changed = changed | blind
     return ~changed
-
-
-def _opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
-    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)

@@ -10,7 +10,7 @@ from magic_core import transforms
 from magic_core.camera import SURELY
 from magic_core.mesh import Mesh
 from magic_perception.looks import Looked
-from magic_perception.pixels import where
+from magic_perception.pixels import opened, where
 
 #: In images of labels: the robot, or what else of no interest stands before the scene (``RgbdFrame.blind``).
 ROBOT = -2
@@ -85,10 +85,10 @@ def parted(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray
             mask = image == label
             if label in tools:
                 outside = mask & (held == 0)
-                image[mask & ~_pieces(outside, _opened(outside, APART))] = own
+                image[mask & ~_pieces(outside, opened(outside, APART))] = own
             else:
                 # Where the two are told apart already, pixels at the edge are all that is taken for the other.
-                sure = _opened(mask & (held == SURELY), EDGE)
+                sure = opened(mask & (held == SURELY), EDGE)
                 if sure.any():
                     rest = mask & ~sure
                     count, pieces = cv2.connectedComponents(rest.view(np.uint8), connectivity=4)
@@ -102,11 +102,6 @@ def parted(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray
     for image in labels:
         image[image > 0] = number[image[image > 0]]
     return labels
-
-
-def _opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
-    """What of a mask (H, W) is no narrower than so many pixels."""
-    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)
 
 
 def _pieces(mask: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ from magic_core import transforms
 from magic_core.camera import RgbdFrame
 from magic_perception import cameras
 from magic_perception.looks import Looked
+from magic_perception.pixels import opened
 
 #: Two frames show the same from places nearer than this, m, with axes nearer than this, rad; and a camera has stood still within these.
 NEAR, TURNED = 0.08, float(np.radians(12))
@@ -140,7 +141,7 @@ def contradicted(
         changed: set[int] = set()
         for k in newer:
             for one, other in ((i, k), (k, i)):
-                refuted = _opened(_refuted(looks[one], labels[one], looks[other], labels[other]))
+                refuted = opened(_refuted(looks[one], labels[one], looks[other], labels[other]), BLOB)
                 changed |= set(np.unique(labels[one][refuted]).tolist())
         # What is seen from both sides may stand a little beside where it stood; whoever sees most of it tells.
         for label in sorted(set(np.unique(labels[i][labels[i] > 0]).tolist()) - changed):
@@ -160,10 +161,6 @@ def contradicted(
 
 def _widened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cv2.dilate(mask.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)).view(bool)
-
-
-def _opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((BLOB, BLOB), np.uint8)).view(bool)
 
 
 def _projected(

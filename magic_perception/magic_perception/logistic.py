@@ -1,4 +1,4 @@
-"""A chance as a logistic function of a few numbers, kept in a readable file."""
+"""A chance as a logistic function of a few numbers, and how a linear function is kept in a readable file."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+Names = Mapping[str, object] | list[str]
 
 
 @dataclass(frozen=True)
@@ -26,16 +28,26 @@ class Logistic:
         """0..1."""
         return float(1 / (1 + np.exp(-np.clip(self.odds(numbers), -30, 30))))
 
-    def save(self, path: Path, names: Mapping[str, object] | list[str]) -> None:
+    def save(self, path: Path, names: Names) -> None:
         """Write a JSON file; names: of the numbers, in their order."""
-        weights = {name: round(float(weight), 4) for name, weight in zip(names, self.weights, strict=True)}
-        path.write_text(json.dumps({"constant": round(self.constant, 4), "weights": weights}, indent=1) + "\n")
+        save_linear(path, self.constant, self.weights, names)
 
 
-def load(path: Path, names: Mapping[str, object] | list[str]) -> Logistic:
+def load(path: Path, names: Names) -> Logistic:
     """What :meth:`Logistic.save` wrote; names: of the numbers, in their order."""
+    return Logistic(*load_linear(path, names))
+
+
+def save_linear(path: Path, constant: float, weights: NDArray[np.float64], names: Names) -> None:
+    """Write constant and weights (C,) as a JSON file, to four decimals; names: of the numbers, in their order."""
+    named = {name: round(float(weight), 4) for name, weight in zip(names, weights, strict=True)}
+    path.write_text(json.dumps({"constant": round(constant, 4), "weights": named}, indent=1) + "\n")
+
+
+def load_linear(path: Path, names: Names) -> tuple[float, NDArray[np.float64]]:
+    """Constant and weights (C,) that :func:`save_linear` wrote; names: of the numbers, in their order."""
     told = json.loads(path.read_text())
-    return Logistic(float(told["constant"]), np.array([float(told["weights"][name]) for name in names]))
+    return float(told["constant"]), np.array([float(told["weights"][name]) for name in names])
 
 
 def fit(

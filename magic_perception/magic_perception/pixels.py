@@ -1,7 +1,8 @@
-"""Which pixels of a picture something holds of."""
+"""Which pixels of a picture something holds of, and which of them together are broad."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,3 +12,8 @@ def where(mask: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     quick along one axis alone."""
     rows, columns = np.divmod(np.flatnonzero(mask), mask.shape[1])
     return rows, columns
+
+
+def opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    """What of a mask (H, W) is no narrower than so many pixels, in rows and in columns."""
+    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)

@@ -8,7 +8,6 @@ is the exponential of a linear function of a few numbers: the quantile regressio
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
 from magic_perception.confidence import ENDED, ROUND, TURNED, Evidence
+from magic_perception.logistic import load_linear, save_linear
 from magic_perception.sight import Sight, measured
 
 #: The share of things whose surface is off by less than is stated.
@@ -144,14 +144,7 @@ class Quantile:
 
     def save(self, path: Path, names: Mapping[str, object]) -> None:
         """Write a JSON file; names: of the numbers, in their order."""
-        weights = {name: round(float(weight), 4) for name, weight in zip(names, self.weights, strict=True)}
-        path.write_text(json.dumps({"constant": round(self.constant, 4), "weights": weights}, indent=1) + "\n")
-
-
-def load(path: Path, names: Mapping[str, object]) -> Quantile:
-    """What :meth:`Quantile.save` wrote; names: of the numbers, in their order."""
-    told = json.loads(path.read_text())
-    return Quantile(float(told["constant"]), np.array([float(told["weights"][name]) for name in names]))
+        save_linear(path, self.constant, self.weights, names)
 
 
 def fit(
@@ -184,7 +177,7 @@ def fit(
 
 @cache
 def _learned() -> Quantile:
-    return load(Path(__file__).with_name("surface_error.json"), NUMBERS)
+    return Quantile(*load_linear(Path(__file__).with_name("surface_error.json"), NUMBERS))
 
 
 def likely(evidence: Evidence, departed: Departure) -> float:

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from magic_core import masses, transforms
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
+from magic_core.mesh import Mesh, box_corners
 from magic_core.recent import Recent
 from magic_core.scene import SceneObject
 
@@ -185,9 +185,8 @@ def roomy_shell(pieces: Iterable[Mesh], margin: float) -> list[Any]:
 
 def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> Hull:
     """The surface of a box between two corners (3,)."""
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], dtype=np.int32)
-    return corners, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return box_corners(low, high), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def _roomy(pieces: Sequence[Mesh], margin: float) -> list[Hull]:

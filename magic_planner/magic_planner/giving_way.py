@@ -27,7 +27,7 @@ from scipy.optimize import nnls
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
+from magic_core.mesh import Mesh, box_corners
 from magic_core.scene import SceneObject
 from magic_planner.collision import Body, grown, hull, outermost, padded, solid_pieces
 
@@ -214,8 +214,8 @@ def hits(poses: Array, tool: Body, walls: Sequence[Body]) -> NDArray[np.bool_]:
 
 
 def _swept_box(poses: Array, points: Array) -> tuple[Array, Array]:
-    low, high = points.min(axis=0), points.max(axis=0)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    """Lowest and highest corner (3,) of all that the box about points (N, 3) passes at poses (T, 4, 4)."""
+    corners = box_corners(points.min(axis=0), points.max(axis=0))
     swept = np.einsum("tij,nj->tni", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
     return swept.min(axis=(0, 1)), swept.max(axis=(0, 1))
 

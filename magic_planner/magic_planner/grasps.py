@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
+from magic_core.mesh import Mesh, box_corners
 from magic_core.scene import SceneObject
 from magic_planner.budget import Budget
 from magic_planner.collision import Body, hull, mass_centre, solid, solid_pieces
@@ -202,7 +202,7 @@ class _Proposal:
         self.up = poses[0, :3, :3].T @ table[:3]
         self.contact = tool_from_contact[:3, 3]
         self.terms = _Terms(self.pieces, tool_from_contact, poses, table, robot, settings)
-        self.corners = np.concatenate([_box_corners(mesh) for mesh in robot.hand.values()])
+        self.corners = np.concatenate([box_corners(*mesh.bounds) for mesh in robot.hand.values()])
         nothing = np.zeros((0, 3))
         self.static, self.swept = (nothing if points is None else points for points in (static, swept))
 
@@ -457,11 +457,6 @@ def _misfit(
         + np.minimum((used / 0.5) ** 2, 9.0)
     )
     return np.where(there, cost, np.inf)
-
-
-def _box_corners(mesh: Mesh) -> NDArray[np.float64]:
-    low, high = mesh.bounds
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
 def _frames(

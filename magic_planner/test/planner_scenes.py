@@ -16,6 +16,11 @@ SIZE = 64
 PIXEL = 0.005
 
 
+def flipped(mesh: Mesh) -> Mesh:
+    """The mesh inside out."""
+    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
+
+
 def view(object_from_view: np.ndarray, kind: str = "top") -> CanonicalView:
     mask = np.ones((SIZE, SIZE), dtype=bool)
     return CanonicalView(np.zeros((SIZE, SIZE, 3), np.uint8), mask, PIXEL, object_from_view, kind)

@@ -58,10 +58,6 @@ def target():
     return scenes.standing_cylinder()[0]
 
 
-def flipped(mesh):
-    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
-
-
 def with_holes(mesh):
     return Mesh(mesh.vertices, mesh.faces[::3].copy())
 
@@ -72,7 +68,7 @@ NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
 
 
 @pytest.mark.parametrize("variant", ["fg", "arm"])
-@pytest.mark.parametrize("damage", [flipped, with_holes])
+@pytest.mark.parametrize("damage", [scenes.flipped, with_holes])
 def test_damaged_surfaces_are_planned_for_as_what_they_look_like(graph, damage, variant):
     damaged = shaped(tool(), *(damage(p) for p in tool().pieces), mesh=damage(tool().mesh))
     answered(graph, goal(tool=damaged, variant=variant), Code.OK)

@@ -35,10 +35,6 @@ def of(item, *pieces, mesh=None):
     return dataclasses.replace(item, mesh=mesh or pieces[0], pieces=pieces)
 
 
-def flipped(mesh):
-    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
-
-
 @pytest.fixture(scope="module")
 def million():
     """A spindle of 1.3 million triangles, every vertex of it on its hull."""
@@ -67,7 +63,7 @@ def attempt(arm, tool, target=None):
 
 def test_flipped_faces_make_no_difference(arm):
     tool, _ = scenes.hook()
-    assert attempt(arm, of(tool, *(flipped(p) for p in tool.pieces), mesh=flipped(tool.mesh))) == Code.OK
+    assert attempt(arm, of(tool, *(scenes.flipped(p) for p in tool.pieces), mesh=scenes.flipped(tool.mesh))) == Code.OK
 
 
 def test_a_mesh_without_pieces_stands_for_its_hull(arm):

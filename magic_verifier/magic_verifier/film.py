@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_core.camera import Intrinsics
-from magic_core.mesh import Mesh, concatenate
+from magic_core.mesh import Mesh, box_corners, concatenate
 from magic_core.rendering import Raycaster, shade
 from magic_core.robot import Description
 from magic_core.robot_pictures import RobotPictures
@@ -132,8 +132,7 @@ def film_strip(
     way = []
     for name, (item, _) in items.items():
         corners = np.concatenate([p.vertices for p in item.pieces]) if item.pieces else item.mesh.vertices
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        box = box_corners(corners.min(axis=0), corners.max(axis=0))
         way += [transforms.apply(pose, box) for pose in recording.poses[name][chosen]]
     with_arm = recording.joints.shape[1] > 0
     if with_arm:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from magic_bringup.demonstrating import demonstrated, made_of, target_contact, target_view, through, unseen
-from magic_bringup.striking import DOWN, OUT, PEG, REFERENCE, SLOT
+from magic_bringup.striking import DOWN, PEG, REFERENCE, slot_fixture
 from magic_core import transforms
 from magic_core.goal import shipped
 from magic_core.placement import pairs_of
@@ -103,8 +103,6 @@ def tipping() -> Strategy:
 
 def pressing() -> Strategy:
     """A peg is pressed 40 mm into a slot, against 8 N."""
-    slot = make("slot", 0, **SLOT)
-    from_target = transforms.make(translation=[OUT + SLOT["length"] / 2, 0.0, -float(slot.mesh.bounds[0, 2])])
     return _pushed(
         "pressing",
         "The side of a mallet's handle presses a peg into a slot.",
@@ -112,7 +110,7 @@ def pressing() -> Strategy:
         0.55,
         _way(0.04),
         shipped("press"),
-        fixtures=[{"id": "slot", "family": "slot", "seed": 0, "parameters": dict(slot.parameters), "from_target": pose_data(from_target)}],
+        fixtures=[slot_fixture()],
     )
 
 

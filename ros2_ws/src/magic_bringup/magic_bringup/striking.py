@@ -78,6 +78,13 @@ def swing(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[
     return times, contacts, waypoints
 
 
+def slot_fixture() -> dict[str, Any]:
+    """The slot as a fixture of an environment: the peg stands out of it by OUT."""
+    slot = make("slot", 0, **SLOT)
+    from_target = transforms.make(translation=[OUT + SLOT["length"] / 2, 0.0, -float(slot.mesh.bounds[0, 2])])
+    return {"id": "slot", **made_of(slot), "from_target": pose_data(from_target)}
+
+
 def hammering() -> Strategy:
     """A peg is driven into a slot by one blow of a mallet."""
     tool, view, contact = _tool("face")
@@ -89,8 +96,6 @@ def hammering() -> Strategy:
     grip = np.array([tool.mesh.bounds[0, 0], 0.0, 0.0])
     side = float(np.sign((OPPOSED @ transforms.inverse(contact.object_from_contact) @ [*grip, 1.0])[1]))
     times, contacts, waypoints = swing(side)
-    slot = make("slot", 0, **SLOT)
-    from_target = transforms.make(translation=[OUT + SLOT["length"] / 2, 0.0, -float(slot.mesh.bounds[0, 2])])
     return Strategy(
         name="hammering",
         description="A mallet, swung in the plane of the table, drives a peg into a slot.",
@@ -105,9 +110,7 @@ def hammering() -> Strategy:
             "world_from_target": pose_data(transforms.make(translation=[0.62, 0.0, PEG["side"] / 2])),
             "tool": made_of(tool),
             "target": made_of(peg),
-            "fixtures": [
-                {"id": "slot", "family": "slot", "seed": 0, "parameters": dict(slot.parameters), "from_target": pose_data(from_target)}
-            ],
+            "fixtures": [slot_fixture()],
         },
     )
 

@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from magic_core.errors import Code, MagicError
-from magic_core.mesh import Mesh
+from magic_core.mesh import Mesh, box_corners
 
 #: Faces above which the surface is sampled rather than used whole.
 SAMPLES = 400_000
@@ -291,8 +291,7 @@ def _piece(
     points = points[np.all((points >= corner - 1e-9) & (points <= end + 1e-9), axis=1)]
     inner = np.argwhere(cells & ~shell[tuple(slice(a, a + n) for a, n in zip(lower, cells.shape, strict=True))])
     if len(inner):
-        low, high = inner.min(axis=0), inner.max(axis=0) + 1
-        block = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        block = box_corners(inner.min(axis=0), inner.max(axis=0) + 1)
         points = np.concatenate([points, corner + block * pitch])
     if len(points) < 4:
         return None

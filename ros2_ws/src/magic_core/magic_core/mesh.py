@@ -107,6 +107,11 @@ def check_solid(mesh: Mesh, what: str) -> None:
         raise MagicError(Code.BAD_MESH, f"thickness of {what} in m", float(f"{thinnest:.3g}"), f"above {FLAT * longest:.2g}; it is flat")
 
 
+def box_corners(low: NDArray, high: NDArray) -> NDArray:
+    """(8, 3): the corners of the box along the axes from its lowest (3,) to its highest (3,); z changes first, then y."""
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
 def concatenate(meshes: list[Mesh] | tuple[Mesh, ...]) -> Mesh:
     """One mesh that holds all the given ones; colours are kept where all have them."""
     if not meshes:

@@ -166,6 +166,30 @@ class Description:
             if not path.is_file():
                 raise MagicError(Code.BAD_REQUEST, what, str(path), "an existing file")
         self.root = _parsed(self.urdf, "URDF")
+        self._read_tree()
+        self.base_frame = config.base_frame.lstrip("/") or self.base
+        if self.base_frame != self.base and self.base_frame in self._links:
+            raise MagicError(
+                Code.BAD_REQUEST,
+                "robot.base_frame",
+                self.base_frame,
+                f"the URDF's root link {self.base}, or another name for the same frame; this is another link of {self.urdf}",
+            )
+        self._read_arm()
+        self._read_gripper()
+        self.moving = frozenset((*self.names, *(joint.name for joint in self.fingers)))
+        self.foot = frozenset(self.beyond(self.base, self.moving))
+        self.disabled = frozenset(
+            frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in _parsed(self.srdf, "SRDF").findall("disable_collisions")
+        )
+        for joint in self.arm:
+            if not joint.effort > 0:
+                raise MagicError(
+                    Code.BAD_REQUEST, f"effort limit of {joint.name} in {self.urdf}", joint.effort, "above 0 (Nm; N if it slides)"
+                )
+
+    def _read_tree(self) -> None:
+        """Links, joints and masses of the URDF, which have to be one tree."""
         try:
             self.joints = {joint.name: joint for joint in map(_joint, self.root.findall("joint"))}
         except (ValueError, TypeError, AttributeError) as error:
@@ -186,37 +210,26 @@ class Description:
         self.base = roots[0] if roots else ""
         if len(roots) != 1 or len(self._above) != len(self.joints) or len(self.beyond(self.base)) != len(self._links):
             raise MagicError(Code.BAD_REQUEST, f"links of {self.urdf}", f"roots {roots}", "one tree with one root")
-        self.base_frame = config.base_frame.lstrip("/") or self.base
-        if self.base_frame != self.base and self.base_frame in self._links:
-            raise MagicError(
-                Code.BAD_REQUEST,
-                "robot.base_frame",
-                self.base_frame,
-                f"the URDF's root link {self.base}, or another name for the same frame; this is another link of {self.urdf}",
-            )
+
+    def _read_arm(self) -> None:
+        """The arm's joints, within the published limits and half a turn either side of home."""
+        home = self.config.home
         self.arm = self._chain()
         self.published = self._published()
-        if len(config.home) != len(self.arm):
-            raise MagicError(Code.BAD_REQUEST, "home configuration", list(config.home), f"{len(self.arm)} joint positions")
+        if len(home) != len(self.arm):
+            raise MagicError(Code.BAD_REQUEST, "home configuration", list(home), f"{len(self.arm)} joint positions")
         if self.published is not None:
             self.arm = tuple(_narrowed(joint, self.published, index) for index, joint in enumerate(self.arm))
-        self.arm = tuple(_within_a_turn(joint, float(home)) for joint, home in zip(self.arm, config.home, strict=True))
+        self.arm = tuple(_within_a_turn(joint, float(position)) for joint, position in zip(self.arm, home, strict=True))
+
+    def _read_gripper(self) -> None:
+        """The two fingers, and where they are closed and open."""
         self.fingers = self._fingers()
-        self.moving = frozenset((*self.names, *(joint.name for joint in self.fingers)))
-        self.foot = frozenset(self.beyond(self.base, self.moving))
         # Grippers count from closed: the limit further from zero is where they are open.
         far = [abs(joint.upper) >= abs(joint.lower) for joint in self.fingers]
         self.closed = np.array([joint.lower if up else joint.upper for joint, up in zip(self.fingers, far, strict=True)])
         self.opened = np.array([joint.upper if up else joint.lower for joint, up in zip(self.fingers, far, strict=True)])
         self.finger_links = frozenset(link for joint in self.fingers for link in self.beyond(joint.child))
-        self.disabled = frozenset(
-            frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in _parsed(self.srdf, "SRDF").findall("disable_collisions")
-        )
-        for joint in self.arm:
-            if not joint.effort > 0:
-                raise MagicError(
-                    Code.BAD_REQUEST, f"effort limit of {joint.name} in {self.urdf}", joint.effort, "above 0 (Nm; N if it slides)"
-                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -374,13 +387,13 @@ class Description:
             found = material.find("color")
             found = found if found is not None else colors.get(material.get("name", ""))
             if found is not None:
-                red, green, blue = (int(255 * v) for v in _numbers(found.get("rgba"), "0.7 0.7 0.7 1")[:3].clip(0, 1))
+                red, green, blue = (int(255 * v) for v in numbers(found.get("rgba"), "0.7 0.7 0.7 1")[:3].clip(0, 1))
                 color = (red, green, blue)
         sizes = {
-            "box": lambda: _numbers(body.get("size"), ""),
-            "sphere": lambda: _numbers(body.get("radius"), ""),
-            "cylinder": lambda: np.concatenate([_numbers(body.get("radius"), ""), _numbers(body.get("length"), "")]),
-            "mesh": lambda: _numbers(body.get("scale"), "1 1 1"),
+            "box": lambda: numbers(body.get("size"), ""),
+            "sphere": lambda: numbers(body.get("radius"), ""),
+            "cylinder": lambda: np.concatenate([numbers(body.get("radius"), ""), numbers(body.get("length"), "")]),
+            "mesh": lambda: numbers(body.get("scale"), "1 1 1"),
         }
         sizes["capsule"] = sizes["cylinder"]
         if body.tag not in sizes:
@@ -455,14 +468,15 @@ def _parsed(path: Path, what: str) -> ET.Element:
         raise MagicError(Code.BAD_REQUEST, f"{what} {path}", f"{type(error).__name__}: {error}", f"a readable {what}") from error
 
 
-def _numbers(text: str | None, default: str) -> NDArray[np.float64]:
+def numbers(text: str | None, default: str) -> NDArray[np.float64]:
+    """The numbers (N,) of an attribute or a text; those of ``default`` where there is none."""
     return np.array([float(x) for x in (text or default).split()])
 
 
 def _origin(element: ET.Element | None) -> NDArray[np.float64]:
     if element is None:
         return np.eye(4)
-    return transforms.from_rpy(*_numbers(element.get("rpy"), "0 0 0"), translation=_numbers(element.get("xyz"), "0 0 0"))
+    return transforms.from_rpy(*numbers(element.get("rpy"), "0 0 0"), translation=numbers(element.get("xyz"), "0 0 0"))
 
 
 def _mass(link: ET.Element) -> tuple[float, NDArray[np.float64]] | None:
@@ -501,7 +515,7 @@ def _joint(element: ET.Element) -> Joint:
 
     kind = element.get("type", "fixed")
     # Generators write the axis "0 0 0" for joints that have none.
-    direction = _numbers(axis.get("xyz"), "1 0 0") if axis is not None and kind != "fixed" else np.array([1.0, 0.0, 0.0])
+    direction = numbers(axis.get("xyz"), "1 0 0") if axis is not None and kind != "fixed" else np.array([1.0, 0.0, 0.0])
     return Joint(
         element.get("name", ""),
         kind,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh, concatenate, from_trimesh, load
-from magic_core.robot import Description, Shape
+from magic_core.robot import Description, Shape, numbers
 
 #: Of what has no colour of its own, RGB.
 PLAIN = (200, 200, 205)
@@ -93,7 +93,7 @@ def read_collada(path: Path) -> Mesh:
         effects = {}
         for effect in root.iterfind("library_effects/effect"):
             color = effect.find(".//diffuse/color")
-            rgb = _numbers(color.text if color is not None else None, "0.7 0.7 0.7 1")[:3]
+            rgb = numbers(color.text if color is not None else None, "0.7 0.7 0.7 1")[:3]
             effects["#" + effect.get("id", "")] = (255 * rgb.clip(0, 1) ** 0.6).astype(np.uint8)
         materials = {}
         for material in root.iterfind("library_materials/material"):
@@ -105,7 +105,7 @@ def read_collada(path: Path) -> Mesh:
         def visit(node: ET.Element, pose: NDArray[np.float64]) -> None:
             matrix = node.find("matrix")
             if matrix is not None:
-                pose = pose @ _numbers(matrix.text, "").reshape(4, 4)
+                pose = pose @ numbers(matrix.text, "").reshape(4, 4)
             for instance in node.iterfind("instance_geometry"):
                 symbols = {b.get("symbol", ""): b.get("target", "#")[1:] for b in instance.iterfind(".//instance_material")}
                 parts.extend(_collada_geometry(geometries[instance.get("url", "")], pose, symbols, materials))
@@ -124,7 +124,7 @@ def _collada_geometry(geometry: ET.Element, pose: NDArray[np.float64], symbols: 
     if mesh is None:
         return []
     sources = {
-        s.get("id", ""): _numbers(s.findtext("float_array"), "").reshape(-1, 3)
+        s.get("id", ""): numbers(s.findtext("float_array"), "").reshape(-1, 3)
         for s in mesh.iterfind("source")
         if "position" in s.get("id", "")
     }
@@ -155,7 +155,3 @@ def _fans(corners: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.i
     first = np.repeat(np.cumsum(counts) - counts, counts - 2)
     step = np.concatenate([np.arange(count - 2) for count in counts]) if len(counts) else np.zeros(0, np.int64)
     return corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
-
-
-def _numbers(text: str | None, default: str) -> NDArray[np.float64]:
-    return np.array([float(x) for x in (text or default).split()])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magic_core import sensor, transforms
 from magic_core.camera import Intrinsics, RgbdFrame
-from magic_core.mesh import Mesh
+from magic_core.mesh import Mesh, box_corners
 from magic_core.rendering import Raycaster, shade
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class Bodies:
 
     def __init__(self, meshes: Mapping[str, Mesh], beside: Bodies | None = None) -> None:
         self.casters = {name: Raycaster([mesh]) for name, mesh in meshes.items()}
-        self.corners = {name: _corners(mesh) for name, mesh in meshes.items()}
+        self.corners = {name: box_corners(*mesh.bounds) for name, mesh in meshes.items()}
         if beside is not None:
             self.casters |= beside.casters
             self.corners |= beside.corners
@@ -142,9 +142,3 @@ class Camera:
 def _draws(name: str, shape: tuple[int, int]) -> list[sensor.Noise]:
     """A camera's draws of noise, the same after each reset."""
     return [sensor.Noise.draw(shape, [zlib.crc32(name.encode()), k]).light() for k in range(DRAWS)]
-
-
-def _corners(mesh: Mesh) -> Array:
-    """(8, 3): of the axis-aligned box."""
-    low, high = mesh.bounds
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

@@ -16,7 +16,6 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from magic_core import conversions
-from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, RunStrategy, VerifyMotion
 from magic_server.execution import Fingers, Look, Move, check_grasp, controller_error, steps
@@ -112,14 +111,6 @@ def test_each_code_of_a_trajectory_controller_is_told_by_its_name():
         assert error.message.endswith(": because")
     assert "SUCCESSFUL" in controller_error(result.SUCCESSFUL, GoalStatus.STATUS_CANCELED, "").message
     assert "an error of its own" in controller_error(-77, GoalStatus.STATUS_ABORTED, "").message
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("strategies")
-    strategies.save(fakes.strategy("fake"), root / "fake")
-    strategies.save(fakes.strategy("dynamic", simulatable=False), root / "dynamic")
-    return root
 
 
 ACTIONS = {"autostart": True, "trajectory_action": "arm/follow_joint_trajectory", "gripper_action": "gripper/gripper_action"}

@@ -21,7 +21,6 @@ from trajectory_msgs.msg import JointTrajectory
 
 from magic_bringup.graph import Process, executable
 from magic_core import conversions, naming, qos, transforms
-from magic_core import strategy as strategies
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import SceneObject
@@ -35,14 +34,6 @@ from magic_server.stages import Stages, doubt
 from magic_server.strategy_server import complaint_code
 from magic_server.testing import fakes
 from magic_server.testing.bench import DEADLINE, Bench
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("strategies")
-    strategies.save(fakes.strategy("fake"), root / "fake")
-    strategies.save(fakes.strategy("dynamic", simulatable=False), root / "dynamic")
-    return root
 
 
 @pytest.fixture(scope="module")
