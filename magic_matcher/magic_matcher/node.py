@@ -42,22 +42,16 @@ class MatcherNode(Node):
 
     def __init__(self) -> None:
         super().__init__("matcher")
-        name = nodes.parameter(
-            self, "features", "auto", "feature backend: auto takes dinov2 where weights are named", choices=BACKENDS, read_only=True
-        )
-        weights = nodes.parameter(self, "weights", "", "hub name or local folder of DINOv2 or DINOv3 weights", read_only=True)
-        device = nodes.parameter(
-            self, "device", devices.AUTO, "torch device of the network; auto: cuda where there is a GPU, else cpu", read_only=True
-        )
+        name = nodes.parameter(self, "features", "auto", "feature backend: auto takes dinov2 where weights are named", choices=BACKENDS)
+        weights = nodes.parameter(self, "weights", "", "hub name or local folder of DINOv2 or DINOv3 weights")
+        device = nodes.parameter(self, "device", devices.AUTO, "torch device of the network; auto: cuda where there is a GPU, else cpu")
         nodes.parameter(
             self, "top_k", 3, "candidates returned for each tool where the request names no number", low=1, high=50, read_only=False
         )
-        weight = nodes.parameter(
-            self, "curvature_weight", score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0, read_only=True
-        )
-        self._root = nodes.parameter(self, "strategies", "", "folder of strategies; empty: the installed ones", read_only=True)
+        weight = nodes.parameter(self, "curvature_weight", score.LAMBDA, "lambda of score = s_dino + lambda s_curv", low=0.0, high=10.0)
+        self._root = nodes.parameter(self, "strategies", "", "folder of strategies; empty: the installed ones")
         cache = nodes.parameter(
-            self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only", read_only=True
+            self, "cache", "", "folder in which prepared references are kept; empty: the user's cache; none: memory only"
         )
         self._matcher = matching.Matcher(features.load(name, weights, device), weight, cache=None if cache == "none" else Cache(cache))
         self._remembered = Remembered(self._matcher)

@@ -50,30 +50,38 @@ def random_vit_s(folder: str) -> str:
 
 def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[str, Any]:
     """Seconds a match of both backends after the reference is prepared, DINOv2's one network pass, memory over many requests."""
-    import torch
-
     job = jobs.JOBS["hooking"]
     shown = jobs.example("hooking", "l_hook", 5000)
     contact = shown.contact("inner")
-    reference: Reference = make_reference(shown.view, contact.pixel, contact.normal, 0.025 / shown.view.metres_per_pixel, shown.contour)
+    reference = make_reference(shown.view, contact.pixel, contact.normal, 0.025 / shown.view.metres_per_pixel, shown.contour)
     target = jobs.disc_target(0.02, job.view)
     tools = [matching.Tool(name, jobs.example("hooking", name, 7000).view) for name in ("caliper", "hammer", "scissors", "watch")]
 
     def match(matcher: matching.Matcher, tool: matching.Tool) -> None:
         matcher.match_views(reference, contact, [tool], target, 3, False, 0.025)
 
-    matcher = matching.Matcher(features.load("embedded"))
-    result: dict[str, Any] = {"embedded": {tool.id: timed(lambda tool=tool: match(matcher, tool), repeats) for tool in tools}}
+    embedded = matching.Matcher(features.load("embedded"))
+    return {
+        "embedded": {tool.id: timed(lambda tool=tool: match(embedded, tool), repeats) for tool in tools},
+        "dinov2": _network(weights, reference, lambda matcher: match(matcher, tools[0]), repeats),
+        "memory": _memory(lambda k: match(embedded, tools[k % len(tools)]), requests),
+    }
+
+
+def _network(weights: str, reference: Reference, match: Callable[[matching.Matcher], None], repeats: int) -> dict[str, Any]:
+    """Seconds of DINOv2's pass and of a match with it, and their ratio, on all threads and on one."""
+    import torch
+
     with tempfile.TemporaryDirectory() as folder:
         backend = features.load("dinov2", weights or random_vit_s(folder))
-        network = matching.Matcher(backend)
-        network.prepare(reference)
+        matcher = matching.Matcher(backend)
+        matcher.prepare(reference)
         picture = np.zeros((1, backend.size, backend.size, 3), np.uint8)
         backend.extract(picture)
 
         def turns() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             """Passes and matches in turns, so that what else runs on the machine slows both alike."""
-            pairs = [(timed_once(lambda: backend.extract(picture)), timed_once(lambda: match(network, tools[0]))) for _ in range(repeats)]
+            pairs = [(timed_once(lambda: backend.extract(picture)), timed_once(lambda: match(matcher))) for _ in range(repeats)]
             return np.array([p for p, _ in pairs]), np.array([m for _, m in pairs])
 
         passes, matches = turns()
@@ -84,35 +92,38 @@ def measure(weights: str = "", requests: int = 1000, repeats: int = 7) -> dict[s
             alone, alone_matches = turns()
         finally:
             torch.set_num_threads(threads)
-        one, all_ = np.median(passes, axis=0), np.median(matches, axis=0)
-        result["dinov2"] = {
-            "weights": weights or "ViT-S/14, random",
-            "side_px": backend.size,
-            "pass_s": float(one[0]),
-            "match_s": float(all_[0]),
-            "threads": threads,
-            "ratio": float(np.median(matches[:, 0] / passes[:, 0])),
-            "ratio_of_least": float(matches[:, 0].min() / passes[:, 0].min()),
-            "pass_cpu_s": float(one[1]),
-            "match_cpu_s": float(all_[1]),
-            "ratio_cpu": float(np.median(matches[:, 1] / passes[:, 1])),
-            "one_thread_ratio": float(np.median(alone_matches[:, 0] / alone[:, 0])),
-            "one_thread_ratio_cpu": float(np.median(alone_matches[:, 1] / alone[:, 1])),
-        }
+    one, all_ = np.median(passes, axis=0), np.median(matches, axis=0)
+    return {
+        "weights": weights or "ViT-S/14, random",
+        "side_px": backend.size,
+        "pass_s": float(one[0]),
+        "match_s": float(all_[0]),
+        "threads": threads,
+        "ratio": float(np.median(matches[:, 0] / passes[:, 0])),
+        "ratio_of_least": float(matches[:, 0].min() / passes[:, 0].min()),
+        "pass_cpu_s": float(one[1]),
+        "match_cpu_s": float(all_[1]),
+        "ratio_cpu": float(np.median(matches[:, 1] / passes[:, 1])),
+        "one_thread_ratio": float(np.median(alone_matches[:, 0] / alone[:, 0])),
+        "one_thread_ratio_cpu": float(np.median(alone_matches[:, 1] / alone[:, 1])),
+    }
+
+
+def _memory(match: Callable[[int], None], requests: int) -> dict[str, Any]:
+    """Memory of this process, MB, over so many requests: at a tenth of them each, and how it grew after the first."""
     memory = []
     for k in range(requests):
         if k % max(1, requests // 10) == 0:
             gc.collect()
             memory.append(resident())
-        match(matcher, tools[k % len(tools)])
+        match(k)
     gc.collect()
     memory.append(resident())
-    result["memory"] = {
+    return {
         "requests": requests,
         "resident_mb": [round(m, 1) for m in memory],
         "growth_mb": round(memory[-1] - memory[min(1, len(memory) - 1)], 1),
     }
-    return result
 
 
 def timed_once(work: Callable[[], Any]) -> tuple[float, float]:

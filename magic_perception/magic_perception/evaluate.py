@@ -471,8 +471,8 @@ TABLES: dict[str, Callable[[dict], list[str]]] = {
 }
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point; exit status 1 where no data are found."""
+def _command(args: list[str] | None) -> argparse.Namespace:
+    """What the command line asks for; ends the program where it makes no sense."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--data", type=Path, help="folder with meshes/ and rgbd/ (not needed with --speed, --views, --moved-cameras or --mugs)"
@@ -494,48 +494,72 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=50, help="scenes of --speed (default 50; 1000 shows whether memory is flat)")
     parser.add_argument("--workers", type=int, default=2, help="processes of --speed, this one among them (default 2, as the node has)")
     given = parser.parse_args(args)
-    without_data = given.speed or given.views or given.moved_cameras or given.mugs
-    if given.data is None and not without_data:
+    if given.data is None and not _without_data(given):
         parser.error("--data is needed, or --speed, --views, --moved-cameras or --mugs")
     if given.frames < 1 or given.workers < 1 or min(given.views, given.moved_cameras, given.mugs) < 0:
         counts = {name: getattr(given, name) for name in ("frames", "workers", "views", "moved_cameras", "mugs")}
         parser.error(f"{counts}: frames and workers at least 1, the others at least 0")
+    return given
+
+
+def _without_data(given: argparse.Namespace) -> bool:
+    """Whether what is asked for is measured on made scenes alone."""
+    return bool(given.speed or given.views or given.moved_cameras or given.mugs)
+
+
+def _made(given: argparse.Namespace) -> dict:
+    """The figures on made scenes, by the part's name."""
 
     def said(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    try:
-        workers = perceiving(given.workers - 1 if given.speed else 0)
+    result: dict = {}
+    if given.speed:
+        workers = perceiving(given.workers - 1)
         segmenter = make_segmenter(given.segmenter, given.weights, workers=workers)
-        result: dict = {}
+        result["speed"] = speed.measure(given.frames, segmenter, given.seed, workers)
+        workers.close()
+    if given.views:
+        result["views"] = coverage.measure(given.views, given.seed, said=said)
+    if given.moved_cameras:
+        result["moved_cameras"] = moved_cameras.measure(given.moved_cameras, given.seed, said=said)
+    if given.mugs:
+        result["mugs"] = made_mugs.measure(given.mugs, given.seed, said)
+    return result
+
+
+def _of_data(given: argparse.Namespace) -> dict:
+    """The figures on the data of a folder, by the part's name; a part whose data are absent is left out, and said so."""
+    segmenter = make_segmenter(given.segmenter, given.weights, workers=perceiving(0))
+    result: dict = {}
+    for part, folder in (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes")):
+        if part not in given.parts:
+            continue
+        if not folder.is_dir():
+            print(f"evaluate: {part} left out: no folder {folder}", file=sys.stderr)
+        elif part == "osd":
+            result[part] = osd(folder, segmenter, not given.no_split, given.out / "osd")
+        elif part == "captures":
+            result[part] = captures(folder, segmenter)
+        else:
+            result[part], pictures = meshes(folder, segmenter, given.poses, given.seed, given.cameras)
+            _write_sheet(given.out / "evaluation.png", pictures)
+    return result
+
+
+def _write_sheet(path: Path, pictures: list[NDArray[np.uint8]]) -> None:
+    """Write pictures (h, w, 3) RGB of one size as one, in two columns."""
+    half = -(-len(pictures) // 2)
+    pictures = [*pictures, *[np.zeros_like(pictures[0])] * (2 * half - len(pictures))]
+    cv2.imwrite(str(path), np.hstack([np.vstack(pictures[:half]), np.vstack(pictures[half:])])[..., ::-1])
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point; exit status 1 where no data are found."""
+    given = _command(args)
+    try:
         given.out.mkdir(parents=True, exist_ok=True)
-        if given.speed:
-            result["speed"] = speed.measure(given.frames, segmenter, given.seed, workers)
-            workers.close()
-        if given.views:
-            result["views"] = coverage.measure(given.views, given.seed, said=said)
-        if given.moved_cameras:
-            result["moved_cameras"] = moved_cameras.measure(given.moved_cameras, given.seed, said=said)
-        if given.mugs:
-            result["mugs"] = made_mugs.measure(given.mugs, given.seed, said)
-        for part, folder in (
-            () if without_data else (("osd", given.data / "rgbd/osd"), ("captures", given.data / "rgbd"), ("meshes", given.data / "meshes"))
-        ):
-            if part not in given.parts:
-                continue
-            if not folder.is_dir():
-                print(f"evaluate: {part} left out: no folder {folder}", file=sys.stderr)
-                continue
-            if part == "osd":
-                result[part] = osd(folder, segmenter, not given.no_split, given.out / "osd")
-            elif part == "captures":
-                result[part] = captures(folder, segmenter)
-            else:
-                result[part], pictures = meshes(folder, segmenter, given.poses, given.seed, given.cameras)
-                half = -(-len(pictures) // 2)
-                pictures += [np.zeros_like(pictures[0])] * (2 * half - len(pictures))
-                sheet = np.hstack([np.vstack(pictures[:half]), np.vstack(pictures[half:])])
-                cv2.imwrite(str(given.out / "evaluation.png"), sheet[..., ::-1])
+        result = _made(given) if _without_data(given) else _of_data(given)
     except MagicError as error:
         print(f"evaluate: {error}", file=sys.stderr)
         sys.exit(1)

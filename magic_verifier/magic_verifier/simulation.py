@@ -318,10 +318,7 @@ class World:
         helper = np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
         pose = transforms.frame(-float(plane[3]) * normal, normal, np.cross(normal, helper))
         component = physx.PhysxRigidStaticComponent()
-        shape = physx.PhysxCollisionShapePlane(material=self.material(friction))
-        shape.contact_offset = self.settings.contact_offset
-        shape.rest_offset = self.settings.rest_offset
-        component.attach(shape)
+        component.attach(self._spaced(physx.PhysxCollisionShapePlane(material=self.material(friction))))
         self._register(name, component, pose)
 
     def add(
@@ -347,50 +344,64 @@ class World:
             raise MagicError(Code.BAD_SCENE, f"density of {name}", density, "above 0 and below 100000 kg/m^3")
         if not np.all(np.isfinite(world_from_object)):
             raise MagicError(Code.BAD_SCENE, f"pose of {name}", "not finite", "finite numbers")
-        component = physx.PhysxRigidStaticComponent() if kind == STATIC else physx.PhysxRigidDynamicComponent()
-        material = self.material(friction)
         if mesh is not None and kind == DYNAMIC:
             raise MagicError(Code.BAD_SCENE, f"shape of {name}", "an exact surface", "convex pieces for a body that is free")
+        component = physx.PhysxRigidStaticComponent() if kind == STATIC else physx.PhysxRigidDynamicComponent()
+        material = self.material(friction)
         if mesh is not None:
-            shape = physx.PhysxCollisionShapeTriangleMesh(
-                vertices=np.ascontiguousarray(mesh.vertices, dtype=np.float32),
-                triangles=np.ascontiguousarray(mesh.faces, dtype=np.uint32),
-                scale=np.ones(3, np.float32),
-                material=material,
-            )
-            shape.contact_offset = self.settings.contact_offset
-            shape.rest_offset = self.settings.rest_offset
-            component.attach(shape)
+            component.attach(self._spaced(self._surface(mesh, material)))
             hulls, balls = [], ()
         if balls is None:
             balls = [sphere_of(corners) for corners in hulls]
         for corners, ball in zip(hulls, balls, strict=True):
-            if ball is not None:
-                shape = physx.PhysxCollisionShapeSphere(radius=ball[1], material=material)
-                shape.local_pose = self._sapien.Pose(ball[0])
-            else:
-                try:
-                    shape = physx.PhysxCollisionShapeConvexMesh(
-                        vertices=np.ascontiguousarray(corners, dtype=np.float32), scale=np.ones(3, np.float32), material=material
-                    )
-                except RuntimeError as error:
-                    raise MagicError(Code.BAD_SCENE, f"piece of {name}", str(error), "a convex piece that PhysX can cook") from error
+            shape = self._spaced(self._piece(name, corners, ball, material))
             shape.density = float(density)
-            shape.contact_offset = self.settings.contact_offset
-            shape.rest_offset = self.settings.rest_offset
             component.attach(shape)
         if kind != STATIC:
-            component.solver_position_iterations = self.settings.position_iterations
-            component.solver_velocity_iterations = self.settings.velocity_iterations
-            component.sleep_threshold = 0.0
-            component.linear_damping = self.settings.linear_damping
-            component.angular_damping = self.settings.rolling_damping if balls and all(balls) else self.settings.angular_damping
-            component.max_depenetration_velocity = self.settings.max_depenetration_speed
-            component.kinematic = kind == KINEMATIC
-            if centre_shift is not None:
-                middle = component.cmass_local_pose
-                component.cmass_local_pose = self._sapien.Pose(middle.p + np.asarray(centre_shift, dtype=np.float32), middle.q)
+            self._let_move(component, kind, bool(balls) and all(balls), centre_shift)
         self._register(name, component, world_from_object)
+
+    def _spaced(self, shape: Any) -> Any:
+        """A shape with the settings' distances at which it is solved and rests."""
+        shape.contact_offset = self.settings.contact_offset
+        shape.rest_offset = self.settings.rest_offset
+        return shape
+
+    def _surface(self, mesh: Mesh, material: Any) -> Any:
+        """A shape that is a mesh's exact surface."""
+        return self._sapien.physx.PhysxCollisionShapeTriangleMesh(
+            vertices=np.ascontiguousarray(mesh.vertices, dtype=np.float32),
+            triangles=np.ascontiguousarray(mesh.faces, dtype=np.uint32),
+            scale=np.ones(3, np.float32),
+            material=material,
+        )
+
+    def _piece(self, name: str, corners: NDArray[np.float64], ball: tuple[NDArray[np.float64], float] | None, material: Any) -> Any:
+        """The shape of one convex piece of a body: a ball where it stands for one.  Raises BAD_SCENE where PhysX cannot take it."""
+        physx = self._sapien.physx
+        if ball is not None:
+            shape = physx.PhysxCollisionShapeSphere(radius=ball[1], material=material)
+            shape.local_pose = self._sapien.Pose(ball[0])
+            return shape
+        try:
+            return physx.PhysxCollisionShapeConvexMesh(
+                vertices=np.ascontiguousarray(corners, dtype=np.float32), scale=np.ones(3, np.float32), material=material
+            )
+        except RuntimeError as error:
+            raise MagicError(Code.BAD_SCENE, f"piece of {name}", str(error), "a convex piece that PhysX can cook") from error
+
+    def _let_move(self, component: Any, kind: str, rolls: bool, centre_shift: NDArray[np.float64] | None) -> None:
+        """Set how a body that is not static is solved and damped; rolls: it is made of balls alone."""
+        component.solver_position_iterations = self.settings.position_iterations
+        component.solver_velocity_iterations = self.settings.velocity_iterations
+        component.sleep_threshold = 0.0
+        component.linear_damping = self.settings.linear_damping
+        component.angular_damping = self.settings.rolling_damping if rolls else self.settings.angular_damping
+        component.max_depenetration_velocity = self.settings.max_depenetration_speed
+        component.kinematic = kind == KINEMATIC
+        if centre_shift is not None:
+            middle = component.cmass_local_pose
+            component.cmass_local_pose = self._sapien.Pose(middle.p + np.asarray(centre_shift, dtype=np.float32), middle.q)
 
     def component(self, name: str) -> Any:
         """The PhysX component of a body."""

@@ -256,37 +256,21 @@ class Session:
             chosen = {} if scenario.chosen else {"tool": found[scene.tools[0]], "target": found[scene.target]}
             looked, began = time.monotonic(), self.now
             result = self.run(strategy=scenario.strategy, seed=seed, **chosen)
-            times = result.times
-            record.update(
-                code=int(result.code),
-                reason=split_metrics(result.message)[0],
-                verified=result.verified,
-                executed=result.executed,
-            )
-            record["attempts"] = len(result.candidates)
-            record["refused"] = [int(candidate.code) for candidate in result.candidates if candidate.code != Code.OK]
-            seconds = {"perceive": looked - begun, "match": times.match, "plan": times.plan, "verify": times.verify}
-            seconds["execute"] = max(0.0, time.monotonic() - looked - times.perceive - times.match - times.plan - times.verify)
-            record["seconds"] = {k: round(v, 2) for k, v in seconds.items()}
+            record.update(_told(result, looked - begun, time.monotonic() - looked))
             ended = self.now
             self.wait(lambda: self.now > ended + AFTER, 30.0, "the truth goes on")
-            record["simulated_seconds"] = round(ended - began, 2)
             names = {i: name for name, i in found.items()}
-            record["tool"] = names.get(result.tool_id, scene.tools[0])
-            record["target"] = names.get(result.target_id, scene.target)
-            record["turn"] = result.candidates[-1].candidate.turn if result.candidates else 0.0
+            record.update(
+                simulated_seconds=round(ended - began, 2),
+                tool=names.get(result.tool_id, scene.tools[0]),
+                target=names.get(result.target_id, scene.target),
+                turn=result.candidates[-1].candidate.turn if result.candidates else 0.0,
+            )
         except MagicError as error:
             record.update(code=int(error.code), reason=error.message)
         seen = self.seen
         if len(seen.truth) > 1 and found:
-            track = Track.of(list(seen.truth), self._hand).begun(BEGUN)
-            record["begun"] = track is not None
-            if track is not None:
-                # What was chosen is judged, as it was to be led.
-                scene = replace(scene, target=record.get("target", scene.target), strategy=scene.strategy.turned(record.get("turn", 0.0)))
-                judgement = judge(scene, record.get("tool", scene.tools[0]), track)
-                success = judgement.code == Code.OK and record["executed"]
-                record.update(truth=int(judgement.code), judgement=judgement.message, success=success)
+            record.update(self._judged(scene, record))
         record.setdefault("code", int(Code.INTERNAL))
         if record["code"] == Code.HANDLE_NOT_SEEN:
             record["loop_in_sight"] = loop_in_sight(scene, scene.tools[0])
@@ -298,6 +282,32 @@ class Session:
         record.update(film(seen, out, path.stem))
         path.write_text(json.dumps(record, indent=2) + "\n")
         return record
+
+    def _judged(self, scene: Scene, record: dict[str, Any]) -> dict[str, Any]:
+        """What truly came of a trial of which so much is known: of what was chosen, as it was to be led."""
+        track = Track.of(list(self.seen.truth), self._hand).begun(BEGUN)
+        if track is None:
+            return {"begun": False}
+        scene = replace(scene, target=record.get("target", scene.target), strategy=scene.strategy.turned(record.get("turn", 0.0)))
+        judgement = judge(scene, record.get("tool", scene.tools[0]), track)
+        success = judgement.code == Code.OK and record["executed"]
+        return {"begun": True, "truth": int(judgement.code), "judgement": judgement.message, "success": success}
+
+
+def _told(result: Any, looking: float, running: float) -> dict[str, Any]:
+    """What the graph tells of a run; looking, running: seconds by the clock until its things were seen, and of the run."""
+    times = result.times
+    seconds = {"perceive": looking, "match": times.match, "plan": times.plan, "verify": times.verify}
+    seconds["execute"] = max(0.0, running - times.perceive - times.match - times.plan - times.verify)
+    return {
+        "code": int(result.code),
+        "reason": split_metrics(result.message)[0],
+        "verified": result.verified,
+        "executed": result.executed,
+        "attempts": len(result.candidates),
+        "refused": [int(candidate.code) for candidate in result.candidates if candidate.code != Code.OK],
+        "seconds": {k: round(v, 2) for k, v in seconds.items()},
+    }
 
 
 def stage_of(record: dict[str, Any]) -> str:

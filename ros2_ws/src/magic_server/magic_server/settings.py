@@ -100,19 +100,20 @@ def read(node: Node, preset: str = "") -> Settings:
     """Declare the parameters of a run and read them; ``preset``: the arm's, which names its driver's actions (empty: the Panda's)."""
     driver = PRESETS[preset or "panda"]
 
-    def count(name: str, default: int, text: str, high: int) -> int:
-        return parameter(node, name, default, text, low=1, high=high, read_only=True)
+    def declared(name: str, default: Any, text: str, low: float | None = None, high: float | None = None) -> Any:
+        return parameter(node, name, default, text, low=low, high=high)
+
+    def count(name: str, default: int, text: str) -> int:
+        return declared(name, default, text, 1, 50)
 
     def seconds(name: str, default: float, text: str) -> float:
-        return parameter(node, name, default, text, low=0.05, high=3600.0, read_only=True)
+        return declared(name, default, text, 0.05, 3600.0)
 
     return Settings(
-        strategies=parameter(node, "strategies", "", "folder of the strategies; empty: the installed ones", read_only=True),
-        top_k=count("top_k", 3, "candidates to try where the goal does not say", 50),
-        attempts=count("attempts", 3, "grasps to try for one contact (variant arm)", 50),
-        repetitions=parameter(
-            node, "repetitions", 0, "rollouts of one motion at most; 0: the verifier's own number", low=0, high=1000, read_only=True
-        ),
+        strategies=declared("strategies", "", "folder of the strategies; empty: the installed ones"),
+        top_k=count("top_k", 3, "candidates to try where the goal does not say"),
+        attempts=count("attempts", 3, "grasps to try for one contact (variant arm)"),
+        repetitions=declared("repetitions", 0, "rollouts of one motion at most; 0: the verifier's own number", 0, 1000),
         timeout=seconds("timeout", 300.0, "s for a whole run where the goal does not say"),
         presence=seconds("server_timeout", 5.0, "s to wait for a server that is not there"),
         objects=seconds("objects_timeout", 10.0, "s to wait for objects"),
@@ -120,53 +121,25 @@ def read(node: Node, preset: str = "") -> Settings:
         plan=seconds("plan_timeout", 30.0, "s for one plan"),
         verify=seconds("verify_timeout", 120.0, "s for one verification"),
         grace=seconds("grace", 5.0, "s that an answer may come late before its server counts as dead"),
-        execute=parameter(node, "execute", False, "carry verified plans out with arm and gripper", read_only=True),
-        autostart=parameter(
-            node,
-            "autostart",
-            False,
-            "begin in the lifecycle's state active, in which the arm may move, without being asked",
-            read_only=True,
+        execute=declared("execute", False, "carry verified plans out with arm and gripper"),
+        autostart=declared("autostart", False, "begin in the lifecycle's state active, in which the arm may move, without being asked"),
+        execute_unverified=declared(
+            "execute_unverified", False, "with execute: also what simulation cannot judge, where the goal has allow_unverified"
         ),
-        execute_unverified=parameter(
-            node,
-            "execute_unverified",
-            False,
-            "with execute: also what simulation cannot judge, where the goal has allow_unverified",
-            read_only=True,
+        trajectory_action=declared(
+            "trajectory_action", driver.trajectory_action, "action of the arm's controller (control_msgs/FollowJointTrajectory)"
         ),
-        trajectory_action=parameter(
-            node,
-            "trajectory_action",
-            driver.trajectory_action,
-            "action of the arm's controller (control_msgs/FollowJointTrajectory)",
-            read_only=True,
-        ),
-        gripper_action=parameter(
-            node, "gripper_action", driver.gripper_action, "action of the gripper (control_msgs/GripperCommand)", read_only=True
-        ),
+        gripper_action=declared("gripper_action", driver.gripper_action, "action of the gripper (control_msgs/GripperCommand)"),
         objects_age=seconds("objects_age", 5.0, "s that the objects may be old where a trajectory is published or the arm begins to move"),
-        object_tolerance=parameter(
-            node, "object_tolerance", 0.02, "m that an object may have moved since it was planned for", low=0.0, high=0.5, read_only=True
+        object_tolerance=declared("object_tolerance", 0.02, "m that an object may have moved since it was planned for", 0.0, 0.5),
+        required_rate=declared(
+            "required_rate", 0.7, "least lower end of the success rate's 95 % interval; the verifier requires its own besides", 0.0, 0.99
         ),
-        required_rate=parameter(
-            node,
-            "required_rate",
-            0.7,
-            "least lower end of the success rate's 95 % interval; the verifier requires its own besides",
-            low=0.0,
-            high=0.99,
-            read_only=True,
-        ),
-        recorded=parameter(
-            node, "recorded", False, "what comes in is a recording: it gets no older, and no arm is moved by it", read_only=True
-        ),
-        words_weights=parameter(
-            node,
+        recorded=declared("recorded", False, "what comes in is a recording: it gets no older, and no arm is moved by it"),
+        words_weights=declared(
             "words_weights",
             "",
             "weights of CLIP or SigLIP, a hub name or a folder, for names in other words than the known ones; empty: such names are refused",
-            read_only=True,
         ),
     )
 
@@ -175,7 +148,7 @@ def read_arm(node: Node, presence: float, finger: str) -> ArmSettings:
     """Declare the parameters of the execution and read them; ``finger``: the joint of a finger."""
 
     def number(name: str, text: str, low: float, high: float) -> float:
-        return parameter(node, name, getattr(ArmSettings, name), text, low=low, high=high, read_only=True)
+        return parameter(node, name, getattr(ArmSettings, name), text, low=low, high=high)
 
     return ArmSettings(
         speed=number("speed", "of the execution, as a share of the planned speed", 0.01, 1.0),
@@ -193,17 +166,9 @@ def read_arm(node: Node, presence: float, finger: str) -> ArmSettings:
         grasp_tolerance=number("grasp_tolerance", "m that the opening of the closed fingers may be off the planned one", 0.0, 0.1),
         presence=presence,
         gripper_command=parameter(
-            node,
-            "gripper_command",
-            "GripperCommand",
-            "the gripper's action, of control_msgs",
-            choices=tuple(gripper.ACTIONS),
-            read_only=True,
+            node, "gripper_command", "GripperCommand", "the gripper's action, of control_msgs", choices=tuple(gripper.ACTIONS)
         ),
-        gripper_joint=parameter(
-            node, "gripper_joint", "", "joint that ParallelGripperCommand names; empty: the first finger's", read_only=True
-        )
-        or finger,
+        gripper_joint=parameter(node, "gripper_joint", "", "joint that ParallelGripperCommand names; empty: the first finger's") or finger,
     )
 
 
@@ -212,7 +177,7 @@ def read_loop(node: Node, preset: str = "") -> LoopSettings:
     given up sooner than corrected."""
 
     def of(name: str, parameter_name: str, text: str, low: float | None = None, high: float | None = None) -> Any:
-        return parameter(node, f"loop.{parameter_name}", getattr(LoopSettings, name), text, low=low, high=high, read_only=True)
+        return parameter(node, f"loop.{parameter_name}", getattr(LoopSettings, name), text, low=low, high=high)
 
     found = LoopSettings(
         look=of("look", "look", "look at the tool in the hand after the lift, and correct its pose"),
@@ -236,7 +201,6 @@ def read_loop(node: Node, preset: str = "") -> LoopSettings:
             "Nm to which each joint repeats the effort that joint_states tell of it: with it the tool is weighed in the hand; 0: it is not",
             low=0.0,
             high=20.0,
-            read_only=True,
         ),
     )
     for small, large in (("tool_shift", "slip_shift"), ("tool_turn", "slip_turn")):
