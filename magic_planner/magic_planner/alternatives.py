@@ -101,7 +101,8 @@ def analytic(robot: Robot) -> Callable[[NDArray[np.float64]], Any]:
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes (B, 3) edges and (B, 4, 4) poses, all in a robot's world, and pairs (P, 2, J) of free joint positions with something between."""
+    """Boxes (B, 3) edges and (B, 4, 4) poses, all in a robot's world, and pairs (P, 2, J) of free
+    joint positions with something between."""
 
     sizes: NDArray[np.float64]
     poses: NDArray[np.float64]

@@ -269,8 +269,8 @@ class _Search:
         return None
 
     def _in_one_of(self, ways: Iterator[Branch]) -> MotionPlan | None:
-        """The plan in the first of the ways with one grasp that serves; ``None`` where none does, or the grasp is one of the attempts before,
-        which is noted."""
+        """The plan in the first of the ways with one grasp that serves; ``None`` where none does, or the grasp is one
+        of the attempts before, which is noted."""
         for branch in ways:
             if self.tried >= self.planner.settings.tries:
                 raise self.failures.error()
@@ -290,8 +290,8 @@ class _Search:
         return None
 
     def _along(self, branch: Branch) -> MotionPlan | None:
-        """The whole plan along one branch, or ``None``, once pick-up and task are known to be possible, where its grasp is one of the attempts
-        before; raises StageError."""
+        """The whole plan along one branch, or ``None``, once pick-up and task are known to be possible, where its grasp is one of
+        the attempts before; raises StageError."""
         planner, request = self.planner, self.request
         planner.task.check(request, branch)
         if self.in_hand:

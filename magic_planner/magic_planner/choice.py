@@ -24,9 +24,9 @@ HEIGHTS, PASSES = 10, 7
 CLOSER = 4
 #: Points on each other thing for the first test of the hand.
 POINTS = 200
-#: Grasps whose hand comes within so many metres of where the target lies in the tool stand back by so much: the target rolls about there.  So do
-#: those whose open hand comes within so many metres of the tool, as it is that far off where it was sent: what it brushes is pushed over, or
-#: dragged along, before the fingers close.
+#: Grasps whose hand comes within so many metres of where the target lies in the tool stand back by so much: the target rolls about
+#: there.  So do those whose open hand comes within so many metres of the tool, as it is that far off where it was sent: what it brushes
+#: is pushed over, or dragged along, before the fingers close.
 BESIDE, BRUSHED, BACK = 0.01, 0.002, 5.0
 
 
@@ -42,7 +42,8 @@ class GraspChoice:
         tool_from_contact: Array,
         tool_from_target: Array | None = None,
     ) -> None:
-        """tool_from_target (4, 4): where the target is in the tool where their contacts meet; ``None`` where no contact of the target is known."""
+        """tool_from_target (4, 4): where the target is in the tool where their contacts meet; ``None``
+        where no contact of the target is known."""
         self.tool_from_target = tool_from_target
         self.robot, self.settings, self.request, self.tool_from_contact = robot, settings, request, tool_from_contact
         self.fixed = request.strategy.physics.target_is_fixed
@@ -138,8 +139,8 @@ class GraspChoice:
         return grip_at_rest(self.robot, self.grasping, request.tool, frames, self.tool_from_contact, poses, pushed)
 
     def _with_room(self, grasps: list[Grasp]) -> list[Grasp]:
-        """The grasps, those last whose hand would be in the way of a target that the tool takes along, or hardly has room for the tool.  A ball that
-        is met with a scoop's lip rolls on to the place that was matched, and lay on the fingers there."""
+        """The grasps, those last whose hand would be in the way of a target that the tool takes along, or hardly has room for the tool.
+        A ball that is met with a scoop's lip rolls on to the place that was matched, and lay on the fingers there."""
         hand, wide = self.robot.hand_body(), Body("hand", grown(self.robot.hand.values(), BRUSHED))
         tool = Body(self.request.tool.id, solid_pieces(self.request.tool))
         pairs = [(wide, tool)]
@@ -159,7 +160,8 @@ class GraspChoice:
         return [grasps[index] for index in np.argsort(ranks, kind="stable")]
 
     def _there(self, index: int) -> bool:
-        """Whether the target is where it was when the motion's pose ``index`` is reached: once touched it goes along, unless it is fixed."""
+        """Whether the target is where it was when the motion's pose ``index`` is reached: once
+        touched it goes along, unless it is fixed."""
         return self.fixed or index <= self.met
 
     def _points(self) -> tuple[Array, Array]:

@@ -2,9 +2,9 @@
 
     ros2 run magic_planner describe_robot arm.urdf --tip tool_link --home 0 -1 1 0 1 0 --out DIR
 
-writes ``robot.param.yaml`` for the launch file, ``robot.srdf`` with the pairs of links that need not be checked against each other, found by
-sampling, and ``robot.urdf`` where the given file cannot be used as it is: a xacro, or a linkage gripper, which is reduced to its opening.
-Exit status 0; 1 with one line that says what is wrong with the description.
+writes ``robot.param.yaml`` for the launch file, ``robot.srdf`` with the pairs of links that need not be checked against each other, found
+by sampling, and ``robot.urdf`` where the given file cannot be used as it is: a xacro, or a linkage gripper, which is reduced to its
+opening. Exit status 0; 1 with one line that says what is wrong with the description.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ TIP = "magic_tip"
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of links that need not be checked: joined by a joint, or both fingers; touching in (nearly) every configuration; touching at home, so that
-    nothing could be planned; never touching in ``samples``.  checked: the others, with the share of configurations in which they touch."""
+    """Pairs of links that need not be checked: joined by a joint, or both fingers; touching in (nearly) every
+    configuration; touching at home, so that nothing could be planned; never touching in ``samples``.  checked: the others,
+    with the share of configurations in which they touch."""
 
     adjacent: tuple[tuple[str, str], ...]
     always: tuple[tuple[str, str], ...]

@@ -1,7 +1,7 @@
 """Free motions of the Panda by roboplan, for :mod:`magic_planner.alternatives`: run by the Python of an environment that has it.
 
-Imports nothing of this project, whose environment cannot have roboplan: it asks for another numpy than MPlib.  ``python free_by_roboplan.py IN.npz OUT.npz``: boxes and pairs of
-joint positions in, paths and seconds of the processor out.
+Imports nothing of this project, whose environment cannot have roboplan: it asks for another numpy than MPlib.
+``python free_by_roboplan.py IN.npz OUT.npz``: boxes and pairs of joint positions in, paths and seconds of the processor out.
 """
 
 from __future__ import annotations

@@ -56,7 +56,8 @@ IN_PLANE = 0.5
 
 
 def gap_of(tool: SceneObject, variant: str) -> float:
-    """The gap for a tool, metres, that a floating gripper (``fg``) leads or an arm holds: one whose surface is stated to be off comes so much nearer."""
+    """The gap for a tool, metres, that a floating gripper (``fg``) leads or an arm holds: one whose surface is
+    stated to be off comes so much nearer."""
     return GAP if variant == "fg" else min(GAP_IN_HAND + tool.surface_error, WIDEST_GAP)
 
 

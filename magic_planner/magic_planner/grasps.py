@@ -143,9 +143,9 @@ def antipodal(
     rng: np.random.Generator,
     up: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces: two opposite faces with
-    nothing else of it beside them between open fingers, though there may be a gap within.  Of a ring as narrow as the hand opens they are the two outer
-    sides, of which one finger would meet the other first that is to close on one side of it.
+    """Centres (M, 3), closing directions (M, 3) unit and widths (M,) of antipodal pairs on a union of convex pieces: two opposite faces
+    with nothing else of it beside them between open fingers, though there may be a gap within.  Of a ring as narrow as the hand opens
+    they are the two outer sides, of which one finger would meet the other first that is to close on one side of it.
 
     up (3,): out of the table on which the pieces lie.  Few points are spent on faces across it, where a finger has no room below.
     """
@@ -401,8 +401,8 @@ class Patches:
 
 
 def _centred(robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Grasps (G, 4, 4) moved so that the middles of what the pads touch come to their middles, and that they touch it at the same time: the one
-    that is first would push the tool on to the other; and by how much (G,), metres."""
+    """Grasps (G, 4, 4) moved so that the middles of what the pads touch come to their middles, and that they touch it at the same time:
+    the one that is first would push the tool on to the other; and by how much (G,), metres."""
     if not len(frames):
         return frames, np.zeros(0)
     patches = Patches.of(robot, frames, pieces)

@@ -102,8 +102,8 @@ def between(pieces: Solid, points: Array, directions: Array, opening: float) -> 
     """What two fingers ``opening`` metres apart close on, along lines (N, 3), (N, 3) from a surface into the convex pieces: the last face
     between them, where the middle of the fingers is that of the line from the surface to that face.
 
-    Returns the length (N,) of that line, gaps between the pieces counted, the outward normal (N, 3) of that face, and whether the start is none
-    of a surface, or a piece lies before it between the fingers.
+    Returns the length (N,) of that line, gaps between the pieces counted, the outward normal (N, 3) of that face, and whether the start
+    is none of a surface, or a piece lies before it between the fingers.
     """
     length, normal, before = through(pieces, points, directions)
     found = list(crossings(pieces, points[:, None], directions))

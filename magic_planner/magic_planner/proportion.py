@@ -1,14 +1,15 @@
 """A scoop keeps to table and walls in the measure of its target.
 
-A demonstrated motion is carried over as it is, from where the new target's contact stands: what leads the contact 70 mm off a wall at the
-end, with the lip of a bowl before it, leads it 50 mm off with a smaller ball that was 20 mm nearer.  The lip of the tool that goes beneath it then is higher
-on the wall than the ball's middle, and drives the ball up and over the wall's end instead of going beneath.  With d the distance of the contact
-from table and obstacles and h its height above what the target stands on, the contact of a smaller target is led at
+A demonstrated motion is carried over as it is, from where the new target's contact stands: what leads the contact 70 mm off a
+wall at the end, with the lip of a bowl before it, leads it 50 mm off with a smaller ball that was 20 mm nearer.  The lip of the
+tool that goes beneath it then is higher on the wall than the ball's middle, and drives the ball up and over the wall's end
+instead of going beneath.  With d the distance of the contact from table and obstacles and h its height above what the target
+stands on, the contact of a smaller target is led at
 
     d = (h / h_shown) d_shown
 
-wherever it would be further off, by h_shown - h at most, d_shown being the distance that the contact of a target of the demonstrated size would have at the
-same place.  Once the tool has turned beneath the target it is taken away as was shown.
+wherever it would be further off, by h_shown - h at most, d_shown being the distance that the contact of a target of the demonstrated size
+would have at the same place.  Once the tool has turned beneath the target it is taken away as was shown.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def in_measure(
 
 
 def _height_and_depth(object_from_contact: Array, vertices: Array, up: Array) -> tuple[float, float]:
-    """How high a contact is above the lowest of an object's vertices (N, 3), and how far out from its middle along its own normal, metres; ``up``
-    (3,) in the contact frame."""
+    """How high a contact is above the lowest of an object's vertices (N, 3), and how far out from its middle along its own normal,
+    metres; ``up`` (3,) in the contact frame."""
     points = transforms.apply(transforms.inverse(object_from_contact), vertices)
     return float(-(points @ up).min()), float(np.ptp(points[:, 0]) / 2)

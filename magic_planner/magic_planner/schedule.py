@@ -23,7 +23,8 @@ LOADED = 60
 
 
 def slowed(plan: MotionPlan, factor: float) -> MotionPlan:
-    """The arm's plan with the tool carried and used ``factor`` times as slowly; coming to it, closing and leaving it take as long as before.
+    """The arm's plan with the tool carried and used ``factor`` times as slowly; coming to it,
+    closing and leaving it take as long as before.
 
     The path is the same, speeds and accelerations are less by ``factor`` and its square.
     """

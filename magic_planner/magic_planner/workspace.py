@@ -64,8 +64,9 @@ class Workspace:
         self.ignore_target(request, False)
 
     def hold_with_room(self, request: Request, grasp: Grasp, room: float, ends: Iterable[Array]) -> None:
-        """As :meth:`hold`, the tool with so much room (m) about it.  To the table it needs none, above which the task may begin by a hair: it stands that much
-        deeper for the tool, and not at all where the ``ends`` (J,) of the way meet even that.  :meth:`hold` undoes it."""
+        """As :meth:`hold`, the tool with so much room (m) about it.  To the table it needs none, above which the task
+        may begin by a hair: it stands that much deeper for the tool, and not at all where the ``ends`` (J,) of the way
+        meet even that.  :meth:`hold` undoes it."""
         robot, name = self.robot, request.tool.id
         self.hold(request, grasp, request.roomy(request.tool, room))
         robot.allow(name, "table")
@@ -78,7 +79,8 @@ class Workspace:
         self.robot.allow(request.tool.id, "table", *request.surroundings())
 
     def lay(self, request: Request, pose: Array, shapes: list[Any] | None = None) -> None:
-        """The world with the tool (or other shapes in its frame) lying at a pose and the hand open about it; only the fingers may touch it."""
+        """The world with the tool (or other shapes in its frame) lying at a pose and the hand open
+        about it; only the fingers may touch it."""
         robot, name = self.robot, request.tool.id
         robot.detach()
         robot.open_to(robot.config.opening)

@@ -54,8 +54,8 @@ class Options:
     """What to do.  tool and target may be empty: the matcher chooses.  timeout in seconds for the run itself.  pictures: for the report.
 
     command: what the user typed, for the report.  weights: of the features.  launch: a launch file and its arguments, which start the
-    nodes instead.  cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it is played.
-    files: parameters files by node.  rerun: a recording for the rerun viewer as well.
+    nodes instead.  cameras: their names, empty: those of perception's parameters.  topics: of the bag, each with the name under which it
+    is played. files: parameters files by node.  rerun: a recording for the rerun viewer as well.
     """
 
     strategy: str
@@ -103,7 +103,8 @@ def look_into(bag: Path, topics: Sequence[tuple[str, str]] = (), cameras: Sequen
 
 
 def first_images(bag: Path, topics: Sequence[tuple[str, str]] = ()) -> dict[str, Any]:
-    """The first image of each camera topic of a bag, by the name that it is played under, as messages: what the report shows.  Raises BAD_BAG."""
+    """The first image of each camera topic of a bag, by the name that it is played under, as messages:
+    what the report shows.  Raises BAD_BAG."""
     from magic_bags import bag_messages
 
     renamed = dict(topics)

@@ -23,7 +23,8 @@ from magic_server.detected import Meshes, scene_of
 
 
 class DetectedObjects(Node):
-    """Subscribes ``detections_in`` (vision_msgs/Detection3DArray) and, latched, ``known_objects`` and ``obstacles``; publishes ``objects``, latched.
+    """Subscribes ``detections_in`` (vision_msgs/Detection3DArray) and, latched, ``known_objects`` and
+    ``obstacles``; publishes ``objects``, latched.
 
     A detection's class id names its mesh in the folder ``meshes``; its pose is the mesh's.  The table is the plane ``table``.
     """

@@ -186,8 +186,8 @@ def scooped_ball(radius: float) -> NDArray[np.float64]:
 
 #: Speed of the tool in scooping, m/s.
 SCOOP_SPEED = 0.08
-#: Where the tool's contact begins and how near it comes quickly (3,), m, in the frame of the target's contact. The deepest bowls reach round the ball before
-#: their bottoms touch it: the start leaves them room.
+#: Where the tool's contact begins and how near it comes quickly (3,), m, in the frame of the target's contact. The deepest bowls reach
+#: round the ball before their bottoms touch it: the start leaves them room.
 BACK, NEAR = np.array([0.10, 0.0, 0.0]), np.array([0.06, 0.0, 0.0])
 
 
@@ -251,7 +251,8 @@ def scooping() -> Strategy:
 
 
 def _scoop(arm: float) -> tuple[NDArray[np.float64], Poses, NDArray[np.float64]]:
-    """The motion of scooping about an axis ``arm`` metres above the contact: times (T,) in s, target_contact_from_tool_contact (T, 4, 4), and that where the turn ends.
+    """The motion of scooping about an axis ``arm`` metres above the contact: times (T,) in s, target_contact_from_tool_contact
+    (T, 4, 4), and that where the turn ends.
 
     Contact frame of the target: x against the slide, y up.
     """

@@ -1,4 +1,5 @@
-"""The package's executables, which import the rest of it only when they have begun; those of server, bags and laboratory are found here as well."""
+"""The package's executables, which import the rest of it only when they have begun; those of server, bags
+and laboratory are found here as well."""
 
 from magic_core.entry import program
 

@@ -264,7 +264,8 @@ BROAD = 1.6
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture on the page: data URI and what stands below it; broad: on a phone it is scrolled along, not shrunk to the screen's width."""
+    """A picture on the page: data URI and what stands below it; broad: on a phone it is scrolled
+    along, not shrunk to the screen's width."""
 
     uri: str
     caption: str

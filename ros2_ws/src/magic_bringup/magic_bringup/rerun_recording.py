@@ -2,8 +2,8 @@
 
 An optional extra: ``pip install --no-deps -r ros2_ws/requirements-rerun.txt``; then ``rerun run.rrd`` shows it.
 
-Entities: ``cameras/TOPIC``, ``world/objects/ID`` (the tool moves), ``world/way`` (of the tool), ``world/robot/LINK`` where the arm's joints are those of the default
-robot, ``film``, ``verdict``.  Timeline ``motion``, in seconds from the plan's begin.
+Entities: ``cameras/TOPIC``, ``world/objects/ID`` (the tool moves), ``world/way`` (of the tool), ``world/robot/LINK`` where the arm's
+joints are those of the default robot, ``film``, ``verdict``.  Timeline ``motion``, in seconds from the plan's begin.
 """
 
 from __future__ import annotations

@@ -80,7 +80,8 @@ def strategy_fixtures(strategy: Strategy, pose: NDArray[np.float64] | None = Non
 
 
 def made_target(text: str, seed: int = 0) -> SceneObject:
-    """A target as ``--target`` takes it, in its own frame: ``FAMILY[:KEY=VALUE,...]``, or a mesh file (metres, z up).  Raises ``BAD_REQUEST``, ``BAD_MESH``."""
+    """A target as ``--target`` takes it, in its own frame: ``FAMILY[:KEY=VALUE,...]``, or a mesh file (metres, z up).
+    Raises ``BAD_REQUEST``, ``BAD_MESH``."""
     family, _, rest = text.partition(":")
     if family in FAMILIES:
         parameters: dict[str, float | str] = {}
@@ -112,11 +113,10 @@ def place_camera(
 ) -> tuple[NDArray[np.float64], float]:
     """world_from_camera (4, 4) from the table in view, with one thing on it where the robot reaches it, and that thing's length, m.
 
-    points (H, W, 3) in the optical frame, NaN where there is none; table_from_camera (4, 4): where it is known already; thing (N, 3): points of
-    the thing in the table's frame, the nearest one where none are given.  Of the places in
-    :data:`PLACES` and 24 directions of view, the one is taken that keeps what was seen
-    off the fixtures and the robot's foot; earlier places, and views towards the robot, first.
-    Raises ``NO_TABLE``, ``NO_OBJECTS``.
+    points (H, W, 3) in the optical frame, NaN where there is none; table_from_camera (4, 4): where it is known already; thing (N, 3):
+    points of the thing in the table's frame, the nearest one where none are given.  Of the places in :data:`PLACES` and 24 directions of
+    view, the one is taken that keeps what was seen off the fixtures and the robot's foot; earlier places, and views towards the robot,
+    first. Raises ``NO_TABLE``, ``NO_OBJECTS``.
     """
     from magic_perception.table import camera_over_table
 
@@ -188,7 +188,8 @@ def chosen(scene: Scene, tool: str) -> SceneObject:
 
 
 def standing_on(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """world_from_table (4, 4) of a plane (4,) whose normal points up: z along the normal, the origin below or above the world's, x as near to the world's as can be."""
+    """world_from_table (4, 4) of a plane (4,) whose normal points up: z along the normal, the origin below or above the
+    world's, x as near to the world's as can be."""
     origin = np.array([0.0, 0.0, -table[3] / table[2]])
     return transforms.frame(origin, np.array([1.0, 0.0, 0.0]) - table[0] * table[:3], table[:3])
 

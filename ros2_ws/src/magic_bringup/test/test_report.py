@@ -106,7 +106,8 @@ class Page(HTMLParser):
 
 
 def test_nothing_on_the_page_asks_for_more_than_a_phone_is_wide(folder, tmp_path):
-    """At 390 px less the margins: no width or column of a fixed size beyond that, tables whose rows become cards, boxes that break or scroll."""
+    """At 390 px less the margins: no width or column of a fixed size beyond that, tables whose rows
+    become cards, boxes that break or scroll."""
     page = Page(report.render(full(folder, tmp_path), tmp_path))
     assert ("meta", {"name": "viewport", "content": "width=device-width,initial-scale=1"}) in page.found
     room = 390 - 2 * 8 - 2 * 12 - 2

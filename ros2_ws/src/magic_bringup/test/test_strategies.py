@@ -107,8 +107,8 @@ def test_the_contacts_lie_on_the_outlines(strategy: Strategy) -> None:
 def test_the_tool_keeps_clear_of_the_table(strategy: Strategy) -> None:
     world_from_tool = demonstrated_pose(strategy.environment) @ strategy.target_from_tool
     height = (world_from_tool[:, 2, :3] @ strategy.tool_mesh.vertices.T).min(axis=1) + world_from_tool[:, 2, 3]
-    # The spoon's bowl reaches below the ball's middle by more than its radius, a mallet's block below a flat peg's, a tip below a ring's: the planner lifts them
-    # by this.
+    # The spoon's bowl reaches below the ball's middle by more than its radius, a mallet's block below a flat peg's, a tip below a
+    # ring's: the planner lifts them by this.
     low = strategy.name in ("scooping", "hammering", "pressing", "ring_pulling")
     assert height.min() > (-0.016 if low else 0.001)
 

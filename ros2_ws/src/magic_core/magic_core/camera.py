@@ -52,8 +52,8 @@ NEARLY, SURELY = 1, 2
 
 @dataclass(frozen=True)
 class ArmSeen:
-    """How a picture sees the arm against where its joints put it: ``offset`` (3,), m, in the world, carries what is seen of it about ``centre`` (3,)
-    to where it should be; error: the standard error of each of its components, m."""
+    """How a picture sees the arm against where its joints put it: ``offset`` (3,), m, in the world, carries what is seen of it about
+    ``centre`` (3,) to where it should be; error: the standard error of each of its components, m."""
 
     centre: NDArray[np.float64]
     offset: NDArray[np.float64]

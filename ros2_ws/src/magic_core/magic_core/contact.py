@@ -61,7 +61,8 @@ class Contact:
 
 @dataclass(frozen=True)
 class Companion:
-    """A further contact of a candidate: its name in the strategy, where it is on the tool, and the contact on the target that it would meet."""
+    """A further contact of a candidate: its name in the strategy, where it is on the tool, and the
+    contact on the target that it would meet."""
 
     name: str
     tool: Contact

@@ -197,7 +197,8 @@ def depth_from_msg(msg: Image, unit: str = "") -> NDArray[np.float32]:
     return depths.in_metres(_pixels(msg, ("16UC1", "mono16", "32FC1"), Code.BAD_IMAGE)[:, :, 0], unit)
 
 
-#: Bytes before the image of a compressedDepth message: int32 how, float32 A and B of depth = A / (value - B) where depth was floating point.
+#: Bytes before the image of a compressedDepth message: int32 how, float32 A and B of depth = A /
+#: (value - B) where depth was floating point.
 _DEPTH_HEADER = 12
 
 
@@ -213,9 +214,11 @@ def color_from_compressed_msg(msg: CompressedImage) -> NDArray[np.uint8]:
 
 
 def depth_from_compressed_msg(msg: CompressedImage, unit: str = "") -> NDArray[np.float32]:
-    """A depth image as image_transport's ``compressedDepth`` sends it (PNG), or its ``compressed`` as 16-bit PNG, as :func:`depth_from_msg` gives it.
+    """A depth image as image_transport's ``compressedDepth`` sends it (PNG), or its ``compressed`` as 16-bit
+    PNG, as :func:`depth_from_msg` gives it.
 
-    ``format`` is ``16UC1; compressedDepth png``, the same with 32FC1, or ``16UC1; png compressed``; raises BAD_ENCODING for others (``rvl``).
+    ``format`` is ``16UC1; compressedDepth png``, the same with 32FC1, or ``16UC1; png compressed``;
+    raises BAD_ENCODING for others (``rvl``).
     """
     encoding, _, how = (part.strip() for part in msg.format.partition(";"))
     with_header = how in ("compressedDepth", "compressedDepth png") and encoding in ("16UC1", "32FC1")
@@ -443,8 +446,8 @@ def object_from_msg(msg: mi.SceneObject, pictures: bool = True) -> SceneObject:
 
 
 def without_pictures(msg: mi.SceneObject, cloud: bool, surface: bool) -> mi.SceneObject:
-    """What planner and verifier need of an object's message: view, mask and picture left out, and without ``cloud`` its points, without ``surface``
-    its mesh, where convex pieces say the same.  Nothing is copied."""
+    """What planner and verifier need of an object's message: view, mask and picture left out, and without ``cloud`` its points, without
+    ``surface`` its mesh, where convex pieces say the same.  Nothing is copied."""
     light = copy.copy(msg)
     light.view, light.mask, light.picture = mi.CanonicalView(), Image(), Image()
     if not cloud:

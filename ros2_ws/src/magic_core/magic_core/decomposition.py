@@ -26,11 +26,11 @@ SAMPLES = 400_000
 CONVEX = 0.95
 #: Cubes that the thinnest side is cut into, if no more than FINEST along the longest edge are needed for it.
 THINNEST, FINEST = 6, 112
-#: A piece that stands this far above the surface, m, where something may lie, is cut further: contacts are solved from 2 mm on.  It is cut to SMALLEST, m,
-#: at least, and so that there are no more than ALL pieces in the end: each costs time in physics.
+#: A piece that stands this far above the surface, m, where something may lie, is cut further: contacts are solved from 2 mm on.  It is
+#: cut to SMALLEST, m, at least, and so that there are no more than ALL pieces in the end: each costs time in physics.
 ABOVE, SMALLEST, ALL = 0.0015, 0.002, 600
-#: Something may lie where a ball of this radius, m, touches the surface, or comes as near as SLACK: thinner than rods and targets are.  In narrower furrows
-#: (a scan's roughness, a corner) nothing does.
+#: Something may lie where a ball of this radius, m, touches the surface, or comes as near as SLACK: thinner than rods and targets are.
+#: In narrower furrows (a scan's roughness, a corner) nothing does.
 BALL, SLACK = 0.005, 0.001
 #: Heights are asked for at points so far apart, m.
 SPACING = 0.002
@@ -95,7 +95,8 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
 
 @dataclass(frozen=True)
 class _Cut:
-    """A convex piece, the box from ``low`` to ``high`` (3,) in which it lies, and, once it was cut, the triangles (T, 3, 3) of the mesh in it."""
+    """A convex piece, the box from ``low`` to ``high`` (3,) in which it lies, and, once it was cut, the
+    triangles (T, 3, 3) of the mesh in it."""
 
     hull: Mesh
     low: NDArray[np.float64]
@@ -106,7 +107,8 @@ class _Cut:
 def _followed(mesh: Mesh, pieces: list[_Cut]) -> list[_Cut]:
     """Pieces that stand above the mesh by more than :data:`ABOVE` cut in two, and again, those that stand highest first, up to :data:`ALL`.
 
-    The two are what of the solid lies on each side of a plane across the box, of the three through its middle that by which the least volume is left.
+    The two are what of the solid lies on each side of a plane across the box, of the three through its
+    middle that by which the least volume is left.
     """
     space = _Space(mesh)
     done: list[_Cut] = []
@@ -151,7 +153,8 @@ class _Space:
         return out
 
     def above(self, pieces: list[_Cut]) -> NDArray[np.float64]:
-        """How far each piece stands above the mesh where something may lie, m: the largest distance of points spread over its faces that are outside."""
+        """How far each piece stands above the mesh where something may lie, m: the largest distance of points
+        spread over its faces that are outside."""
         points = [_spread(cut) for cut in pieces]
         owner = np.repeat(np.arange(len(pieces)), [len(p) for p in points])
         everything = np.concatenate(points)

@@ -78,7 +78,8 @@ def load(path: str | Path, name: str, code: Code = Code.BAD_IMAGE) -> Stored:
 
 
 def eight_bits(data: NDArray) -> NDArray[np.uint8]:
-    """Pixels of any type as 8 bits: 16 bits by their range (12 bits where nothing exceeds them), floats by their largest where it exceeds 1."""
+    """Pixels of any type as 8 bits: 16 bits by their range (12 bits where nothing exceeds them),
+    floats by their largest where it exceeds 1."""
     if data.dtype == np.bool_:
         return data.astype(np.uint8) * 255
     if data.dtype.kind == "f":

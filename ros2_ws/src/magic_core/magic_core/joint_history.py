@@ -58,8 +58,8 @@ class JointHistory:
             return min((self._tracks[n][-1][0] if n in self._tracks else -math.inf for n in names), default=-math.inf)
 
     def at(self, names: Iterable[str], stamp: float, reach: float) -> dict[str, float]:
-        """Positions by name at a stamp, linear between states; before the first and after the last as these, for at most ``reach`` seconds, and in a longer
-        gap where the joint is after it where it was before.
+        """Positions by name at a stamp, linear between states; before the first and after the last as these, for at most ``reach``
+        seconds, and in a longer gap where the joint is after it where it was before.
 
         Raises ``NO_FRAMES`` where nothing was received, ``STALE_DATA`` for a joint that no message tells of, or none within reach.
         """

@@ -32,7 +32,8 @@ class JointLimits:
 
 @dataclass(frozen=True)
 class Braking:
-    """How fast a joint may still go towards the end of its range, all (J,): ends (lower and upper), rad; deceleration, rad/s^2; offset, rad/s:
+    """How fast a joint may still go towards the end of its range, all (J,): ends (lower and upper),
+    rad; deceleration, rad/s^2; offset, rad/s:
 
     at most sqrt(2 deceleration (end - q)) - offset, and not below 0.
     """

@@ -35,8 +35,8 @@ class _Apart(CallbackGroup):
 def listen_apart(node: Node, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
     """Subscribe, and have ``callback`` called in a thread of its own, with one message after the other, until the node is destroyed.
 
-    rclpy's executors list and wait for all that a node has anew for each message, which with joint states at 100 Hz and some twenty entities takes a fifth of
-    a core.  What comes out of the callback is logged.
+    rclpy's executors list and wait for all that a node has anew for each message, which with joint states at 100 Hz and some twenty
+    entities takes a fifth of a core.  What comes out of the callback is logged.
     """
     subscription = node.create_subscription(kind, topic, callback, qos, callback_group=_Apart())
 

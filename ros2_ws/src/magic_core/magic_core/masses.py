@@ -17,13 +17,14 @@ from magic_core.errors import Code, MagicError
 from magic_core.scene import SceneObject
 from magic_core.strategy import Strategy
 
-#: Densities, kg/m^3, between which solid things and hollow ones that were taken for solid lie: from foam to more than osmium.  What is outside
-#: was told in another unit, or of another thing.
+#: Densities, kg/m^3, between which solid things and hollow ones that were taken for solid lie: from foam to more than osmium.  What is
+#: outside was told in another unit, or of another thing.
 LEAST, MOST = 2.0, 25_000.0
 
 
 def mass_centre(hulls: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]]) -> tuple[float, NDArray[np.float64]]:
-    """Volume in m^3 of convex solids taken together, and the centre (3,) of their mass; of each its vertices (V, 3) and outward faces (F, 3)."""
+    """Volume in m^3 of convex solids taken together, and the centre (3,) of their mass; of each its
+    vertices (V, 3) and outward faces (F, 3)."""
     # Tetrahedra between each face and a corner of its solid.
     corners = np.concatenate([vertices[faces] - vertices[0] for vertices, faces in hulls])
     apexes = np.array([vertices[0] for vertices, _ in hulls])

@@ -82,7 +82,8 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         refuse_unknown_parameters(node)
         executor.add_node(node)
         one_thread()
-        # What was imported and built is there to stay: the collector would walk through all of it, 0.15 s each time, in the middle of goals.
+        # What was imported and built is there to stay: the collector would walk through all of it,
+        # 0.15 s each time, in the middle of goals.
         gc.collect()
         gc.freeze()
         spinning = True

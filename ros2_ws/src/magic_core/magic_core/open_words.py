@@ -25,7 +25,8 @@ MODELS = ("clip", "siglip", "siglip2")
 CAPTION = "a photo of {}"
 #: What is true of every object on a table: words that say no more than these do not name it.
 ANYTHING = ("an object", "a thing on a table", "something")
-#: The first object's share among all, by the network's own softmax, from which on it is the one that is meant: four to one against all others.
+#: The first object's share among all, by the network's own softmax, from which on it is the one that is
+#: meant: four to one against all others.
 LEAST_SHARE = 0.8
 
 
@@ -33,7 +34,8 @@ LEAST_SHARE = 0.8
 class Fit:
     """How well words fit the picture of one object.
 
-    above: by how much they fit better than words that fit anything, in the network's logits; share 0..1: of this object among all of the scene.
+    above: by how much they fit better than words that fit anything, in the network's logits; share
+    0..1: of this object among all of the scene.
     """
 
     id: str

@@ -21,7 +21,8 @@ from magic_core.strategy import Waypoint
 #: For contacts after the first, by name: its frame in the first's on the target, and the first's frame in its own on the tool, (4, 4) each.
 Pairs = Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
-#: Standard deviations: of an angle (rad), of the logarithm of a length against the common scale, and of that scale against the tools' sizes.
+#: Standard deviations: of an angle (rad), of the logarithm of a length against the common scale, and
+#: of that scale against the tools' sizes.
 ANGLE, LENGTH, SCALE = np.deg2rad(25.0), np.log(1.5), np.log(3.0)
 #: A vector shorter than this share of its tool's size has no direction.
 SHORT = 0.03
@@ -39,7 +40,8 @@ class Relative:
 
 @dataclass(frozen=True)
 class Placement:
-    """How places agree with one placement: agreement 0..1, the angle (rad) by which the tool is turned about the first contact for it, and its scale."""
+    """How places agree with one placement: agreement 0..1, the angle (rad) by which the tool is turned about
+    the first contact for it, and its scale."""
 
     agreement: float
     angle: float
@@ -58,7 +60,8 @@ def mirrored(place: Relative) -> Relative:
 
 
 def placement(wanted: Sequence[Relative], found: Sequence[Relative], sizes: tuple[float, float]) -> Placement:
-    """The placement that suits places best, pair by pair as ``wanted`` on a tool of the first of two sizes (m), and ``found`` on one of the second."""
+    """The placement that suits places best, pair by pair as ``wanted`` on a tool of the first of two sizes
+    (m), and ``found`` on one of the second."""
     turned, stretched = [0.0], []
     for a, b in zip(wanted, found, strict=True):
         turned.append(_wrapped(b.angle - a.angle))
@@ -113,7 +116,8 @@ def pairs_of(
 
 
 def waypoint_poses(waypoints: Sequence[Waypoint], pairs: Pairs) -> NDArray[np.float64]:
-    """(N, 4, 4): where the first contact's frame on the tool is in that on the target at each waypoint, squarely opposed the frames it is of.
+    """(N, 4, 4): where the first contact's frame on the tool is in that on the target at each
+    waypoint, squarely opposed the frames it is of.
 
     Raises BAD_STRATEGY for a waypoint of a contact that is not among the pairs.
     """

@@ -28,7 +28,8 @@ class RobotPictures:
         self._meshes = {link: link_mesh(robot, link) for link in robot.links}
 
     def at(self, joints: NDArray[np.float64], world_from_base: NDArray[np.float64] | None = None) -> list[Mesh]:
-        """The meshes in world coordinates for (J + 2,): the arm's joints, then the fingers; the base stands in the world's origin by default."""
+        """The meshes in world coordinates for (J + 2,): the arm's joints, then the fingers; the base
+        stands in the world's origin by default."""
         poses = self._robot.poses(self._robot.arm_positions(joints))
         base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
         return [mesh.transformed(base @ poses[link]) for link, mesh in self._meshes.items() if mesh is not None]

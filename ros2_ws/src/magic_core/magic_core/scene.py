@@ -12,8 +12,8 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.mesh import Mesh
 
-#: What besides an object's id may stand in SceneObject.cut_off: the border of the pictures, of the region of interest, a known object or the robot;
-#: and that no camera sees it now: what is told of it is remembered from earlier pictures.
+#: What besides an object's id may stand in SceneObject.cut_off: the border of the pictures, of the region of interest, a known object or
+#: the robot; and that no camera sees it now: what is told of it is remembered from earlier pictures.
 PICTURE, REGION, FIXTURE, ROBOT, UNSEEN = "picture", "region", "fixture", "robot", "unseen"
 
 VIEW_KINDS = ("top", "side", "section")

@@ -37,7 +37,8 @@ NEAR = 0.05
 STEP = 2
 #: Standard deviation of the depth, metres at one metre, growing with its square (a D435: magic_core.sensor).
 NOISE = 0.0042
-#: A robot that is drawn but looked through: depth farther than this behind its front, metres, in more than this share of at least so many pixels.
+#: A robot that is drawn but looked through: depth farther than this behind its front, metres, in more than
+#: this share of at least so many pixels.
 BEHIND, SHARE, PIXELS = 0.15, 0.5, 300
 #: Drawn pictures kept: some cameras, some frames each.
 KEPT = 12
@@ -113,7 +114,8 @@ class Body:
 
 @dataclass(frozen=True)
 class _Cast:
-    """What is seen of a body in a window of a drawing: depth (h, w) where it begins, metres, inf where it is not; pad: by how much it is widened."""
+    """What is seen of a body in a window of a drawing: depth (h, w) where it begins, metres, inf where it
+    is not; pad: by how much it is widened."""
 
     window: tuple[slice, slice]
     depth: NDArray[np.float32]
@@ -203,7 +205,8 @@ class SelfFilter:
         tolerance = self.margins.space + 3 * NOISE * np.minimum(widened, 5.0) ** 2
         drawn = np.isfinite(front)
         with np.errstate(invalid="ignore"):
-            # What is measured before the robot hides it.  All else in the widened outline is the robot, its smear, or cannot be told from it.
+            # What is measured before the robot hides it.  All else in the widened outline is the
+            # robot, its smear, or cannot be told from it.
             robot = np.isfinite(widened) & ~(depth < widened - tolerance)
             inner = cv2.erode(drawn.view(np.uint8), np.ones((2 * self.margins.edge + 1,) * 2, np.uint8)).view(bool) & np.isfinite(depth)
             count = np.count_nonzero(inner)

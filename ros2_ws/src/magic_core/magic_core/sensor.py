@@ -83,8 +83,9 @@ class DepthModel:
         return depth**2 * self.noise / (self.focal * self.baseline)
 
 
-#: A D435 with the smear at edges and the filled holes that recorded depth images of small things show: at mugs with their handle to the side depth
-#: reaches some 3 to 8 pixels of the colour image past the colour's edge, and holes of 8 to 12 pixels are closed, as read off pictures.
+#: A D435 with the smear at edges and the filled holes that recorded depth images of small things show: at mugs with their
+#: handle to the side depth reaches some 3 to 8 pixels of the colour image past the colour's edge, and holes of 8 to 12
+#: pixels are closed, as read off pictures.
 SMEARED = DepthModel(window=9, filled=6)
 
 
@@ -178,10 +179,11 @@ def degrade(
 
 @dataclass(frozen=True)
 class Sight:
-    """True depth with what of it chance does not change, so that a camera at rest before things at rest need not work it out for each frame.
+    """True depth with what of it chance does not change, so that a camera at rest before things at
+    rest need not work it out for each frame.
 
-    depth (H, W) metres, NaN where nothing is; disparity (H, W) pixels; jump (2, N): rows and columns of pixels beside a jump of the depth; lost (H, W) bool:
-    where nothing is, or the second imager sees nothing; cosine (H, W).
+    depth (H, W) metres, NaN where nothing is; disparity (H, W) pixels; jump (2, N): rows and columns of pixels beside a jump of the
+    depth; lost (H, W) bool: where nothing is, or the second imager sees nothing; cosine (H, W).
     """
 
     depth: NDArray[np.float32]

@@ -18,10 +18,11 @@ places, at once or one after the other, each is an entry of a list beside them, 
       tool: {pixel: [372.6, 168.8], normal: [1.0, 0.0], radius: .inf, concave: false, scale: 0.06}
       target: {pixel: [191.5, 316.0], normal: [0.0, 1.0], radius: .inf, concave: false, scale: 0.02, normal_in_world: [-1.0, 0.0, 0.0], outline: outer}
 
-Under ``target``, ``turned_by: 40`` allows motion and goal to be turned by up to 40 degrees about the vertical where other things stand in the
-way.
+Under ``target``, ``turned_by: 40`` allows motion and goal to be turned by up to 40 degrees about the
+vertical where other things stand in the way.
 
-A waypoint with ``contact: back`` is a pose of that contact of the tool in the frame of that contact of the target; without it, of the first.
+A waypoint with ``contact: back`` is a pose of that contact of the tool in the frame of that contact
+of the target; without it, of the first.
 """
 
 from __future__ import annotations
@@ -146,8 +147,8 @@ class Strategy:
     turned_by: float = 0.0
 
     def turned(self, angle: float) -> Strategy:
-        """The strategy with the target's normal turned by an angle (rad) about the vertical, and so what its goal calls the pull; raises BAD_REQUEST
-        for more than it allows."""
+        """The strategy with the target's normal turned by an angle (rad) about the vertical, and so what its goal calls the pull;
+        raises BAD_REQUEST for more than it allows."""
         if angle == 0:
             return self
         if not abs(angle) <= self.turned_by + 1e-6:
@@ -329,7 +330,8 @@ MOST_KNOWN = 16
 
 
 def known(name: str, root: str | Path | None = None) -> Strategy:
-    """As :func:`find`, for who asks again and again: read once for files of the same content.  Its arrays are not to be written to, and refuse it."""
+    """As :func:`find`, for who asks again and again: read once for files of the same content.  Its arrays
+    are not to be written to, and refuse it."""
     folder = _folder(name, root)
     content = _content(folder)
     kept = _KNOWN.get(content)

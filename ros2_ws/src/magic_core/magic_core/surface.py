@@ -27,7 +27,8 @@ ACROSS, ENOUGH = 17, 60
 LEFT = 0.01
 #: Nor is it larger than this share of the smaller radius of curvature: wider arcs are steep at their ends.
 ARC = 0.55
-#: What is turned away farther than this (cosine) belongs to another side; a patch whose kept part is narrower than this share of it says nothing.
+#: What is turned away farther than this (cosine) belongs to another side; a patch whose kept part is
+#: narrower than this share of it says nothing.
 SAME_SIDE, WIDTH = 0.5, 0.6
 #: How far inside of the edge the line of sight is looked along, px.
 INSIDE = (1.5, 0.75, 3.0)
@@ -80,7 +81,8 @@ class Surface:
         return None
 
     def depth_beside(self, view: CanonicalView, pixel: ArrayLike) -> float:
-        """How far behind the view's plane, m, the surface lies that is nearest to the plane's point at a pixel (2,), where nothing is in sight itself."""
+        """How far behind the view's plane, m, the surface lies that is nearest to the plane's point at a pixel
+        (2,), where nothing is in sight itself."""
         point = view.points(np.asarray(pixel))
         nearest = self._caster.nearest(point)
         there = view.pixels(nearest)

@@ -67,12 +67,14 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Matrix:
     return make(Rotation.from_quat(np.asarray(xyzw, dtype=float)).as_matrix(), translation)
 
 
-#: By how much a quaternion's length may differ from 1 and be normalised: numbers rounded to one decimal do; more is another rotation or none.
+#: By how much a quaternion's length may differ from 1 and be normalised: numbers rounded to one decimal
+#: do; more is another rotation or none.
 UNIT = 0.1
 
 
 def from_numbers(numbers: ArrayLike) -> Matrix:
-    """Build a transform from what somebody wrote or sent: x y z in metres and a quaternion x y z w, which is normalised where it nearly is one.
+    """Build a transform from what somebody wrote or sent: x y z in metres and a quaternion x y z w,
+    which is normalised where it nearly is one.
 
     Raises ``ValueError``, whose text says what is allowed.
     """

@@ -27,6 +27,7 @@ class _Later(ModuleType):
 
 
 def prepare() -> None:
-    """From here on importing Open3D imports its viewer only when that is used; does nothing where Open3D is there already, and imports nothing."""
+    """From here on importing Open3D imports its viewer only when that is used; does nothing where Open3D
+    is there already, and imports nothing."""
     if "open3d" not in sys.modules:
         sys.modules.setdefault(VIEWER, _Later(VIEWER))

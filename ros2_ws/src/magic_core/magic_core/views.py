@@ -77,9 +77,9 @@ def along(
     """Draw an object in a view of a kind along a direction (3,) of its own frame: a silhouette, or (``section``) the cut across it.
 
     Up in the picture is the long one of the object's own axes (:func:`own_axes`), or the next where that is what is looked along: a
-    turned object looked at along the turned direction gives the same picture.  The same direction gives the same
-    picture, so that a contact's frame, whose z is the view's direction, tells in which picture it was found; the opposite one gives its mirror image.
-    Raises ``BAD_MESH`` where there is nothing to see: a sheet seen edge-on, a cut that is empty.
+    turned object looked at along the turned direction gives the same picture.  The same direction gives the same picture, so that a
+    contact's frame, whose z is the view's direction, tells in which picture it was found; the opposite one gives its mirror image. Raises
+    ``BAD_MESH`` where there is nothing to see: a sheet seen edge-on, a cut that is empty.
     """
     _check(mesh)
     direction = transforms.unit(direction)
@@ -118,9 +118,10 @@ def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]
     """Directions (K, 3) of an object's own shape in which it may have been meant to be seen, whatever its attitude, best first.
 
     Silhouettes: of the principal axes of the surface and of directions all over the sphere, those in which holes and
-    notches show most, at most ``count`` and well apart; none for what is convex from everywhere.  A hole shows in the topology of the mask
-    (:func:`holes_of`), how much it tells is its area.  ``section``: the three principal axes; a plane of symmetry is across one of them.
-    They turn with the object; of a direction and its opposite, whose pictures mirror each other, the one nearer to :func:`own_axes` is given.
+    notches show most, at most ``count`` and well apart; none for what is convex from everywhere.  A hole shows in the
+    topology of the mask (:func:`holes_of`), how much it tells is its area.  ``section``: the three principal axes; a plane
+    of symmetry is across one of them. They turn with the object; of a direction and its opposite, whose pictures mirror
+    each other, the one nearer to :func:`own_axes` is given.
     """
     _check(mesh)
     axes = own_axes(mesh)[0]
@@ -154,7 +155,8 @@ def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]
 
 
 def square_axis(mesh: Mesh, direction: ArrayLike, kind: str) -> NDArray[np.float64] | None:
-    """The principal axis (3,) of an object's surface along which, or against which, a direction (3,) looks, to 12 degrees; ``None`` where it is askew.
+    """The principal axis (3,) of an object's surface along which, or against which, a direction (3,) looks,
+    to 12 degrees; ``None`` where it is askew.
 
     What is seen askew is drawn shorter than it is, and a contact found there lies beside the surface.  A section is square
     only if the object is as heavy on one side of the plane as on the other, which a spoon is across its plane of symmetry alone.
@@ -253,7 +255,8 @@ def own_axes(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def mirrored(view: CanonicalView) -> CanonicalView:
-    """The silhouette as seen from behind: the mirror image, for the opposite direction.  The picture remains that of the front, the depth is not known."""
+    """The silhouette as seen from behind: the mirror image, for the opposite direction.  The picture remains that
+    of the front, the depth is not known."""
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
     image, mask = (np.ascontiguousarray(a[:, ::-1]) for a in (view.image, view.mask))
     return replace(view, image=image, mask=mask, depth=None, object_from_view=view.object_from_view @ behind)
@@ -269,7 +272,8 @@ def _check(mesh: Mesh) -> None:
 def mesh_of_cloud(points: NDArray[np.float64], colors: NDArray[np.uint8] | None = None, spacing: float | None = None) -> Mesh:
     """A cloud (N, 3) with colours (N, 3) as small octahedra, so that it can be looked at like a mesh: neighbours touch, holes stay open.
 
-    ``spacing`` metres between points; found from the cloud if not given, and thinned to it.  Raises ``BAD_MESH`` for fewer than 10 finite points.
+    ``spacing`` metres between points; found from the cloud if not given, and thinned to it.  Raises
+    ``BAD_MESH`` for fewer than 10 finite points.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3:

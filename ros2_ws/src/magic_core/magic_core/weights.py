@@ -11,8 +11,8 @@ from magic_core.errors import Code, MagicError
 
 @contextmanager
 def loading(weights: str, device: str, allowed: str) -> Iterator[None]:
-    """Raises FEATURE_WEIGHTS for whatever the libraries make of files that are not what they should be, of a hub out of reach, or of a device that is
-    not there; a MagicError passes as it is.  allowed: what would have done."""
+    """Raises FEATURE_WEIGHTS for whatever the libraries make of files that are not what they should be, of a hub out of reach, or of a
+    device that is not there; a MagicError passes as it is.  allowed: what would have done."""
     try:
         yield
     except MagicError:

@@ -41,8 +41,8 @@ class Workers:
         return bool(self._begun) and all(future.done() for future in self._begun)
 
     def submit(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Future[R] | None:
-        """Have a function of a module computed; ``None`` where nobody is ready to.  Where one of them was killed all are begun anew, but not where
-        one died as it began: the next would as well."""
+        """Have a function of a module computed; ``None`` where nobody is ready to.  Where one of them was killed all are begun anew, but
+        not where one died as it began: the next would as well."""
         if self.executor is None or not self.ready:
             return None
         if any(future.cancelled() or future.exception() is not None for future in self._begun):

@@ -68,7 +68,8 @@ class Tolerance:
 
 @dataclass
 class Goal:
-    """A goal at work, and what became of it: ``done`` is set once ``code`` and ``reason`` stand; ``canceled``: by its client or a newer goal."""
+    """A goal at work, and what became of it: ``done`` is set once ``code`` and ``reason`` stand;
+    ``canceled``: by its client or a newer goal."""
 
     trajectory: Trajectory
     start: float
@@ -89,9 +90,9 @@ class Goal:
 class Trajectory:
     """Positions and velocities over time, interpolated as the joint trajectory controller does.
 
-    Between two points a polynomial of the first degree where only positions are given, of the third with velocities, of the fifth
-    with accelerations.  Before the first point comes the state (``q``, ``qd``) at the moment ``received``, in seconds from its start, where that is
-    before the first point's time; a trajectory that should have begun before that is entered where it would be by then.
+    Between two points a polynomial of the first degree where only positions are given, of the third with velocities, of the fifth with
+    accelerations.  Before the first point comes the state (``q``, ``qd``) at the moment ``received``, in seconds from its start, where
+    that is before the first point's time; a trajectory that should have begun before that is entered where it would be by then.
     """
 
     def __init__(self, points: Sequence[Point], q: Array, qd: Array, received: float = 0.0) -> None:
@@ -306,10 +307,10 @@ class GripperGoal:
 class GripperController:
     """One goal at a time, on the position of a finger's joint (m).
 
-    A goal to open has ended when the fingers are there.  A goal to close has when they stand still: they press
-    with the goal's effort on what is between them, wherever that is.  ``reached`` says that it was within ``tolerance`` of where they
-    were told to close to; else they have stalled: succeeded where ``allow_stalling`` is set, else aborted, as the gripper action controller has it.
-    stall_velocity m/s, stall_timeout s: slower than that for so long is standing.
+    A goal to open has ended when the fingers are there.  A goal to close has when they stand still: they press with the goal's effort on
+    what is between them, wherever that is.  ``reached`` says that it was within ``tolerance`` of where they were told to close to; else
+    they have stalled: succeeded where ``allow_stalling`` is set, else aborted, as the gripper action controller has it. stall_velocity
+    m/s, stall_timeout s: slower than that for so long is standing.
     """
 
     def __init__(

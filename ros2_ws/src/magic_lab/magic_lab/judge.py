@@ -41,8 +41,8 @@ PUT = "/put"
 
 @dataclass(frozen=True)
 class Track:
-    """Where everything truly was: times (T,) s, poses[name] (T, 4, 4) world_from_object, tcp (T, 4, 4) of the hand; put[name] (4, 4): where an event
-    has put a thing, last."""
+    """Where everything truly was: times (T,) s, poses[name] (T, 4, 4) world_from_object, tcp (T, 4, 4) of the hand; put[name] (4, 4):
+    where an event has put a thing, last."""
 
     times: Array
     poses: Mapping[str, Array]
@@ -65,8 +65,8 @@ class Track:
         return np.linalg.norm(places - places[0], axis=1)
 
     def begun(self, by: float, lead: float = 1.0) -> Track | None:
-        """The track from ``lead`` seconds before the hand was first more than ``by`` metres from where it was; ``None``: it never was.  While planner and
-        verifier are at work nothing moves, and that may be minutes."""
+        """The track from ``lead`` seconds before the hand was first more than ``by`` metres from where it was; ``None``: it never was.
+        While planner and verifier are at work nothing moves, and that may be minutes."""
         away = np.flatnonzero(np.linalg.norm((self.tcp - self.tcp[0])[:, :3, 3], axis=1) > by)
         if not len(away):
             return None
@@ -116,8 +116,8 @@ class Replay:
         self.phases = (Phase("goal", *self._pull()),)
 
     def _pull(self) -> tuple[float, float]:
-        """From when to when the target moved along with the tool, s, what rolls on after that left out; of one that never did: while it moved, and of
-        one that never moved: all the time."""
+        """From when to when the target moved along with the tool, s, what rolls on after that left out; of one that never did: while it
+        moved, and of one that never moved: all the time."""
         times, poses = self._track.times, self._track.poses
         target, tool = (np.gradient(poses[name][:, :3, 3], times, axis=0) for name in (self._target, self._tool))
         moves = np.linalg.norm(target, axis=1) > MOVING
@@ -172,8 +172,8 @@ class Replay:
 
 
 def judge(scene: Scene, tool: str, track: Track) -> Judgement:
-    """What the strategy's goal test says of the truth, and where it is met whether other things stand where they stood; never raises for what may
-    have happened to things."""
+    """What the strategy's goal test says of the truth, and where it is met whether other things stand where they stood; never raises
+    for what may have happened to things."""
     try:
         run = Replay(scene, tool, track)
         test = goal_test(scene.strategy, run, np.random.default_rng(0))  # nobody kicks the target: it is not asked to disturb
@@ -213,8 +213,8 @@ def middle(thing: Thing, pose: Array) -> Array:
 
 
 def loop_in_sight(scene: Scene, tool: str) -> float | None:
-    """How much of the opening of a tool's loop is in a camera's sight where the tool lies at first, as a share of what there is from straight ahead:
-    the most of any camera.  ``None`` where the tool has no such opening.
+    """How much of the opening of a tool's loop is in a camera's sight where the tool lies at first, as a share of what there is from
+    straight ahead: the most of any camera.  ``None`` where the tool has no such opening.
 
     Where hardly any is in sight of a camera it is right that nobody finds a handle.
     """

@@ -44,8 +44,8 @@ class Silent:
 class Lab:
     """One scene from its reset on.
 
-    world, arm, gripper: physics and controllers.  moves: trajectories begun since the reset.  happened: events that have been; put: where they have
-    put things, by name.
+    world, arm, gripper: physics and controllers.  moves: trajectories begun since the reset.  happened: events that have been;
+    put: where they have put things, by name.
     """
 
     def __init__(self, scene: Scene, robot: Description, events: tuple[Event, ...] = (), allow_stalling: bool = False) -> None:

@@ -41,8 +41,8 @@ EVENTS = {
 NUDGE, SLIP, SLIP_TURN = 0.05, 0.012, 0.25
 #: Names of what is moved by events, and of the target.
 HAND, BLOCK, TARGET = "hand", "block", "target"
-#: Between which factors of the densities that the strategy assumes the true ones are drawn; friction coefficients of things, of the table and of the
-#: finger pads.
+#: Between which factors of the densities that the strategy assumes the true ones are drawn; friction coefficients of
+#: things, of the table and of the finger pads.
 FACTOR = 2.0
 #: How many times as heavy as the strategies' wood and plastics a thing is that is partly of metal, and one of steel.
 METAL = (2.0, 13.0)
@@ -51,7 +51,8 @@ FRICTION, TABLE_FRICTION, PAD_FRICTION = (0.2, 0.5), (0.25, 0.5), (0.9, 1.5)
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happens ``after`` so many seconds of the arm's move number ``move`` since the reset; move 0: since the reset itself."""
+    """Something that happens ``after`` so many seconds of the arm's move number ``move`` since the
+    reset; move 0: since the reset itself."""
 
     kind: str
     move: int = 0
@@ -219,7 +220,8 @@ def _of_boxes(name: str, boxes: list[tuple[tuple[float, ...], tuple[float, ...]]
 
 
 def hand_pose(time: float) -> Array | None:
-    """world_from_hand (4, 4) so many seconds after it came: in from the robot's left over the table, and out again; ``None``: it has left."""
+    """world_from_hand (4, 4) so many seconds after it came: in from the robot's left over the table,
+    and out again; ``None``: it has left."""
     seconds, reach = 4.0, 0.75
     if not 0 <= time <= seconds:
         return None

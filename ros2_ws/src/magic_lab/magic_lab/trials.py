@@ -46,8 +46,8 @@ BEGUN = 0.01
 SHOWN = 0.05
 #: A thing that perception sees is nearer to the true one than this share of its longest side.
 NEAR = 0.35
-#: Size of each camera's picture in the video, how long each picture stands, ms (twice as fast as it was), and how many there are at most: of a long trial every
-#: second or third is left.
+#: Size of each camera's picture in the video, how long each picture stands, ms (twice as fast as it was), and how many there are at most:
+#: of a long trial every second or third is left.
 SIZE, FRAME_MS, MOST_FRAMES = (400, 300), 100, 120
 #: Parameters of the graph beside a laboratory.
 SERVER = {"execute": True, "autostart": True, "effort": 60.0}
@@ -193,7 +193,8 @@ class Session:
         self.seen = Seen(truth=[s for s in self.seen.truth if s[0] > begun])
 
     def find(self, scene: Scene, since: float) -> dict[str, str]:
-        """Ids under which perception knows tools and target, by their true names, in what it saw after ``since``; empty: not all of them."""
+        """Ids under which perception knows tools and target, by their true names, in what it saw
+        after ``since``; empty: not all of them."""
         from magic_core import conversions as cv
 
         message = self.watcher.scene
@@ -423,7 +424,8 @@ def do(
     minutes: float = 0.0,
     rate: float = 1.0,
 ) -> list[dict[str, Any]]:
-    """All trials, those that are on disk already read from there; with ``minutes`` no new one is begun after so long; rate: of the laboratory's clock."""
+    """All trials, those that are on disk already read from there; with ``minutes`` no new one is begun after so
+    long; rate: of the laboratory's clock."""
     wanted = [(case.name, seed + k) for k in range(count) for case in scenario.cases if not objects or case.name in objects]
     out.mkdir(parents=True, exist_ok=True)
     records: dict[tuple[str, int], dict[str, Any]] = {}

@@ -50,7 +50,8 @@ def cameras(case):
 
 
 def seen(case, poses, look, held=None):
-    """What perception makes of bodies at poses, the arm out of sight; look: a number of its own for the noise; held: a mesh and its pose in the hand."""
+    """What perception makes of bodies at poses, the arm out of sight; look: a number of its own for the noise;
+    held: a mesh and its pose in the hand."""
     fixed = {item.id: item.world_from_object for item in scene(case).known}
     frames = []
     for number, camera in enumerate(cameras(case)):
@@ -77,8 +78,8 @@ def before(case):
 
 
 def told(case, ball, slipped=(0.0, 0.0, 0.0), handed_on=False):
-    """What is told of the goal with the ball at a place (3,; None: nowhere) and the bowl so far (3,) from where it was grasped; handed_on: what is seen of
-    the bowl goes by the ball's id."""
+    """What is told of the goal with the ball at a place (3,; None: nowhere) and the bowl so far (3,) from where it was grasped;
+    handed_on: what is seen of the bowl goes by the ball's id."""
     world_from_hand, world_from_tool, _ = ENDS[case]
     tool = next(item for item in before(case).objects if item.id == "tool_1")
     seen_from_true = transforms.inverse(scene(case).thing("tool_1").item.world_from_object) @ conversions.pose_from_msg(tool.pose)

@@ -2,9 +2,10 @@
 
 What is read (ROS 2's XML format, as far as this project uses it): ``launch``, ``arg`` (name, default, value, description, ``choice``),
 ``let``, ``include`` (file, ``arg``), ``group`` (scoped), ``push_ros_namespace``, ``set_env``, ``set_remap``, ``node`` (pkg, exec, name,
-namespace, args, ros_args, output, respawn, respawn_delay, launch-prefix, on_exit; ``param`` (also from files, with allow_substs), ``remap``, ``env``), ``executable`` (cmd,
-cwd, name, output, ...; ``env``), ``log`` (message); ``if`` and ``unless`` on each; the substitutions ``var``, ``env``, ``find-pkg-share``,
-``find-pkg-prefix``, ``dirname``, ``eval``, ``equals``, ``not-equals``, ``not``, ``and``, ``or``. Anything else is refused by name.
+namespace, args, ros_args, output, respawn, respawn_delay, launch-prefix, on_exit; ``param`` (also from files, with allow_substs),
+``remap``, ``env``), ``executable`` (cmd, cwd, name, output, ...; ``env``), ``log`` (message); ``if`` and ``unless`` on each; the
+substitutions ``var``, ``env``, ``find-pkg-share``, ``find-pkg-prefix``, ``dirname``, ``eval``, ``equals``, ``not-equals``, ``not``,
+``and``, ``or``. Anything else is refused by name.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ TRUNCATE = 128
 
 
 def interface(name: str, kind: str) -> Any:
-    """The Python class of a type name such as ``std_msgs/msg/String``; ``kind`` is msg, srv or action. ``std_msgs/String`` is read alike."""
+    """The Python class of a type name such as ``std_msgs/msg/String``; ``kind`` is msg, srv or
+    action. ``std_msgs/String`` is read alike."""
     parts = name.split("/")
     if len(parts) == 2:
         parts.insert(1, kind)

@@ -25,8 +25,8 @@ ENVIRONMENT = {
 }
 ROS2 = [sys.executable, "-c", "import sys; from magic_ros2cli.main import main; sys.exit(main())"]
 TIMEOUT = 60.0
-#: The output of commands of ros2cli 0.32 on the graph of ``small_node.py``.  Written from ros2cli's own format strings and from what its own
-#: tests expect: ros2cli itself does not run without a ROS installation.
+#: The output of commands of ros2cli 0.32 on the graph of ``small_node.py``.  Written from ros2cli's own format strings and from what its
+#: own tests expect: ros2cli itself does not run without a ROS installation.
 RECORDED = HERE / "ros2cli.txt"
 
 

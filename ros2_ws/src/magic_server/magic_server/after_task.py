@@ -1,7 +1,7 @@
 """What is seen after a motion: each thing by the id that it had before, and the tool wherever it may be.
 
-A target that has been taken along is another thing to the cameras, or a part of the tool that carries it: it is what has its colour, is none of the tool, and
-where its shape, as it was seen before, can be laid on that.
+A target that has been taken along is another thing to the cameras, or a part of the tool that carries it: it is what has its colour, is
+none of the tool, and where its shape, as it was seen before, can be laid on that.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def share(item: SceneObject, places: Sequence[Placed]) -> float:
 class After:
     """What is known of a scene from before a motion, and of the tool since.
 
-    before: the scene as it was planned in, and stood: its hulls, by ids.  carried, held: the tool that was taken up, and that is in the hand; None: none.
-    closing: the axis of the hand along which the fingers close.  tolerance: m that a thing which stands is seen to move at most; accuracy: m to which it is
-    known.
+    before: the scene as it was planned in, and stood: its hulls, by ids.  carried, held: the tool that was taken up, and that is in the
+    hand; None: none. closing: the axis of the hand along which the fingers close.  tolerance: m that a thing which stands is seen to move
+    at most; accuracy: m to which it is known.
     """
 
     before: SceneObjectArray
@@ -75,8 +75,8 @@ class After:
     def sights(self, scene: SceneObjectArray, hand: Callable[[float], NDArray[np.float64]]) -> list[Sight]:
         """Things where a scene shows them, for each place where the tool may be; hand: world_from_tcp (4, 4) by stamps.
 
-        The tool is where the hand has it, or where its shape is seen once that has let it go; ids may have been handed on: tool and target were near each
-        other.
+        The tool is where the hand has it, or where its shape is seen once that has let it go; ids may have been handed
+        on: tool and target were near each other.
         """
         # What is remembered from before the motion does not tell what came of it.
         items, stamp = [item for item in scene.objects if UNSEEN not in item.cut_off], conversions.time_from_msg(scene.header.stamp)
@@ -97,8 +97,8 @@ class After:
     def _named_target(
         self, things: dict[str, Thing], items: Sequence[SceneObject], scene: SceneObjectArray, places: Sequence[Placed]
     ) -> dict[str, Thing]:
-        """Things with the target by its id: what has its form, or else where its shape lies on what is seen; not what is mostly the tool.  ``places``: where the
-        tool may be."""
+        """Things with the target by its id: what has its form, or else where its shape lies on what is seen; not what is mostly the
+        tool.  ``places``: where the tool may be."""
         before = next(item for item in self.before.objects if item.id == self.target)
         form = thing(before)
         if self.target in things and form.like(things[self.target], 2 * self.accuracy):
@@ -114,7 +114,8 @@ class After:
         return {i: there for i, there in things.items() if i != self.target or part}
 
     def _may_be_part(self, item: SceneObject, target: SceneObject, places: Sequence[Placed]) -> bool:
-        """Whether what is seen by the target's id may be a part of it: of its colour, no larger, and not mostly the tool, to which the id may have been handed on."""
+        """Whether what is seen by the target's id may be a part of it: of its colour, no larger, and not mostly the tool, to
+        which the id may have been handed on."""
         (points, shown), (own, colors) = (conversions.cloud_from_msg(one.cloud) for one in (item, target))
         if item.source != SceneObject.CAMERA or not len(points) or not len(own):
             return True
@@ -123,8 +124,8 @@ class After:
         return bool(alike) and _across(points) <= _across(whole) + 2 * self.accuracy and share(item, places) <= MIXED
 
     def _laid(self, target: SceneObject, scene: SceneObjectArray, places: Sequence[Placed]) -> Placed | None:
-        """Where the target has been taken, its shape and colours as they were seen before laid on what is seen and is none of the tool; ``None``: too little of it
-        is seen, or that goes with the target in several places."""
+        """Where the target has been taken, its shape and colours as they were seen before laid on what is seen and is none of the tool;
+        ``None``: too little of it is seen, or that goes with the target in several places."""
         pose, up = conversions.pose_from_msg(target.pose), conversions.plane_from_msg(scene.table)[:3]
         own, colors = conversions.cloud_from_msg(target.cloud)
         clouds = [conversions.cloud_from_msg(item.cloud) for item in strangers(scene, self.stood, self.target, self.tolerance)]
@@ -155,8 +156,8 @@ class After:
         return placed if on.mean() > MOST and facing.mean() > 0 else None
 
     def _name_tool(self, things: dict[str, Thing], carried: Carried) -> None:
-        """Give its id to what is seen of a tool that the hand has let go and whose shape is not told by that: some part of it, whatever is seen under its id, or
-        else the most of what is where it was let go."""
+        """Give its id to what is seen of a tool that the hand has let go and whose shape is not told by that: some part of it, whatever
+        is seen under its id, or else the most of what is where it was let go."""
         held = carried.held
         if held.tool.id not in things and carried.let_go_at is not None:
             place, strange = held.hull(carried.let_go_at), things.keys() - self.stood.keys()
@@ -167,8 +168,8 @@ class After:
             things[held.tool.id] = things[held.tool.id].part(float(np.linalg.norm(held.mesh.extents)))
 
     def _let_go(self, scene: SceneObjectArray) -> list[Placed]:
-        """Where the hand has let the tool go, its shape as it was seen before, laid on what is seen there, in each of the ways in which that is as likely; empty:
-        it was never taken up, or too little of it is seen.
+        """Where the hand has let the tool go, its shape as it was seen before, laid on what is seen there, in each of the ways in which
+        that is as likely; empty: it was never taken up, or too little of it is seen.
 
         What is seen of a tool that hangs stops where it is near what holds it, what is seen there counts as that, and it has no more of its
         hollows than shows now.
@@ -198,7 +199,8 @@ def _across(points: NDArray[np.float64]) -> float:
 
 
 def strangers(scene: SceneObjectArray, stood: Mapping[str, NDArray[np.float64]], moved: str, tolerance: float) -> list[SceneObject]:
-    """What cameras see and what is not one of the things that stand where they stood, with hulls by ids from before; the thing ``moved`` is none of them."""
+    """What cameras see and what is not one of the things that stand where they stood, with hulls by ids from
+    before; the thing ``moved`` is none of them."""
     found = []
     for item in scene.objects:
         if item.source != SceneObject.CAMERA or UNSEEN in item.cut_off:

@@ -23,12 +23,14 @@ class Ahead(Generic[T]):
         self._cancel: Callable[[], None] = lambda: None
 
     def begin(self, key: Hashable, work: Callable[[], T], cancel: Callable[[], None]) -> None:
-        """Begin ``work()``, which ends soon after ``cancel()`` was called; what was begun before is dropped, and this comes after its end."""
+        """Begin ``work()``, which ends soon after ``cancel()`` was called; what was begun before is
+        dropped, and this comes after its end."""
         self.drop()
         self._key, self._cancel, self._future = key, cancel, self._pool.submit(work)
 
     def take(self, key: Hashable) -> tuple[Future[T] | None, bool]:
-        """What was begun last, with whether it is the work of this key, which is told once; else it is canceled.  ``None``: nothing was begun."""
+        """What was begun last, with whether it is the work of this key, which is told once; else it is
+        canceled.  ``None``: nothing was begun."""
         mine = self._future is not None and self._key == key
         if mine:
             self._key = None

@@ -119,8 +119,9 @@ class Goal:
 class Calls:
     """What the loop leaves to others.
 
-    plan(request, stages, reflections, spent): a run of the pipeline.  claim(outcome, stages): what the rule is to know of it.  allowed(ask): what ``ask`` returns, once
-    that is allowed.  begun(): the arm is about to move.  tell(job, text): how far a job has come.
+    plan(request, stages, reflections, spent): a run of the pipeline.  claim(outcome, stages): what the rule is to
+    know of it.  allowed(ask): what ``ask`` returns, once that is allowed.  begun(): the arm is about to move.
+    tell(job, text): how far a job has come.
     """
 
     plan: Callable[[pipeline.Request, Stages, Sequence[str], Callable[[Any], int]], pipeline.Outcome]
@@ -133,8 +134,9 @@ class Calls:
 class ClosedLoop:
     """Carries one goal out, looks, and goes on from what there is; :meth:`execute` raises what it ends with, unless that is success.
 
-    first: what is carried out first.  Afterwards ``jobs`` holds what was carried out, the last one last, ``tried`` all outcomes of planning, ``executed`` whether
-    the last was carried out to its end, ``notes`` what is to be told, and ``weight`` what the tool was found to weigh, if it was.
+    first: what is carried out first.  Afterwards ``jobs`` holds what was carried out, the last one last, ``tried`` all
+    outcomes of planning, ``executed`` whether the last was carried out to its end, ``notes`` what is to be told, and
+    ``weight`` what the tool was found to weigh, if it was.
     """
 
     def __init__(
@@ -234,7 +236,8 @@ class ClosedLoop:
     # ------------------------------------------------------------ what the arm asks (magic_server.arm.Guard)
 
     def ask(self, point: int) -> None:
-        """Ask the rule whether the arm may begin to move from a point of its trajectory; raises GRASP_FAILED where the tool has fallen out of the hand."""
+        """Ask the rule whether the arm may begin to move from a point of its trajectory; raises GRASP_FAILED
+        where the tool has fallen out of the hand."""
         self._refuse_lost()
         self._touched = self._touched or self._may_touch
         job = self.jobs[-1]
@@ -262,7 +265,8 @@ class ClosedLoop:
         return moved | ({outcome.target_id} if self._touched else set())
 
     def _tool_at(self, stamp: float) -> NDArray[np.float64] | None:
-        """The hull of the tool where it was at a stamp, once it has been taken up; raises STALE_DATA where nobody said where the hand was then."""
+        """The hull of the tool where it was at a stamp, once it has been taken up; raises STALE_DATA
+        where nobody said where the hand was then."""
         if self._carried is None:
             return None
         try:
@@ -362,7 +366,8 @@ class ClosedLoop:
         self._held = None
 
     def look(self, point: int) -> None:
-        """Look at the tool in the hand, and weigh it; raises :class:`Off`, GRASP_FAILED where it lies where it lay or has fallen out, TOOL_SLIPPED."""
+        """Look at the tool in the hand, and weigh it; raises :class:`Off`, GRASP_FAILED where it lies where
+        it lay or has fallen out, TOOL_SLIPPED."""
         self._refuse_lost()
         held, self._point = self._held, point
         assert held is not None
@@ -529,8 +534,8 @@ class ClosedLoop:
         return replace(request, tool_mass=self._masses.get(tool_id, request.tool_mass))
 
     def _corrected(self, job: Job, held: Held) -> Job:
-        """The rest of the motion, planned anew with the tool as it is, the same contact first; where no plan is found, as it was planned before.  Each has its
-        own verdict with the tool as it is."""
+        """The rest of the motion, planned anew with the tool as it is, the same contact first; where no plan is found, as it was planned
+        before.  Each has its own verdict with the tool as it is."""
         trial = job.outcome.reports[-1].trial
         rest = rest_of(job.outcome.plan, self._point, held.tool_from_tcp, self._server.robot)
         stages = HeldStages(
@@ -594,8 +599,9 @@ class ClosedLoop:
     # ------------------------------------------------------------ the goal
 
     def _judge(self, job: Job) -> str:
-        """Look whether the goal is met, twice, so that what moves is seen to move, and on while what may come to rest is all that speaks against it, the tool is
-        not well enough seen, or one pair of looks alone says that it is missed; raises GOAL_MISSED, GOAL_UNSEEN."""
+        """Look whether the goal is met, twice, so that what moves is seen to move, and on while what may come to rest
+        is all that speaks against it, the tool is not well enough seen, or one pair of looks alone says that it is
+        missed; raises GOAL_MISSED, GOAL_UNSEEN."""
         settle, apart = seen_goal.patience(self._goal.strategy, self._settings.accuracy)
         self._say("looking whether the goal is met")
         begin = self._now()
@@ -617,7 +623,8 @@ class ClosedLoop:
         return seen.message
 
     def _seen_goal(self, job: Job, first: SceneObjectArray, second: SceneObjectArray) -> seen_goal.SeenGoal:
-        """The goal asked of two looks after the motion, for each place where the tool may be by the second, and where it was then by the first."""
+        """The goal asked of two looks after the motion, for each place where the tool may be by the
+        second, and where it was then by the first."""
         outcome = job.outcome
         names = {"tool": outcome.tool_id, "target": outcome.target_id}
         table = conversions.plane_from_msg(first.table)

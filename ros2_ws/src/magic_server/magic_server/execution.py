@@ -50,7 +50,8 @@ _ENDINGS = {
 
 
 def controller_error(error_code: int, status: int, reason: str) -> MagicError:
-    """What a trajectory controller that did not carry a trajectory out has said, by its FollowJointTrajectory result, as EXECUTION_FAILED."""
+    """What a trajectory controller that did not carry a trajectory out has said, by its
+    FollowJointTrajectory result, as EXECUTION_FAILED."""
     name, what, look = _ENDINGS.get(error_code, ("an error of its own", "no code of FollowJointTrajectory", "see the controller's log"))
     return MagicError(
         Code.EXECUTION_FAILED,
@@ -127,8 +128,8 @@ def _moves(first: int, last: int, velocities: Sequence[Sequence[float]], standst
 def check_grasp(wanted: float, found: float, tolerance: float, looked: bool = False) -> None:
     """Whether fingers that closed have the tool between them: their opening ``found`` is ``wanted`` within ``tolerance``, all m.
 
-    looked: the tool in the hand is looked at before it is used.  Then it is enough that there is something between the fingers: cameras that look down tell
-    a lying thing's thickness worst, and where the tool is tells more than how thick it is.  Raises GRASP_FAILED.
+    looked: the tool in the hand is looked at before it is used.  Then it is enough that there is something between the fingers: cameras
+    that look down tell a lying thing's thickness worst, and where the tool is tells more than how thick it is.  Raises GRASP_FAILED.
     """
     thinner = looked and EMPTY < found < wanted
     if not thinner and not abs(found - wanted) <= tolerance:

@@ -27,7 +27,8 @@ def action_of(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Found:
-    """What a gripper says at the end: position of its joint (m or rad), whether it pushes and does not move, whether it is where it was told."""
+    """What a gripper says at the end: position of its joint (m or rad), whether it pushes and does not
+    move, whether it is where it was told."""
 
     position: float
     stalled: bool

@@ -28,7 +28,8 @@ from magic_server.stages import Server, Stages, code_of, hull_of
 
 @dataclass(frozen=True)
 class Held:
-    """A tool in the hand: the object as it was seen before it was grasped, and tool_from_tcp (4, 4), how it is held; ``looked``: as it was seen in the hand."""
+    """A tool in the hand: the object as it was seen before it was grasped, and tool_from_tcp (4, 4), how it is held;
+    ``looked``: as it was seen in the hand."""
 
     tool: SceneObject
     tool_from_tcp: NDArray[np.float64]
@@ -76,8 +77,8 @@ class Held:
 
 @dataclass(frozen=True)
 class Carried:
-    """Where a tool has been that was taken up: in the hand from the stamp ``taken`` on, when the hand was at ``taken_at`` (4, 4; None: since before the
-    motion began), and until ``let_go``, when it was at ``let_go_at`` (None: it still is)."""
+    """Where a tool has been that was taken up: in the hand from the stamp ``taken`` on, when the hand was at ``taken_at`` (4, 4; None:
+    since before the motion began), and until ``let_go``, when it was at ``let_go_at`` (None: it still is)."""
 
     held: Held
     taken: float = -math.inf
@@ -95,7 +96,8 @@ class Carried:
 
 
 def rest_of(plan: MotionPlan, point: int, tool_from_tcp: NDArray[np.float64], robot: Description) -> MotionPlan:
-    """What is left of an arm's motion from a point of its trajectory on, where it stands, with the tool in the hand as it is: tool_from_tcp (4, 4)."""
+    """What is left of an arm's motion from a point of its trajectory on, where it stands, with the tool in
+    the hand as it is: tool_from_tcp (4, 4)."""
     arm, begin = plan.arm_trajectory, conversions.time_from_msg(plan.arm_trajectory.points[point].time_from_start)
     rest = MotionPlan(variant=plan.variant, grasp_width=plan.grasp_width, grasp_time=0.0, release_time=plan.release_time - begin)
     rest.tool_from_tcp = conversions.pose_to_msg(tool_from_tcp)

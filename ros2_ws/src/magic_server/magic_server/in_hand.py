@@ -133,15 +133,15 @@ def clear_of(hand: Array, points: Array) -> Array:
 
 
 def locate(shape: Shape, expected: Array, points: Array, hand: Array, closing: int, spread: Spread = GRASPED) -> Seen | None:
-    """The pose of a tool, where there is one that :func:`located` finds; ``None`` where too little of it is seen, or what is seen would be as likely with the
-    tool elsewhere."""
+    """The pose of a tool, where there is one that :func:`located` finds; ``None`` where too little of it is seen, or what is seen would
+    be as likely with the tool elsewhere."""
     found = located(shape, expected, points, hand, closing, spread)
     return found[0] if len(found) == 1 else None
 
 
 def located(shape: Shape, expected: Array, points: Array, hand: Array, closing: int, spread: Spread = GRASPED) -> list[Seen]:
-    """The poses of a tool that is expected at ``expected`` (world_from_tool), by world points (N, 3) of which some are on it: the most likely one first, and
-    those as likely that are :data:`APART` from the ones before.
+    """The poses of a tool that is expected at ``expected`` (world_from_tool), by world points (N, 3) of which some are on it: the most
+    likely one first, and those as likely that are :data:`APART` from the ones before.
 
     hand (4, 4): world_from_tcp, where the pads hold it, or did; closing: the axis of that frame, 0 or 1, along which they close.
     Empty where too little of it is seen.

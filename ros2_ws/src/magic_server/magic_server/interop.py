@@ -114,8 +114,8 @@ def grasps(result: RunStrategy.Result, robot: Description, link: str, moveit: An
     """moveit_msgs/Grasp[]: the grasp at the matched contact that physics has passed; none of a run that ended otherwise.
 
     ``link``: whose pose a grasp tells, the parent link of the end effector in MoveIt's setup; it must be fixed to the hand.  The pose is
-    in the robot's base frame, for the tool where it lay when it was planned: where the arm's trajectory closes the fingers.  approach, lift (m): of the planner's parameters ``standoff``
-    and ``lift``.
+    in the robot's base frame, for the tool where it lay when it was planned: where the arm's trajectory closes the fingers.  approach,
+    lift (m): of the planner's parameters ``standoff`` and ``lift``.
     """
     plan = result.plan
     if not result.verified or plan.variant != MotionPlan.ARM or not plan.arm_trajectory.points:

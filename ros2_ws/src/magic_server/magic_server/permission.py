@@ -155,8 +155,9 @@ class Limits:
 def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tuple[str, ...]:
     """What the permission rests on without having been seen, in sentences; raises :class:`MagicError` where there is none.
 
-    CANCELED (an emergency stop too), SERVER_UNAVAILABLE (not active too), NOT_ALONE, NOT_VERIFIABLE, NOT_SURE_ENOUGH or the verdict's own code, BAD_REQUEST (frames,
-    recordings), NO_OBJECTS, STALE_DATA, NO_FRAMES, BAD_MOTION; as :class:`NotYet` where it may pass by waiting.
+    CANCELED (an emergency stop too), SERVER_UNAVAILABLE (not active too), NOT_ALONE, NOT_VERIFIABLE, NOT_SURE_ENOUGH or
+    the verdict's own code, BAD_REQUEST (frames, recordings), NO_OBJECTS, STALE_DATA, NO_FRAMES, BAD_MOTION; as
+    :class:`NotYet` where it may pass by waiting.
 
     What was published stays valid only while nothing has changed that it was verified for: the objects, and where the arm
     stands.  That the run is over by then, or that servers have ended, does not speak against it.

@@ -80,9 +80,9 @@ def check(
 ) -> None:
     """Refuse a scene in which an object is gone, has come, or has moved by more than ``tolerance`` m; raises :class:`Changed`.
 
-    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.  partly, remembered: ids of what
-    the arm, or what it carries, hides a part of now that was seen before, and all of.  carried: hull of the tool when ``after`` was seen, in the hand or
-    where that let it go: what has come within :data:`ABOUT` of it is the tool, by whatever id.
+    before, after: hulls by id.  meant: ids of what has been moved on purpose since, which may be anywhere.  partly, remembered: ids of
+    what the arm, or what it carries, hides a part of now that was seen before, and all of.  carried: hull of the tool when ``after`` was
+    seen, in the hand or where that let it go: what has come within :data:`ABOUT` of it is the tool, by whatever id.
     """
     there = parts(before, after, partly, tolerance)
     old, new = before.keys() - set(meant), after.keys() - set(meant) - there.keys()

@@ -9,8 +9,8 @@ may touch all the same where not all of them is seen: a thing of which a part is
 short of a fixture, to which perception counts what is as near to it as it may be wrong.
 
 What only a simulation can try (pushes, pulls to the side), and masses and impulses, no look tells; they were asked when the motion was
-verified.  In a plain 'all' they are left out, and the answer says so; below an 'any' or a 'not' they cannot be told.  That one body is in another, which a
-simulation may show, no true ones are.
+verified.  In a plain 'all' they are left out, and the answer says so; below an 'any' or a 'not' they cannot be told.  That one body is in
+another, which a simulation may show, no true ones are.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ Array = NDArray[np.float64]
 
 #: What no camera tells.
 UNASKED = frozenset({"masses", "history", "trying"})
-#: Points that stand for a surface lie about so far apart, m, much nearer than its place is known: what touches is as near as points are. At most so many.
+#: Points that stand for a surface lie about so far apart, m, much nearer than its place is known: what touches is
+#: as near as points are. At most so many.
 SPACING, MOST = 0.002, 20000
 #: Points that stand for a link of the arm.
 SURFACE = 1000
@@ -49,8 +50,8 @@ ENDING = ("retreat",)
 APART = 5.0
 #: What a goal lets come to rest is looked at for so long, s: a simulation calms it, by itself a thing that hangs swings on.
 CALMING = 20.0
-#: What is seen of a thing that touches a fixture ends so far from it at most, m: points as near as perception's ``known_margin`` to a fixture are the
-#: fixture's, and lie apart.
+#: What is seen of a thing that touches a fixture ends so far from it at most, m: points as near as perception's ``known_margin`` to a
+#: fixture are the fixture's, and lie apart.
 SHORT = 0.02
 
 
@@ -58,8 +59,8 @@ SHORT = 0.02
 class Thing:
     """An object as it was seen: points (N, 3) on its surface and the middle (3,) of its box, in the world.
 
-    given: it is a fixture.  whole: all of its surface is there, of one that cameras see what they see.  span: where that is some part of it, all of it lies
-    within so many m of each of the points.
+    given: it is a fixture.  whole: all of its surface is there, of one that cameras see what they see.  span: where that is some part of
+    it, all of it lies within so many m of each of the points.
     """
 
     points: Array
@@ -115,9 +116,9 @@ class Sight:
 
 @dataclass(frozen=True)
 class SeenGoal:
-    """met: whether the goal is met, ``None`` where it cannot be told; message: by what; moving: what the goal lets come to rest is seen to move, and nothing
-    else speaks against it: how it moves is why it cannot be told, or may be; unsure: where the tool is cannot be told by what is seen of it, which another
-    look may."""
+    """met: whether the goal is met, ``None`` where it cannot be told; message: by what; moving: what the goal lets come to rest is seen
+    to move, and nothing else speaks against it: how it moves is why it cannot be told, or may be; unsure: where the tool is cannot be
+    told by what is seen of it, which another look may."""
 
     met: bool | None
     message: str
@@ -147,8 +148,8 @@ class _Told:
 
 @dataclass(frozen=True)
 class Hand:
-    """The hand when the motion was over: whether it has let the tool go, how far (m) it is from where it did, and points (N, 3) on the surface of arm and
-    hand in the world; ``None`` where that is not known."""
+    """The hand when the motion was over: whether it has let the tool go, how far (m) it is from where it did, and points (N, 3) on the
+    surface of arm and hand in the world; ``None`` where that is not known."""
 
     released: bool
     away: float | None = None
@@ -218,8 +219,8 @@ class _Asked:
     # ------------------------------------------------------------ the tree
 
     def node(self, node: Node, plain: bool, rests: bool = False) -> _Told | None:
-        """The answer of a node; ``None`` where it is left out.  plain: there is no 'any' or 'not' above, so that it may be.  rests: it is asked when something
-        has come to rest."""
+        """The answer of a node; ``None`` where it is left out.  plain: there is no 'any' or 'not' above, so that it may be.  rests: it is
+        asked when something has come to rest."""
         moment = node.after
         rests = rests or (moment is not None and moment.kind == "rest")
         if (moment is not None and moment.kind == "push") or (node.kind in PREDICATES and UNASKED & set(PREDICATES[node.kind].needs)):
@@ -426,7 +427,8 @@ class _Asked:
 
 
 def _nearest(part: Thing, other: Thing) -> float:
-    """How near another thing's surface comes at least to one of which a part is seen, m: all of that is within its span of each of its points."""
+    """How near another thing's surface comes at least to one of which a part is seen, m: all of that is
+    within its span of each of its points."""
     assert part.span is not None
     ends = part.points[np.unique((part.points @ scene_change.DIRECTIONS.T).argmax(axis=0))]
     farthest = np.max([np.linalg.norm(other.points - end, axis=1) for end in ends], axis=0)

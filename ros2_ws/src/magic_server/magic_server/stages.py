@@ -38,8 +38,8 @@ OBJECTS_LAG = 5.0
 ID_LAG = 1.0
 #: Points of a contact that are nearer than this are the same, m: it went through messages, but nobody measured it anew.
 SAME_POINT = 1e-6
-#: A reconstruction whose surface may be off by more than this, m, is no longer what a hook, a handle or a hollow is judged by; where nobody says by how much,
-#: one below this confidence, which is hardly ever right (``magic_perception/README.md``).
+#: A reconstruction whose surface may be off by more than this, m, is no longer what a hook, a handle or a hollow is judged by; where
+#: nobody says by how much, one below this confidence, which is hardly ever right (``magic_perception/README.md``).
 OFF, DOUBTFUL = 0.004, 0.2
 
 
@@ -89,8 +89,9 @@ class Server(Protocol):
 class Stages:
     """The stages of :mod:`magic_server.pipeline`, done by the other nodes; messages pass through as they came.
 
-    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.  tried: motions for the same task that were simulated before.
-    closer: how long a better reconstruction is waited for, s, where that of what the request names is doubtful.
+    scene: the objects of this run, in the robot's base frame, with a stamp no older than ``since``, s.  tried:
+    motions for the same task that were simulated before. closer: how long a better reconstruction is waited for, s,
+    where that of what the request names is doubtful.
     """
 
     def __init__(
@@ -361,7 +362,8 @@ class Stages:
             return self._ask_planner(request, matches, trial, max(0.0, deadline - time.monotonic()), self._token)
 
     def expect(self, request: pipeline.Request, matches: pipeline.Matches, trial: pipeline.Trial, timeout: float) -> None:
-        """Have the planner asked for a trial, in another thread, as soon as the verifier has its next motion: not before, for that is waited for."""
+        """Have the planner asked for a trial, in another thread, as soon as the verifier has its next
+        motion: not before, for that is waited for."""
         token = Token(self._token)
         self._meanwhile = lambda: self._server.ahead.begin(
             self._key(trial), lambda: self._ask_planner(request, matches, trial, timeout, token), token.cancel
@@ -375,7 +377,8 @@ class Stages:
         return self, trial.index, trial.reflection, trial.attempt
 
     def _expected(self, trial: pipeline.Trial, deadline: float) -> pipeline.Planned | None:
-        """What the planner answered for a trial that was expected; ``None`` where it is to be asked now, which nothing stands in the way of then.
+        """What the planner answered for a trial that was expected; ``None`` where it is to be asked now,
+        which nothing stands in the way of then.
 
         Only an answer for the trial itself counts: whatever else kept one from coming may be over.
         """
@@ -485,8 +488,8 @@ class Stages:
         return masses.sentence(strategy, conversions.object_from_msg(self._tool_of(trial), pictures=False), request.tool_mass)
 
     def film(self, outcome: pipeline.Outcome) -> Image | None:
-        """The film strip of the motion that a run ended with, or of the last that it simulated: the verifier draws it from what it recorded when
-        it gets the same goal again.
+        """The film strip of the motion that a run ended with, or of the last that it simulated: the verifier draws it from what it
+        recorded when it gets the same goal again.
 
         Drawing may cost more than simulating, and only one of a run's simulations is looked at.
         """
@@ -526,7 +529,8 @@ def _stands_in(scene: SceneObjectArray, candidate: ContactCandidate, target_id: 
 
 
 def same_frames(one: SceneObjectArray, other: SceneObjectArray) -> bool:
-    """Whether two scenes have the same objects, in the same order, with their own frames where they were: contacts mean the same in both."""
+    """Whether two scenes have the same objects, in the same order, with their own frames where they
+    were: contacts mean the same in both."""
     return one.header.frame_id == other.header.frame_id and [(o.id, o.pose) for o in one.objects] == [(o.id, o.pose) for o in other.objects]
 
 

@@ -52,7 +52,8 @@ from magic_server.scene_change import Changed
 from magic_server.stages import Stages, complaint_code, hull_of, mark_of, same_frames
 from magic_server.watch import Bounds
 
-#: Answers that another look at the same things may change: perception draws them anew every ten seconds, and sooner where it can do so more closely.
+#: Answers that another look at the same things may change: perception draws them anew every ten seconds, and
+#: sooner where it can do so more closely.
 BY_SIGHT = frozenset({Code.NO_MATCH, Code.OBJECT_CUT_OFF, Code.HANDLE_NOT_SEEN, Code.NO_CANDIDATE_SUCCEEDED})
 #: A run that is to be carried out waits for such a look so many times, s each.
 LOOKS, LOOK_TIME = 2, 12.0
@@ -74,7 +75,8 @@ ASKING_PERIOD = 0.1
 
 @dataclass(frozen=True)
 class _Asked:
-    """A goal at work: what was asked for, by which strategy, as the pipeline is asked for it, what cancels it, and who is told how it goes."""
+    """A goal at work: what was asked for, by which strategy, as the pipeline is asked for it, what
+    cancels it, and who is told how it goes."""
 
     goal: RunStrategy.Goal
     strategy: strategies.Strategy
@@ -321,7 +323,8 @@ class StrategyServer(LifecycleNode):
         self._held_pub.publish(SceneObjectArray(header=header, objects=[held.in_hand()] if held is not None else []))
 
     def hand(self, stamp: float | None = None) -> NDArray[np.float64]:
-        """base_from_tcp (4, 4) as the joints were last heard, or as they were at a stamp; raises NO_FRAMES, STALE_DATA where that is not known."""
+        """base_from_tcp (4, 4) as the joints were last heard, or as they were at a stamp; raises
+        NO_FRAMES, STALE_DATA where that is not known."""
         names, joints = self.robot.names, self.joints.all()
         missing = [name for name in names if name not in joints]
         if missing:
@@ -473,7 +476,8 @@ class StrategyServer(LifecycleNode):
         return handle.status == GoalStatus.STATUS_CANCELING
 
     def _run(self, handle: Any, token: Token, result: RunStrategy.Result) -> None:
-        """Plan until physics has passed a motion for the scene as it is, publish it, and have the arm carry it out where that is wanted; the result is told on the way."""
+        """Plan until physics has passed a motion for the scene as it is, publish it, and have the arm carry it out where that is
+        wanted; the result is told on the way."""
         goal = handle.request
         self.publication.take_back("a new run has begun")
         strategy = strategies.known(goal.strategy, self.settings.strategies or None)
@@ -659,8 +663,8 @@ class StrategyServer(LifecycleNode):
             token.wait(lambda: False, min(deadline, time.monotonic() + ASKING_PERIOD))
 
     def _publish(self, claim: Claim, token: Token, result: RunStrategy.Result, bounds: Bounds) -> bool:
-        """Publish a verified motion, if that is allowed, and write into the result how that went; raises :class:`Changed` where the scene is another one by
-        then and may be looked at and planned with once more."""
+        """Publish a verified motion, if that is allowed, and write into the result how that went; raises :class:`Changed` where the scene
+        is another one by then and may be looked at and planned with once more."""
         sentence, metrics = pipeline.split_metrics(result.message)
         try:
             notes = self._when_allowed(lambda: self.publication.offer(claim), token)
@@ -710,7 +714,8 @@ class StrategyServer(LifecycleNode):
         )
 
     def _carry_out(self, loop: ClosedLoop, result: RunStrategy.Result, before: Sequence[pipeline.Outcome]) -> None:
-        """Have arm and gripper do what was planned, and write into the result how that went; ``before``: what was planned for scenes that did not last."""
+        """Have arm and gripper do what was planned, and write into the result how that went; ``before``: what was
+        planned for scenes that did not last."""
         first = loop.jobs[0].outcome
         kind = "verified" if first.verified else "UNVERIFIED"
         self.get_logger().warning(f"the arm is about to move, if it may: carrying out the {kind} plan")
@@ -786,7 +791,8 @@ def tell_rates(message: CandidateReport | RunStrategy.Result, verdict: Verdict) 
 
 
 def look_at(scene: SceneObjectArray) -> Look:
-    """The objects of a message as the rule wants to know them; ``came`` is not filled in.  What is only remembered has not been seen to be there."""
+    """The objects of a message as the rule wants to know them; ``came`` is not filled in.  What is only
+    remembered has not been seen to be there."""
     hulls = {item.id: hull_of(item) for item in scene.objects}
     seen = [item for item in scene.objects if UNSEEN not in item.cut_off]
     return Look(

@@ -434,7 +434,8 @@ def test_an_arm_that_goes_on_moving_ends_it(bench):
 
 
 def unwatched(bench, number, until_stopped=True):
-    """While the arm is on its ``number``-th move nobody has seen the scene for too long; once it is stopped it is seen again, if so wanted."""
+    """While the arm is on its ``number``-th move nobody has seen the scene for too long; once it is
+    stopped it is seen again, if so wanted."""
     stopped = threading.Event()
 
     def move(trajectory, canceled):

@@ -108,7 +108,8 @@ def test_what_swings_would_be_met_at_rest_and_what_fell_would_not(swung, height,
 
 
 def test_what_swings_may_touch_where_it_comes_to_rest():
-    """A mean of pictures of what swings lies beside it: whether it touches cannot be told before it rests, and then it is no question of time any more."""
+    """A mean of pictures of what swings lies beside it: whether it touches cannot be told before it rests, and
+    then it is no question of time any more."""
     phases = ("grasp", "transfer", "contact", "release", "retreat")
     for swung, moving in ((0.012, True), (0.0, False)):
         places = [{**STAND, "object_1": at(0.5, y, 0.385, UPRIGHT)} for y in (swung, 0.0)]

@@ -176,7 +176,8 @@ def test_a_scene_that_nobody_sees_by_then_is_not_published_for(bench, now, says)
 
 @pytest.mark.parametrize("changes, code", [(1, Code.OK), (6, Code.STALE_DATA)])
 def test_a_scene_that_is_another_one_by_then_is_planned_for_again_a_few_times(bench, changes, code):
-    """What perception makes of a thing may flip between two looks, or somebody has moved it while it was planned with: another look, another plan."""
+    """What perception makes of a thing may flip between two looks, or somebody has moved it while it was
+    planned with: another look, another plan."""
     count = 0
 
     def verify(goal, canceled):
@@ -775,8 +776,8 @@ def test_cancel_inside_a_stage_reaches_its_server(bench, stage):
 
 
 class OneAtATime:
-    """A planner as the true one is: BUSY during another goal.  ``begun`` has an event for each trial (score, reflection, attempt), set by its goal; what is
-    ``held`` is planned until it is canceled."""
+    """A planner as the true one is: BUSY during another goal.  ``begun`` has an event for each trial (score, reflection, attempt), set by
+    its goal; what is ``held`` is planned until it is canceled."""
 
     def __init__(self, held=()):
         self.held = set(held)

@@ -248,7 +248,8 @@ def caliper(seed: int = 0, **given: float | str) -> Shape:
 
 
 def watch(seed: int = 0, **given: float | str) -> Shape:
-    """A watch on its side, its closed band a ring in the xy plane, the case at +x; region ``band``: the inside of the band away from the case."""
+    """A watch on its side, its closed band a ring in the xy plane, the case at +x; region ``band``: the
+    inside of the band away from the case."""
     d = Draw("watch", seed, given)
     rx, ry = d.real("half_length", 0.024, 0.036), d.real("half_width", 0.024, 0.034)
     strap, breadth = d.real("strap", 0.003, 0.005), d.real("breadth", 0.016, 0.024)

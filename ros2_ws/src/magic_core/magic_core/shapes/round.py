@@ -75,7 +75,8 @@ def _handle(form: str, low: float, high: float, reach: float, start_x: float, lo
 
 
 def mug(seed: int = 0, **given: float | str) -> Shape:
-    """A mug; regions ``handle`` (upper outer stretch of the handle's inner side, normals down and towards the body), ``handle_loop`` and ``rim``."""
+    """A mug; regions ``handle`` (upper outer stretch of the handle's inner side, normals down and towards
+    the body), ``handle_loop`` and ``rim``."""
     d = Draw("mug", seed, given)
     profile, form = d.choice("profile", PROFILES), d.choice("handle", HANDLES)
     radius, height = d.real("radius", 0.034, 0.044), d.real("height", 0.075, 0.115)
@@ -144,7 +145,8 @@ def _bowl_regions(half: float, depth: float, power: float, centre: Array) -> dic
 
 
 def spoon(seed: int = 0, **given: float | str) -> Shape:
-    """A spoon of 2.5 times a table spoon's size; regions ``bowl`` (bottom of the inside) and ``bowl_inside`` (all of the profile but the rim)."""
+    """A spoon of 2.5 times a table spoon's size; regions ``bowl`` (bottom of the inside) and
+    ``bowl_inside`` (all of the profile but the rim)."""
     d = Draw("spoon", seed, given)
     a, b = d.real("bowl_half_length", 0.042, 0.062), d.real("bowl_half_width", 0.038, 0.052)
     depth, wall = d.real("depth", 0.018, 0.034), d.real("wall", 0.003, 0.005)

@@ -39,6 +39,7 @@ def hand(thick: float) -> Mesh:
 
 
 def coming(since: float, arrives: float = 0.3) -> NDArray[np.float64]:
-    """Where the hand is (3,), from where it closes, in its own frame, ``since`` seconds after it sets out: it comes from behind and above in ``arrives`` s."""
+    """Where the hand is (3,), from where it closes, in its own frame, ``since`` seconds after it sets out: it comes
+    from behind and above in ``arrives`` s."""
     left = float(np.clip(1 - since / arrives, 0.0, 1.0))
     return left * np.array([-0.25, 0.0, 0.30])

@@ -244,12 +244,12 @@ class FakeServers(Node):
 class FakeArm(Node):
     """A trajectory controller, a gripper and joint states: an arm that is where its last point told it to be, at once.
 
-    ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort); ``goals`` the moves' goals.  ``thickness`` is what is
-    between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code, error_string).
-    ``asked`` is set by the first trajectory, which is accepted once ``admits`` is set; ``moving`` by the first accepted one.
-    ``positions`` of the joints, rad, and ``velocity``, rad/s, are told at 50 Hz while ``tells`` is set, ``late`` seconds late,
-    with ``apart`` in two messages.  With ``squeezes`` the fingers close as far as they can, whatever they are told.  ``bears(positions, closed)``
-    gives the joints' torques, Nm, where they are told.
+    ``log`` lists what it was told: the trajectories, and ("open" or "close", position, effort); ``goals`` the moves' goals.
+    ``thickness`` is what is between the fingers, m.  ``on_move(trajectory, canceled)`` may be replaced; it returns (error_code,
+    error_string). ``asked`` is set by the first trajectory, which is accepted once ``admits`` is set; ``moving`` by the first accepted
+    one. ``positions`` of the joints, rad, and ``velocity``, rad/s, are told at 50 Hz while ``tells`` is set, ``late`` seconds late, with
+    ``apart`` in two messages.  With ``squeezes`` the fingers close as far as they can, whatever they are told.
+    ``bears(positions, closed)`` gives the joints' torques, Nm, where they are told.
     """
 
     def __init__(self, name: str = "fake_arm", thickness: float = 0.03, **kwargs: Any) -> None:
