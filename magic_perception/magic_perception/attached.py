@@ -16,9 +16,12 @@ from magic_core import transforms
 from magic_perception import smear
 from magic_perception.looks import Looked
 
-#: The widest gap and least height over the table of what hangs in the air, m; the largest difference in chromaticity (R, G, B over their sum); pixels in
-#: which both are neighbours.
-GAP, LIFTED, COLOR, BESIDE = 0.020, 0.012, 0.06, 7
+#: The widest gap and the least height over the table of what hangs in the air, m.
+GAP, LIFTED = 0.020, 0.012
+#: The largest difference in chromaticity (R, G, B over their sum) of what has one colour.
+COLOR = 0.06
+#: Pixels in which two parts are neighbours.
+BESIDE = 7
 #: The largest share of the other's pixels that a part has which hangs beside it or is a strip along it, and which closes a loop with it.
 PART, LOOP = 0.2, 0.5
 #: A hole of so many pixels, of whose rim either has such a share, closes a loop; a strip is so wide at most, as a mean, at a focal length of 615.

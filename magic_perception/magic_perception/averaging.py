@@ -13,14 +13,22 @@ from magic_core.camera import RgbdFrame
 from magic_core.errors import Code, MagicError
 from magic_perception.pixels import opened
 
-#: A place has changed since an older frame where a channel of its colour, smoothed, is off by more than this (of 255) and than so many times what the
-#: frames are off by elsewhere, in a blob of so many pixels in both directions; and so have as many pixels around it.
-CHANGED, NOISES, BLOB, AROUND = 10.0, 5.0, 3, 7
+#: A place has changed since an older frame where a channel of its colour, smoothed, is off by more than this (of 255)...
+CHANGED = 10.0
+#: ...and than so many times what the frames are off by elsewhere...
+NOISES = 5.0
+#: ...in a blob of so many pixels in both directions.
+BLOB = 3
+#: So have as many pixels around it.
+AROUND = 7
 #: So has depth that is off by more than the spread in a blob of so many pixels: flicker at edges is narrower.
 FAR_BLOB = 9
-#: The same of two means, which have less noise: levels of colour, and of depth m at one metre (as its noise, growing with the square), in a blob of so
-#: many pixels; and how far the camera may be from where it was (entries of its pose).
-FAINT, SHIFT, DEEP_BLOB, PLACE = 6.0, 0.006, 7, 1e-4
+#: The same of two means, which have less noise: levels of colour.
+FAINT = 6.0
+#: Of depth, m at one metre (as its noise, growing with the square), in a blob of so many pixels.
+SHIFT, DEEP_BLOB = 0.006, 7
+#: How far the camera may be from where it was (entries of its pose).
+PLACE = 1e-4
 
 
 def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:

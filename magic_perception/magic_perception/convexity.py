@@ -140,15 +140,20 @@ def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArra
     return np.unique(part, return_inverse=True)[1]
 
 
-#: Voxels of a level face look up to this cosine, so many of them lie within LEVEL of its height, m, and other faces are APART from it, m.
-UPWARD, FACE, LEVEL, APART = 0.95, 30, 0.006, 0.012
+#: Voxels of a level face look up to this cosine.
+UPWARD = 0.95
+#: So many of them lie within so much, m, of its height.
+FACE, LEVEL = 30, 0.006
+#: Other faces are so far from it, m.
+APART = 0.012
 #: What stands on it begins so much above it, m, where voxels look up to this cosine, and at its height where they do not.
 ABOVE, SIDE = 0.004, 0.8
 #: Where it begins such a share of the surface bends inward.
 BENT = 0.25
-#: A thing that stands beside the face goes on below it: of its lowest BAND above the face, m, more than such a share has something below the face that lies at most
-#: so far aside, m, and differs by no more in colour (R, G, B of 0..1).
-GOES_ON, BAND, ASIDE, PAINT = 0.3, 0.016, 0.010, 0.08
+#: A thing that stands beside the face goes on below it: of its lowest part above the face, so high, m, more than such a share...
+BAND, GOES_ON = 0.016, 0.3
+#: ...has something below the face that lies at most so far aside, m, and differs by no more in colour (R, G, B of 0..1).
+ASIDE, PAINT = 0.010, 0.08
 
 
 def on_tops(voxels: seams.Voxels, least: int = 50) -> NDArray[np.int64]:
@@ -277,10 +282,14 @@ def insides(
     return _outsides(points, normal, labels, heights)
 
 
-#: Of an inside such a share lies near one circle, to a wall's thickness at its best, m, and faces its middle: the rest may be a pen that stands in it.  Of an
-#: outside such a share faces away from there, and lies within the rim: the rest may be a handle.  Its highest points lie at such a share of the rim's radius:
-#: depth rounds the near rim off, and the far one outwards.
-WALL, MOST, INWARD, OUTWARD, WITHIN, BESIDE_RIM = 0.004, 0.6, 0.8, 0.75, 0.7, 0.75
+#: Of an inside such a share lies near one circle, to a wall's thickness at its best, m: the rest may be a pen that stands in it.
+MOST, WALL = 0.6, 0.004
+#: Such a share of it faces the circle's middle.
+INWARD = 0.8
+#: Of an outside such a share faces away from there, and such a share lies within the rim: the rest may be a handle.
+OUTWARD, WITHIN = 0.75, 0.7
+#: Its highest points lie at such a share of the rim's radius: depth rounds the near rim off, and the far one outwards.
+BESIDE_RIM = 0.75
 
 
 def _walls(normal: NDArray[np.floating], labels: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -331,9 +340,13 @@ def _outsides(
     return labels
 
 
-#: Of a part that has a handle such a share of its upright surfaces at least lies within the other's rim, beside it, and of these such a share faces the other way;
-#: parts of one thing are so near each other, m.  Of an inside alone, or an outside alone, no more than a tenth faces otherwise.
-HANDLED, FACING, TOUCHING, ALONE = 0.1, 0.6, 0.012, 0.1
+#: Of a part that has a handle such a share of its upright surfaces at least lies within the other's rim, beside it, and of these such a
+#: share faces the other way.
+HANDLED, FACING = 0.1, 0.6
+#: Parts of one thing are so near each other, m.
+TOUCHING = 0.012
+#: Of an inside alone, or an outside alone, no more than this share faces otherwise.
+ALONE = 0.1
 
 
 def with_handles(

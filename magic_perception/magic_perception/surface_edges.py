@@ -8,9 +8,12 @@ from numpy.typing import NDArray
 
 from magic_perception.looks import Looked
 
-#: Pixels beside the seam of two labels that are judged anew, and half the window around them in which surfaces are fitted; standard deviations of depth
-#: from which a pixel is not of its own surface, and within which it is of another; least share of the window that tells of a surface.
-BAND, FITTED, OFF, ON, SUPPORT = 6, 14, 2.5, 1.5, 0.06
+#: Pixels beside the seam of two labels that are judged anew, and half the window around them in which surfaces are fitted.
+BAND, FITTED = 6, 14
+#: Standard deviations of depth from which a pixel is not of its own surface, and within which it is of another.
+OFF, ON = 2.5, 1.5
+#: Least share of the window that tells of a surface.
+SUPPORT = 0.06
 
 
 def on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:

@@ -199,19 +199,75 @@ def _drafted(
     """The strategy but for its phases, looked at so that both contacts are where they were shown; how far (m) each is from there; and how far
     (rad) askew of the way that the target was led.
 
-    The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  A round thing that was met a
-    millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led, and so does the tool; in a hollow
-    hardly wider than it any number of degrees.  There the normals are those of the way.  Raises BAD_REQUEST that says how near the best of them came.
+    The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  Raises BAD_REQUEST that says how
+    near the best of them came.
     """
-    tool, target = demonstration.tool, demonstration.target
-    world_from_tool = target.world_from_object @ motion.target_from_tool[motion.index(made)]
-    came = world_from_tool[:3, 3] - (target.world_from_object @ motion.target_from_tool[_last_away(motion, found, made, APPROACH)])[:3, 3]
-    towards = target.world_from_object[:3, :3] @ found.target_normal
-    way = target.world_from_object[:3, :3] @ _way(motion, found, made, parted)
+    draft = _Draft(demonstration, task, motion, found, made, parted)
+    why: list[MagicError] = []
+    for direction in draft.directions():
+        if task.view and (task.view == "top") != (direction[2] != 0.0):
+            continue
+        try:
+            return draft.along(direction)
+        except MagicError as error:
+            why.append(error)
+    if why:
+        raise why[0]
+    raise MagicError(Code.BAD_REQUEST, "view", task.view, "one in which the contact is seen in profile; without --view it is found")
 
-    def drawn(direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float, float]:
+
+class _Draft:
+    """A strategy but for its phases, as it is looked at along one direction or another.
+
+    made, parted: seconds at which the contact is made, and at which tool and target part.
+    """
+
+    def __init__(self, demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float, parted: float) -> None:
+        self.demonstration, self.task, self.motion, self.found = demonstration, task, motion, found
+        world_from_target = demonstration.target.world_from_object
+        self.world_from_tool = world_from_target @ motion.target_from_tool[motion.index(made)]
+        before = (world_from_target @ motion.target_from_tool[_last_away(motion, found, made, APPROACH)])[:3, 3]
+        self.came = self.world_from_tool[:3, 3] - before
+        self.towards = world_from_target[:3, :3] @ found.target_normal
+        self.way = world_from_target[:3, :3] @ _way(motion, found, made, parted)
+
+    def directions(self) -> list[Array]:
+        """The view directions (3,) to try, best first."""
+        return view_directions(self.demonstration.tool, self.world_from_tool, self.towards, self.came)
+
+    def along(self, direction: Array) -> tuple[Strategy, float, float, float]:
+        """As :func:`_drafted`, looked at along a direction (3,).
+
+        A round thing that was met a millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led,
+        and so does the tool; in a hollow hardly wider than it any number of degrees.  There the normals are those of the way.
+        """
+        found, way = self.found, self.way
+        draft, target_gap, tool_gap = self._read(direction, self.towards, found)
+        radius = draft.target_contact.disc_radius if draft.target_outline == "outer" else None
+        if not radius or way @ self.towards >= 0:
+            return draft, tool_gap, target_gap, 0.0
+        led = levelled(transforms.unit(way - (way @ direction) * direction))
+        tool_led = self.world_from_tool[:3, :3].T @ led
+        about = radius if _elsewhere(draft, found, tool_led, radius) <= OFF_OUTLINE else 0.0
+        askew = float(np.arccos(np.clip(-(way @ self.towards) / np.linalg.norm(way), -1.0, 1.0)))
+        if not about and askew >= NEARLY:
+            return draft, tool_gap, target_gap, askew
+        # On a round thing the place goes with the normal.
+        target_led = -self.demonstration.target.world_from_object[:3, :3].T @ led
+        met = found.target_point + radius * (target_led - found.target_normal)
+        draft, _, tool_gap = self._read(direction, -led, replace(found, tool_normal=tool_led, target_point=met, target_normal=target_led))
+        draft = replace(draft, tool_contact=_led(draft, tool_led, about))
+        view = draft.target_view
+        off = view.pixels(draft.target_contact.object_from_contact[:3, 3]) - view.pixels(found.target_point)
+        return draft, tool_gap, float(np.linalg.norm(off)) * view.metres_per_pixel, 0.0
+
+    def _read(self, direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float, float]:
+        """The draft with contacts as they were read, ``towards`` (3,) the target's outward normal; how far (m) the target's and the tool's are
+        from where they were shown."""
+        demonstration, task, motion = self.demonstration, self.task, self.motion
+        tool, target = demonstration.tool, demonstration.target
         normal = levelled(transforms.unit(towards - (towards @ direction) * direction))
-        view, contact, tool_gap = _tool_contact(tool, world_from_tool, direction, read, task.view)
+        view, contact, tool_gap = _tool_contact(tool, self.world_from_tool, direction, read, task.view)
         draft = Strategy(
             name=task.name,
             description=task.description,
@@ -234,38 +290,6 @@ def _drafted(
             simulatable=task.simulatable,
         )
         return *_target_contact(draft, target, read), tool_gap
-
-    why: list[MagicError] = []
-    for direction in view_directions(tool, world_from_tool, towards, came):
-        if task.view and (task.view == "top") != (direction[2] != 0.0):
-            continue
-        try:
-            draft, target_gap, tool_gap = drawn(direction, towards, found)
-            radius = draft.target_contact.disc_radius if draft.target_outline == "outer" else None
-            askew = 0.0
-            if radius and way @ towards < 0:
-                led = levelled(transforms.unit(way - (way @ direction) * direction))
-                tool_led, target_led = world_from_tool[:3, :3].T @ led, -target.world_from_object[:3, :3].T @ led
-                about = radius if _elsewhere(draft, found, tool_led, radius) <= OFF_OUTLINE else 0.0
-                askew = float(np.arccos(np.clip(-(way @ towards) / np.linalg.norm(way), -1.0, 1.0)))
-                if about or askew < NEARLY:
-                    # On a round thing the place goes with the normal.
-                    met = found.target_point + radius * (target_led - found.target_normal)
-                    draft, _, tool_gap = drawn(
-                        direction, -led, replace(found, tool_normal=tool_led, target_point=met, target_normal=target_led)
-                    )
-                    draft = replace(draft, tool_contact=_led(draft, tool_led, about))
-                    off = draft.target_view.pixels(draft.target_contact.object_from_contact[:3, 3]) - draft.target_view.pixels(
-                        found.target_point
-                    )
-                    target_gap = float(np.linalg.norm(off)) * draft.target_view.metres_per_pixel
-                    askew = 0.0
-            return draft, tool_gap, target_gap, askew
-        except MagicError as error:
-            why.append(error)
-    if why:
-        raise why[0]
-    raise MagicError(Code.BAD_REQUEST, "view", task.view, "one in which the contact is seen in profile; without --view it is found")
 
 
 def _way(motion: _Motion, found: Replay, made: float, parted: float) -> Array:

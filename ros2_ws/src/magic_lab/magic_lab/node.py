@@ -39,9 +39,11 @@ from magic_verifier.cases import Case
 
 Array = NDArray[np.float64]
 
-#: Ticks between two messages of each kind: /clock at 10 Hz, /tf at 20 Hz (robot_state_publisher's own), the truth at 20 Hz; and s between
-#: two words of a trajectory's feedback.  Each message on /clock wakes every node.
-CLOCK_EVERY, TF_EVERY, TRUTH_EVERY, FEEDBACK = 10, 5, 5, 0.05
+#: Ticks between two messages of each kind: /clock at 10 Hz, as each of them wakes every node; /tf at 20 Hz (robot_state_publisher's own);
+#: the truth at 20 Hz.
+CLOCK_EVERY, TF_EVERY, TRUTH_EVERY = 10, 5, 5
+#: Seconds between two words of a trajectory's feedback.
+FEEDBACK = 0.05
 #: How far this clock may be behind the wall's before the difference is given up, s: it never runs faster to catch up.
 BEHIND = 0.05
 #: How long a reset may take, s.

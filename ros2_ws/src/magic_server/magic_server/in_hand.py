@@ -43,9 +43,12 @@ GRASPED, LOOKED, LET_GO = Spread(0.003, 0.012, 0.15), Spread(0.002, 0.005, 0.07)
 NOISE, WORTH = 0.003, 60
 #: Points on the tool's surface that stand for it, and points seen that are used.
 SURFACE, USED = 12000, 400
-#: The surface is where points were seen at the first look, the median of so many, where those are within this, m, along it and across, and
-#: lie around: their mean is within this, m, along it.
-NEIGHBOURS, BESIDE, ABOVE, AROUND = 9, 0.006, 0.005, 0.0015
+#: The surface is where points were seen at the first look: the median of so many...
+NEIGHBOURS = 9
+#: ...where those are within so much, m, along it and across it...
+BESIDE, ABOVE = 0.006, 0.005
+#: ...and lie around: their mean is within this, m, along it.
+AROUND = 0.0015
 #: Nearer to the fingertips than this, m, depth is smeared between fingers and tool.
 BY_FINGERS = 0.045
 #: Points farther than this from the tool are none of it, m: when the search begins, and when it ends.
