@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import planner_scenes as scenes
 
 from magic_core import strategy as strategies
+from magic_core.testing.served import served
 
 DEADLINE = 20.0
 
@@ -18,34 +17,12 @@ DEADLINE = 20.0
 def planner(folder, **parameters) -> Iterator:
     """An action client of a planner node, both in a domain of their own, that has the strategy ``pulling``; folder: where that may
     be written."""
-    import rclpy
-    from rclpy.executors import MultiThreadedExecutor
-    from rclpy.parameter import Parameter
-
-    from magic_core.actions import ActionClient
-    from magic_core.domain import free_domain
     from magic_interfaces.action import PlanMotion
     from magic_planner.node import PlannerNode
 
     strategies.save(scenes.pulling(), folder / "pulling")
-    rclpy.init(domain_id=free_domain())
-    given = {"strategies": str(folder), **parameters}
-    node = PlannerNode(parameter_overrides=[Parameter(name, value=value) for name, value in given.items()])
-    user = rclpy.create_node("user")
-    client = ActionClient(user, PlanMotion, "plan_motion")
-    executor = MultiThreadedExecutor(4)
-    executor.add_node(node)
-    executor.add_node(user)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
-    assert client.wait_for_server(DEADLINE)
-    yield client
-    executor.shutdown(timeout_sec=2.0)
-    client.destroy()
-    node.destroy_node()
-    user.destroy_node()
-    rclpy.try_shutdown()
-    thread.join(5.0)
+    with served(PlannerNode, PlanMotion, "plan_motion", {"strategies": str(folder), **parameters}) as client:
+        yield client
 
 
 def goal(tool=None, target=None, **changes):
@@ -63,19 +40,3 @@ def goal(tool=None, target=None, **changes):
     for name, value in changes.items():
         setattr(message, name, value)
     return message
-
-
-def wait(future):
-    """The result of a future; fails after DEADLINE."""
-    end = time.monotonic() + DEADLINE
-    while not future.done():
-        assert time.monotonic() < end, "no answer"
-        time.sleep(0.002)
-    return future.result()
-
-
-def ask(client, message, feedback=None):
-    """The result of a goal."""
-    handle = wait(client.send_goal_async(message, feedback_callback=feedback))
-    assert handle.accepted
-    return wait(handle.get_result_async()).result

@@ -10,9 +10,10 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 import planner_scenes as scenes
 import pytest
-from planner_graph import DEADLINE, ask, goal, planner, wait
+from planner_graph import DEADLINE, goal, planner
 
 from magic_core.errors import Code
+from magic_core.testing.served import ask, wait
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("magic_interfaces.action")

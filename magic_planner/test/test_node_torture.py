@@ -13,11 +13,12 @@ import numpy as np
 import planner_scenes as scenes
 import pytest
 import trimesh
-from planner_graph import DEADLINE, ask, goal, planner, wait
+from planner_graph import DEADLINE, goal, planner
 
 from magic_core import transforms
 from magic_core.errors import Code
 from magic_core.mesh import Mesh
+from magic_core.testing.served import ask, wait
 
 pytest.importorskip("rclpy")
 pytest.importorskip("magic_interfaces.action")

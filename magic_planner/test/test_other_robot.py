@@ -91,8 +91,10 @@ def test_a_wider_gripper_takes_what_a_narrow_one_cannot(planner, config):
 
 def test_the_node_takes_it_by_its_parameters(config, tmp_path):
     pytest.importorskip("rclpy")
-    from planner_graph import ask, goal
+    from planner_graph import goal
     from planner_graph import planner as node
+
+    from magic_core.testing.served import ask
 
     given = {
         f"robot.{name}": value if not isinstance(value, tuple) else list(value)

@@ -14,10 +14,11 @@ import scenes
 
 pytest.importorskip("rclpy")
 
-from verifier_graph import ask, goal_message, slow_plan, verifier, wait
+from verifier_graph import goal_message, slow_plan, verifier
 
 from magic_core import conversions as convert
 from magic_core.errors import Code
+from magic_core.testing.served import ask, wait
 from magic_interfaces.msg import SceneObject as SceneObjectMsg
 from magic_verifier import node as verifier_node
 

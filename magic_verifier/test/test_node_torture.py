@@ -14,13 +14,14 @@ import trimesh
 
 pytest.importorskip("rclpy")
 
-from verifier_graph import ask, goal_message, slow_plan, verifier, wait
+from verifier_graph import goal_message, slow_plan, verifier
 
 from magic_core import conversions as convert
 from magic_core import transforms
 from magic_core.errors import Code
 from magic_core.mesh import Mesh
 from magic_core.motion import MotionPlan, Phase, ToolMotion
+from magic_core.testing.served import ask, wait
 
 #: Seconds that a goal here may take.
 ALLOWED = 60.0

@@ -264,7 +264,9 @@ def given(config):
 
 def test_the_node_takes_it_by_the_planners_parameters(config, pull, tmp_path):
     pytest.importorskip("rclpy")
-    from verifier_graph import ask, goal_message, verifier
+    from verifier_graph import goal_message, verifier
+
+    from magic_core.testing.served import ask
 
     (_, tool, target, _, _), plan = pull
     with verifier(tmp_path, **given(config), **{"arm.stiffness": [3000.0], "arm.damping": [100.0]}) as client:

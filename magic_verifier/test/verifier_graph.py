@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +13,7 @@ from magic_core import conversions as convert
 from magic_core import strategy as strategies
 from magic_core.mesh import Mesh
 from magic_core.scene import CanonicalView
+from magic_core.testing.served import served
 
 
 def _save(folder, name, goal):
@@ -32,38 +32,14 @@ def verifier(folder, **parameters) -> Iterator:
 
     folder: where these may be written; parameters: of the node, ``{"arm.grip_force": 40.0}``.
     """
-    import rclpy
-    from rclpy.executors import MultiThreadedExecutor
-    from rclpy.parameter import Parameter
-
-    from magic_core.actions import ActionClient
-    from magic_core.domain import free_domain
     from magic_interfaces.action import VerifyMotion
     from magic_verifier.node import VerifierNode
 
     _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
     _save(folder, "pulling", strategies.Goal("hook", {"noise": 0.0}))
     _save(folder, "juggling", strategies.Goal("juggle"))
-    rclpy.init(domain_id=free_domain())
-    given = {"strategies": str(folder), **parameters}
-    node = VerifierNode(parameter_overrides=[Parameter(name, value=value) for name, value in given.items()])
-    peer = rclpy.create_node("peer")
-    client = ActionClient(peer, VerifyMotion, "verify_motion")
-    executor = MultiThreadedExecutor(4)
-    executor.add_node(node)
-    executor.add_node(peer)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
-    try:
-        assert client.wait_for_server(timeout_sec=20)
+    with served(VerifierNode, VerifyMotion, "verify_motion", {"strategies": str(folder), **parameters}) as client:
         yield client
-    finally:
-        executor.shutdown(timeout_sec=5)
-        thread.join(timeout=5)
-        client.destroy()
-        node.destroy_node()
-        peer.destroy_node()
-        rclpy.try_shutdown()
 
 
 def slow_plan():
@@ -90,18 +66,3 @@ def goal_message(name="hooking", kind="L", tool=None, target=None, plan=None, **
     for key, value in fields.items():
         setattr(goal, key, value)
     return goal
-
-
-def wait(future, seconds=30.0):
-    """The result of a future; fails after so many seconds."""
-    done = threading.Event()
-    future.add_done_callback(lambda _f: done.set())
-    assert done.wait(seconds), f"no answer within {seconds} s"
-    return future.result()
-
-
-def ask(client, goal, feedback=None):
-    """The result of a goal."""
-    handle = wait(client.send_goal_async(goal, feedback_callback=feedback))
-    assert handle.accepted
-    return wait(handle.get_result_async()).result
