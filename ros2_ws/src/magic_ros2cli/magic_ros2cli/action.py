@@ -75,11 +75,8 @@ def action_list(arguments: list[str]) -> int:
     parser.add_argument("-c", "--count-actions", action="store_true", help="only display the number of actions discovered")
     parsed = parser.parse_args(arguments)
     with connect.node() as node:
-        found = sorted(connect.settle(node, lambda: get_action_names_and_types(node)))
-    if parsed.count_actions:
-        print(len(found))
-    for name, types in [] if parsed.count_actions else found:
-        print(f"{name} [{', '.join(types)}]" if parsed.show_types else name)
+        found = connect.settle(node, lambda: get_action_names_and_types(node))
+    connect.print_names(found, parsed.show_types, parsed.count_actions)
     return 0
 
 

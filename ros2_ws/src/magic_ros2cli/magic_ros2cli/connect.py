@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -95,3 +95,13 @@ def absolute(name: str) -> str:
 def hidden(name: str) -> bool:
     """Whether ros2cli leaves the name out of its lists."""
     return any(part.startswith("_") for part in name.split("/"))
+
+
+def print_names(found: Iterable[tuple[str, list[str]]], show_types: bool, count: bool) -> None:
+    """Print names, with their types in brackets where that is asked for, or how many there are instead."""
+    found = sorted(found)
+    if count:
+        print(len(found))
+        return
+    for name, types in found:
+        print(f"{name} [{', '.join(types)}]" if show_types else name)

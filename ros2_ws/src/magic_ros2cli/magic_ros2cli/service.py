@@ -17,11 +17,8 @@ def service_list(arguments: list[str]) -> int:
     parsed = parser.parse_args(arguments)
     with connect.node() as node:
         found = connect.settle(node, node.get_service_names_and_types)
-    found = sorted((n, t) for n, t in found if parsed.include_hidden_services or not connect.hidden(n))
-    if parsed.count_services:
-        print(len(found))
-    for name, types in [] if parsed.count_services else found:
-        print(f"{name} [{', '.join(types)}]" if parsed.show_types else name)
+    shown = ((n, t) for n, t in found if parsed.include_hidden_services or not connect.hidden(n))
+    connect.print_names(shown, parsed.show_types, parsed.count_services)
     return 0
 
 

@@ -28,11 +28,8 @@ def topic_list(arguments: list[str]) -> int:
     parsed = parser.parse_args(arguments)
     with connect.node() as node:
         found = connect.settle(node, node.get_topic_names_and_types)
-    found = [(n, t) for n, t in found if parsed.include_hidden_topics or not connect.hidden(n)]
-    if parsed.count_topics:
-        print(len(found))
-    for name, types in [] if parsed.count_topics else sorted(found):
-        print(f"{name} [{', '.join(types)}]" if parsed.show_types else name)
+    shown = ((n, t) for n, t in found if parsed.include_hidden_topics or not connect.hidden(n))
+    connect.print_names(shown, parsed.show_types, parsed.count_topics)
     return 0
 
 
