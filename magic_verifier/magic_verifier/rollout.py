@@ -562,9 +562,9 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None, taken_anew: Any = Non
 
     if drawn is None:
         return ArmRun(setup, task.plan, task.arm_options or ArmOptions(), task.limits, task.robot, rests=_seen(task), offset=task.offset)
-    options = _drawn_options(task, drawn)
+    options, limits = _drawn_options(task, drawn), task.limits.yielding()
     if options.past is not None:  # what contacts alone have taken hold of has no state that could be begun from
-        return ArmRun(setup, task.plan, options, task.limits, task.robot, None, drawn.lag)
+        return ArmRun(setup, task.plan, options, limits, task.robot, None, drawn.lag)
     if taken_anew is None:
         held = replace(task.held, tool_from_tcp=transforms.inverse(drawn.tool_from_held) @ task.held.tool_from_tcp)
     else:
@@ -573,4 +573,4 @@ def _arm_run(task: Task, setup: Setup, drawn: Draw | None, taken_anew: Any = Non
         _, off_it = along_table(drawn.tool_from_held, task.setup.tool.world_from_object[:3, :3].T @ setup.table[:3])
         crept = transforms.inverse(task.held.taken) @ task.held.tool_from_tcp
         held = replace(taken_anew, time=task.held.time, tool_from_tcp=transforms.inverse(off_it) @ taken_anew.taken @ crept)
-    return ArmRun(setup, task.plan, options, task.limits, task.robot, held, drawn.lag)
+    return ArmRun(setup, task.plan, options, limits, task.robot, held, drawn.lag)

@@ -566,6 +566,10 @@ class World:
         """How deep two bodies were in each other in the last step, m, at the deepest contact point; 0 where they were not."""
         return max([0.0, *(-point.separation for contact in self._between(first, second) for point in contact.points)])
 
+    def force(self, first: str, second: str) -> float:
+        """With how many newtons two bodies pressed on each other in the last step, all their contact points together, whichever way each of them goes."""
+        return sum(math.hypot(*p.impulse.tolist()) for contact in self._between(first, second) for p in contact.points) / self.timestep
+
     def _between(self, first: str, second: str) -> list[Any]:
         """The last step's contacts of two bodies, whichever of them is named first."""
         contacts = self._contacts()

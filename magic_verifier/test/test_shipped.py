@@ -12,6 +12,7 @@ pytest.importorskip("magic_planner.object_motion")
 from magic_core import transforms
 from magic_core.errors import Code
 from magic_core.motion import MotionPlan
+from magic_core.robot_pictures import link_mesh
 from magic_planner.arm import ArmPlanner
 from magic_planner.budget import Budget
 from magic_planner.object_motion import plan_tool_motion
@@ -81,6 +82,24 @@ def test_the_arm_run_is_deterministic_and_feels_what_is_changed(planner):
     )
     written = words[len(film) :]
     assert len(written) > 60 and written.min() < 100 and written[:, -8:].min() == 255  # all of it, on lines within the picture
+
+
+@pytest.mark.parametrize(("phase", "code"), [("transfer", Code.PRE_CONTACT_COLLISION), ("goal", Code.LIMIT_EXCEEDED)])
+def test_a_hand_that_presses_on_a_fixture_has_hit_it(planner, phase, code):
+    """A post stands 5 mm in the way of the hand: the engine lets the two go next to no way into each other, however hard they press."""
+    strategy, tool, target, obstacles, candidate = demonstration("hooking")
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
+    arm, robot = plan.arm_motion, planner.robot.description
+    span = next(p for p in arm.phases if p.name == phase)
+    at = int(np.searchsorted(arm.times, 0.4 * span.start + 0.6 * span.end))
+    hand = link_mesh(robot, "panda_hand", ("collision",)).vertices
+    points = transforms.apply(robot.poses(dict(zip(arm.joint_names, arm.positions[at], strict=True)))["panda_hand"], hand)
+    x, y, z = points.mean(axis=0)[0], points[:, 1].max() - 0.005, points.mean(axis=0)[2]
+    post = scenes.item("post", [scenes.block((x - 0.02, x + 0.02), (y, y + 0.04), (0.0, z + 0.1))])
+    verdict = verify_proposal(Proposal(strategy, tool, target, (*obstacles, post), scenes.TABLE, plan), repetitions=1)
+    assert verdict.code == code and "hit the post" in verdict.message and " N'" in verdict.message, verdict.message
+    assert verdict.metrics["torque_ratio"] < 0.9, "before it asks for all that the arm can give"
 
 
 def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
