@@ -54,7 +54,7 @@ def contained(inner: NDArray[np.float64], outer: NDArray[np.float64], margin: fl
 
 def gap(before: NDArray[np.float64], after: NDArray[np.float64], partly: bool) -> float:
     """How far an object has moved at least, m.  Of one that is seen in part only by how much it sticks out of where it was."""
-    return max(0.0, float((after - before).max())) if partly else distance(before, after)
+    return float(np.maximum((after - before).max(), 0.0)) if partly else distance(before, after)
 
 
 def parts(

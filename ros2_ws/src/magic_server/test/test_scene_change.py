@@ -58,3 +58,10 @@ def test_a_scene_that_is_no_longer_is_refused():
         assert caught.value.code == Code.STALE_DATA
         assert says in caught.value.message
     scene_change.check(before, only_one, 0.0, meant={"object_2"})
+
+
+def test_what_is_nowhere_has_moved_though_it_is_seen_in_part():
+    there = scene_change.hulls(fakes.scene().objects)
+    nowhere = {**there, "object_1": np.full(len(scene_change.DIRECTIONS), np.nan)}
+    with pytest.raises(scene_change.Changed, match="nan"):
+        scene_change.check(there, nowhere, 1.0, partly={"object_1"})
