@@ -92,6 +92,6 @@ def sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: P
     keep.sort(reverse=True)
     table = np.zeros(top + 2, np.int32)
     table[-1] = -1
-    for new, (_, old) in enumerate(keep[: parameters.max_objects]):
+    for new, (_, old) in enumerate(keep):
         table[old] = new + 1
     return [table[image] for image in labels]

@@ -160,7 +160,7 @@ def perceive(
 
         with report.stage("meshes"):
             solids, refused = _solids(building, views, apart)
-            report.notes += [f"cluster {label} left out: {error.message}" for label, error in refused.items()]
+            report.notes += [_about_refused(label, error, views) for label, error in refused.items()]
             ids = {built.label: f"object_{number}" for number, built in enumerate(solids, 1)}
             report.numbers = {name: label for label, name in ids.items()}
             told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[:now])
@@ -375,6 +375,14 @@ def _about_glass(views: _Views) -> list[str]:
     return [f"[{int(Code.NO_DEPTH)} {Code.NO_DEPTH.name}] {item}" for item in once(blank)]
 
 
+def _about_refused(label: int, error: MagicError, views: _Views) -> str:
+    """What there is to say of what was seen to stand there and is no object."""
+    points = np.concatenate([look.points(*np.nonzero(image == label)) for look, image in zip(views.looks, views.labels, strict=True)])
+    points = points[np.isfinite(points[:, 0])]
+    at = " at ({:.2f}, {:.2f}) m".format(*np.median(points[:, :2], axis=0)) if len(points) else ""
+    return f"something{at} is no object, and motions do not avoid it: {error.message}"
+
+
 # ---------------------------------------------------------------- solids
 
 
@@ -437,6 +445,9 @@ def _solids(
 
 def _attempt(given: tuple[_Views, Parameters], label: int) -> _Built | MagicError:
     """The thing with that label, or why it cannot be built."""
+    most = given[1].max_objects
+    if label > most:  # the largest come first
+        return MagicError(Code.RECONSTRUCTION_FAILED, "things in the scene", label, f"the {most} largest; parameter max_objects")
     try:
         return _build(label, *given)
     except MagicError as error:
@@ -455,7 +466,7 @@ def _build(label: int, views: _Views, parameters: Parameters) -> _Built:
     if across > parameters.max_extent and any(by in (PICTURE, REGION) for by in cut) and not hanging:
         raise MagicError(
             Code.OBJECT_CUT_OFF,
-            "extent in metres of something that the picture or the region cuts; motions do not avoid it",
+            "extent in metres of something that the picture or the region cuts",
             round(across, 2),
             f"up to {parameters.max_extent}",
         )

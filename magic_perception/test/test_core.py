@@ -1,6 +1,7 @@
 """Perception's core against analytic truths and ray-cast scenes."""
 
 import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -280,6 +281,18 @@ def test_region_of_interest(hooking):
     _, captured, _, _ = hooking
     scene = perceive([c[0] for c in captured], parameters=Parameters(region_low=(0.0, -0.5, -0.05), region_high=(0.9, -0.02, 0.5)))
     assert len(scene.objects) == 2
+
+
+def test_what_is_too_much_is_said_to_stand_there(hooking):
+    """What is seen and is no object is in nobody's way: whoever plans has to be told."""
+    meshes, captured, _, _ = hooking
+    few = perceive([c[0] for c in captured], parameters=Parameters(max_objects=2))
+    assert len(few.objects) == 2
+    (note,) = [note for note in few.notes if "motions do not avoid it" in note]
+    told = np.array([float(v) for v in re.search(r"at \((\S+), (\S+)\) m is no object", note).groups()])
+    (left,) = [mesh for mesh in meshes if np.linalg.norm(mesh.bounds.mean(axis=0)[:2] - told) < 0.05]
+    assert min(np.linalg.norm(o.world_from_object[:3, 3] - left.bounds.mean(axis=0)) for o in few.objects) > 0.1
+    assert "max_objects" in note
 
 
 def test_same_frames_same_scene(hooking):

@@ -91,6 +91,7 @@ class Claim:
     state_known : whether the plan began where the arm was heard to be; else it began at home.
     meant : ids of what the motion itself has moved so far.
     carried : hull of the tool where it was when the newest objects were seen, if the arm has, or had, it in its hand, else ``None``.
+    said : what perception had to say of that scene, of what it does not show for one.
     motion, mark : the motion itself, which the rule does not look into, and what tells it from others, as its verdict has it.
     """
 
@@ -104,6 +105,7 @@ class Claim:
     state_known: bool = True
     meant: frozenset[str] = frozenset()
     carried: NDArray[np.float64] | None = field(default=None, compare=False)
+    said: tuple[str, ...] = ()
     motion: Any = field(default=None, compare=False)
     mark: bytes = b""
 
@@ -185,7 +187,7 @@ def permit(claim: Claim, world: World, limits: Limits, purpose: Purpose) -> tupl
         seen.remembered if among else (),
     )
     notes = _arm(claim, world, limits, purpose)
-    return (*notes, *((RECORDED,) if world.recorded or world.replaying else ()))
+    return (*notes, *((RECORDED,) if world.recorded or world.replaying else ()), *claim.said)
 
 
 def _in_operation(world: World, purpose: Purpose) -> None:

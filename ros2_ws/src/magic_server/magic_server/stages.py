@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -526,6 +527,14 @@ def _stands_in(scene: SceneObjectArray, candidate: ContactCandidate, target_id: 
     world_from_tool = conversions.pose_from_msg(tools[candidate.tool_id].pose)
     contact = conversions.pose_from_msg(candidate.tool.object_from_contact)
     return bool(np.allclose((world_from_tool @ contact)[:3, 3], point, rtol=0.0, atol=SAME_POINT))
+
+
+def check_ids(scene: SceneObjectArray) -> None:
+    """Refuse objects two of which have one id: what is asked for by it would be one of them, and the other would be in no plan; raises BAD_REQUEST."""
+    counts = Counter(item.id for item in scene.objects)
+    twice = sorted(name for name, count in counts.items() if count > 1)
+    if twice:
+        raise MagicError(Code.BAD_REQUEST, "ids of the objects, given twice", ", ".join(twice), "ids that differ")
 
 
 def same_frames(one: SceneObjectArray, other: SceneObjectArray) -> bool:

@@ -49,7 +49,7 @@ from magic_server.permission import RECORDED, Claim, Limits, Look, NotYet, Verdi
 from magic_server.publication import Publication
 from magic_server.remote import SEND_GOAL, RemoteAction, RemoteService, Token, servers_of
 from magic_server.scene_change import Changed
-from magic_server.stages import Stages, complaint_code, hull_of, mark_of, same_frames
+from magic_server.stages import Stages, check_ids, complaint_code, hull_of, mark_of, same_frames
 from magic_server.watch import Bounds
 
 #: Answers that another look at the same things may change: perception draws them anew every ten seconds, and
@@ -280,7 +280,8 @@ class StrategyServer(LifecycleNode):
         return scene.header.frame_id.lstrip("/")
 
     def in_base(self, scene: SceneObjectArray) -> SceneObjectArray:
-        """Objects told in the robot's base frame; raises NO_TRANSFORM, BAD_REQUEST where they name no frame."""
+        """Objects told in the robot's base frame; raises NO_TRANSFORM, BAD_REQUEST where they name no frame or two have one id."""
+        check_ids(scene)
         frame, base = self._frame_of(scene), self.robot.base_frame
         if frame == base:
             return scene
@@ -646,6 +647,7 @@ class StrategyServer(LifecycleNode):
             joints=tuple(arm.joint_names) if arm is not None else (),
             start=tuple(arm.points[0].positions) if arm is not None and arm.points else (),
             state_known=outcome.state_known,
+            said=tuple(stages.scene.notes),
             motion=Motion(plan, stages.strategy, outcome.tool_id, outcome.target_id, stages.scene.header.stamp),
             mark=mark_of(plan),
         )
@@ -668,8 +670,9 @@ class StrategyServer(LifecycleNode):
         sentence, metrics = pipeline.split_metrics(result.message)
         try:
             notes = self._when_allowed(lambda: self.publication.offer(claim), token)
-            # Who has told the server that all is recorded need not be told in each sentence.
-            sentence = "; ".join([sentence, *(n for n in notes if n != RECORDED or not self.settings.recorded)])
+            # Who has told the server that all is recorded need not be told in each sentence, and what perception says it says of each scene.
+            told = {*claim.said, *([RECORDED] if self.settings.recorded else [])}
+            sentence = "; ".join([sentence, *(n for n in notes if n not in told)])
             result.notes = [*result.notes, *notes]
         except Exception as error:
             if isinstance(error, Changed):
@@ -732,7 +735,7 @@ class StrategyServer(LifecycleNode):
         result.notes = [*notes, *loop.notes]
         result.executed = loop.executed
         sentence, metrics = pipeline.split_metrics(last.message)
-        sentence = "; ".join([sentence, *notes])
+        sentence = "; ".join([sentence, *(n for n in notes if n not in loop.jobs[0].claim.said)])
         if error is None:
             sentence += "; carried out by the arm" + (f", and seen to be met: {seen}" if seen else "")
         else:

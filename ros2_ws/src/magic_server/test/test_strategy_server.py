@@ -130,6 +130,32 @@ def test_what_stands_published_says_what_it_rests_on(bench):
     assert bench.messages["state"][-1].header.stamp != state.header.stamp
 
 
+def test_what_perception_says_of_a_scene_stands_beside_what_is_published_for_it(bench):
+    """A glass that gives no depth is no object: a motion that physics has passed may go through it."""
+    glass = "something that gives no depth stands at (0.50, 0.08) m: it is no object, and motions do not avoid it"
+    sees(bench, replace(fakes.scene(), notes=(glass,)))
+    result, _ = bench.run()
+    assert result.code == 0 and glass in result.notes and glass not in result.message
+    bench.wait(lambda: bench.messages["state"] and bench.messages["state"][-1].valid)
+    assert glass in bench.messages["state"][-1].notes
+    sees(bench, fakes.scene())
+    assert glass not in bench.run()[0].notes
+
+
+def test_objects_of_one_id_are_refused(bench):
+    """By the id of tool or target the other one of that id would be no obstacle to planner and verifier."""
+    scene = fakes.scene(("object_1", "object_2", "object_3"))
+    twin = replace(scene.objects[2], id="object_2")
+    sees(bench, scene)
+    assert bench.run()[0].code == 0
+    bench.wait(lambda: bench.valid["tool"])
+    sees(bench, replace(scene, objects=(*scene.objects[:2], twin)))
+    bench.until(lambda: not bench.server.publication.standing)
+    result, _ = bench.run()
+    assert (result.code, result.verified) == (Code.BAD_REQUEST, False) and "object_2" in result.message
+    sees(bench, fakes.scene())
+
+
 def elsewhere(scene, by):
     """The scene with its first object moved along x, m."""
     first = scene.objects[0]
