@@ -46,6 +46,8 @@ CONTACT_PHASES = ("contact", "goal", "release", "strike", "retreat")
 #: A tool that overlaps what it is let go on, by no more than is allowed, is pushed out of it so fast (m/s): the fall of a tenth of a
 #: millimetre.  The solver's own speed for bodies that were driven into each other would throw it up by a centimetre.
 PUSHED_OUT = 0.05
+#: A led tool comes no farther than this (m) from one look at what it is in to the next: past a rod that is thicker, together with it, it does not slip unseen.
+BETWEEN_LOOKS = 0.005
 
 
 @dataclass(frozen=True)
@@ -337,7 +339,8 @@ class FloatingRun:
         planned: float = np.inf,
     ) -> tuple[Intrusion, ...]:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
-        phase begins, sampled every ``interval`` seconds up to the release; ``check`` may raise to end it early.
+        phase begins, sampled every ``interval`` seconds up to the release, and every :data:`BETWEEN_LOOKS` of its way; ``check`` may raise to end it
+        early.
 
         ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it cannot
         be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.  ``planned``: what this found of the
@@ -353,8 +356,7 @@ class FloatingRun:
         if not others and planned <= harmless:
             return ()
         end = min((t for t in (self.release_time, self.strike_time) if t is not None), default=self.duration)
-        times = np.append(np.arange(0.0, end, interval), end)
-        poses = transforms.interpolate(motion.times, motion.world_from_tool, motion.times[0] + times)
+        times, poses = _looks(motion, setup.tool, end, interval)
         worst: dict[tuple[str, bool], Intrusion] = {}
 
         def note(name: str, depth: float, time: float) -> None:
@@ -381,6 +383,22 @@ class FloatingRun:
                 if name:
                     note(name, depth, float(time))
         return tuple(worst.values())
+
+
+def _looks(motion: ToolMotion, tool: Body, end: float, interval: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Moments (T,), s from the motion's beginning to ``end``, and the tool's poses then (T, 4, 4): ``interval`` seconds apart, nearer where the tool is fast."""
+
+    def posed(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        return transforms.interpolate(motion.times, motion.world_from_tool, motion.times[0] + times)
+
+    times = np.append(np.arange(0.0, end, interval), end)
+    poses = posed(times)
+    parts = np.ceil(_ways(poses, tool) / BETWEEN_LOOKS).astype(int)
+    if (parts <= 1).all():
+        return times, poses
+    between = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(times, times[1:], np.maximum(parts, 1), strict=False)]
+    times = np.concatenate([*between, times[-1:]])
+    return times, posed(times)
 
 
 def _apart(tool: Body, thought: Body, tool_from_held: NDArray[np.float64]) -> float:

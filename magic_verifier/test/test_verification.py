@@ -83,6 +83,22 @@ def test_an_obstacle_in_the_way_of_the_approach_is_a_collision():
     assert "box" in verdict.message
 
 
+@pytest.mark.parametrize("number", range(6))
+def test_a_fast_tool_does_not_slip_past_a_thin_rod_between_two_looks(number):
+    """The L's shaft, 20 mm thick, comes along by 32 mm in 20 ms; the rod of 4 mm stands where a look may fall behind it."""
+    strategy, tool, target, _ = scenes.hooking("L", noise=0.0)
+
+    def at(x, y=0.0, z=0.0):
+        return transforms.make(translation=[0.625 + x, y, z])
+
+    poses = [(at(0.03, 0.5, 0.15), "", 0), (at(0.03, 0.0, 0.15), "approach", 0.5 / 1.6), (at(0.03), "approach", 0.7), (at(0.0), "contact", 0.3)]
+    motion = scenes.plan([*poses, (at(-0.28), "goal", 2.8)])
+    beside = 0.3 + 0.0054 * number
+    rod = scenes.item("rod", [scenes.block((0.45, 0.454), (beside, beside + 0.004), (0.0, 0.3))])
+    verdict = verify_proposal(Proposal(strategy, tool, target, (rod,), scenes.TABLE, motion), repetitions=1)
+    assert verdict.code == Code.PRE_CONTACT_COLLISION and "the tool is in the rod" in verdict.message
+
+
 def test_pushing_the_target_away_before_the_contact_is_a_collision():
     strategy, tool, target, motion = scenes.hooking("L")
     shifted = replace(target, world_from_object=transforms.make(translation=[0.65, 0, 0.025]))
