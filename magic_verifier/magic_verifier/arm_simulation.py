@@ -412,7 +412,7 @@ class ArmRun:
         world, limits = self.world, self.limits
         for part in (ARM, FINGERS):
             for other in world.touched_by(part):
-                if other not in self._obstacles and not (other == TABLE and part == ARM):
+                if other != TABLE and other not in self._obstacles:
                     continue
                 # The solver lets a link go next to no way into what stands fast, however hard it presses; what is loose gives way.
                 force = 0.0 if other in self._loose else world.force(part, other)

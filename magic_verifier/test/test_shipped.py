@@ -102,6 +102,15 @@ def test_a_hand_that_presses_on_a_fixture_has_hit_it(planner, phase, code):
     assert verdict.metrics["torque_ratio"] < 0.9, "before it asks for all that the arm can give"
 
 
+def test_fingertips_that_press_on_a_table_higher_than_planned_for_have_hit_it(planner):
+    strategy, tool, target, obstacles, candidate = demonstration("hanging")
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
+    higher = scenes.TABLE - [0.0, 0.0, 0.0, 0.006]
+    verdict = verify_proposal(Proposal(strategy, tool, target, obstacles, higher, plan), repetitions=1)
+    assert verdict.code == Code.PRE_CONTACT_COLLISION and "the hand hit the table" in verdict.message, verdict.message
+
+
 def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
