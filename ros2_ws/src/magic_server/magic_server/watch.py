@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magic_core.errors import Code, MagicError
 from magic_server import scene_change
 from magic_server.permission import AHEAD, Look
-from magic_server.scene_change import Changed, gap
+from magic_server.scene_change import Changed, beyond
 
 #: What is in none of so many looks that follow each other is gone: a single picture may miss a thing.
 GONE = 2
@@ -28,8 +28,8 @@ class SceneWatch:
     """Looks at target and obstacles while the arm moves.
 
     planned: the objects that the motion was planned for.  meant: ids of what is moved on purpose.  target: its id, and ``contact``:
-    from how many seconds after the move's beginning on the tool may move it (infinite: not in this move).  tolerance: m that a thing
-    may have moved; age: s that the newest look may be old.  What has come is not looked at here: a hand that reaches in is seen where
+    from how many seconds after the move's beginning on the tool may move it (infinite: not in this move).  tolerance: m that points of a
+    thing may have moved (:func:`magic_server.scene_change.beyond`); age: s that the newest look may be old.  What has come is not looked at here: a hand that reaches in is seen where
     it moves something, and before each move of the arm.
     """
 
@@ -73,13 +73,11 @@ class SceneWatch:
                     raise Changed(Code.SCENE_CHANGED, f"{name} has gone while the arm moved", allowed="what the motion was planned for")
                 continue
             self._missing[name] = 0
-            moved = gap(before, look.objects[name], name in partly)
-            if not moved <= self._tolerance:
+            moved = beyond(before, look.objects[name], name in partly, self._tolerance)
+            if moved is not None:
+                found, allowed = moved
                 raise Changed(
-                    Code.SCENE_CHANGED,
-                    f"{name} has moved while the arm moved, in mm",
-                    round(1000 * moved, 1),
-                    f"at most {1000 * self._tolerance:g}",
+                    Code.SCENE_CHANGED, f"{name} has moved while the arm moved, in mm", round(1000 * found, 1), f"at most {1000 * allowed:g}"
                 )
 
 

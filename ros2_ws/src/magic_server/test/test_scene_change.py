@@ -65,3 +65,18 @@ def test_what_is_nowhere_has_moved_though_it_is_seen_in_part():
     nowhere = {**there, "object_1": np.full(len(scene_change.DIRECTIONS), np.nan)}
     with pytest.raises(scene_change.Changed, match="nan"):
         scene_change.check(there, nowhere, 1.0, partly={"object_1"})
+
+
+def test_a_thing_that_was_shifted_is_told_from_one_whose_outline_comes_out_otherwise():
+    rng = np.random.default_rng(3)
+    mesh = shapes.make("l_hook", 1).mesh
+    pose = transforms.make(translation=[0.4, 0.1, 0.0])
+    before = scene_change.hulls([placed(pose, mesh)])["object_1"]
+    for direction in (0.0, 1.0, 2.5):
+        by = 0.012 * np.array([np.cos(direction), np.sin(direction), 0.0])
+        after = scene_change.hulls([placed(transforms.make(translation=by) @ pose, mesh)])["object_1"]
+        assert scene_change.shift(before, after) == pytest.approx(0.012, rel=1e-6)
+        assert scene_change.beyond(before, after, False, 0.02) == pytest.approx((0.012, 0.01))
+        assert scene_change.beyond(before, after, True, 0.02) is None  # of what is hidden in part nobody knows
+    otherwise = before + rng.uniform(-0.015, 0.015, len(before))
+    assert scene_change.distance(before, otherwise) > 0.013 and scene_change.beyond(before, otherwise, False, 0.02) is None

@@ -38,7 +38,7 @@ def take(watching, places, after=1.0, partly=(), hand=FAR):
 def test_what_stays_or_is_moved_on_purpose_stops_nothing():
     watching = watch(contact=4.0)
     take(watching, TABLE)
-    take(watching, {**TABLE, "tool": 0.4, "target": 0.22, "hand": 0.1}, 2.0)
+    take(watching, {**TABLE, "tool": 0.4, "target": 0.21, "hand": 0.1}, 2.0)
     take(watching, {"target": 0.2, "cup": 0.5}, 3.0)
     take(watching, {"target": 0.9, "cup": 0.5}, 5.0)  # the tool has met it by then
     take(watching, {"cup": 0.5}, 6.0)
