@@ -38,7 +38,8 @@ def mark_of(goal: VerifyMotion.Goal, proposal: Proposal) -> bytes:
     # What obstacles look like is in the film alone.
     simulated = tuple(replace(obstacle, mesh=NO_MESH) for obstacle in proposal.obstacles)
     plan = proposal.plan, goal.repetitions, goal.seed, goal.tried, goal.tool_mass, goal.target_mass
-    return digest((goal.strategy, goal.candidate.turn, proposal.tool, proposal.target, simulated, proposal.table, *plan))
+    # The strategy as it was read: its files may have changed since.
+    return digest((proposal.strategy, proposal.tool, proposal.target, simulated, proposal.table, *plan))
 
 
 class VerifierNode(Node):

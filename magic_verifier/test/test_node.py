@@ -14,10 +14,11 @@ import scenes
 
 pytest.importorskip("rclpy")
 
-from verifier_graph import goal_message, slow_plan, verifier
+from verifier_graph import goal_message, save, slow_plan, verifier
 
 from magic_core import conversions as convert
 from magic_core.errors import Code
+from magic_core.strategy import Goal
 from magic_core.testing.served import ask, wait
 from magic_interfaces.msg import SceneObject as SceneObjectMsg
 from magic_verifier import node as verifier_node
@@ -95,6 +96,16 @@ def test_the_film_of_the_last_goal_needs_no_second_simulation(graph):
     assert (again.code, again.message, again.metric_values) == (first.code, first.message, first.metric_values)
     ask(graph, goal_message(seed=6, repetitions=2, want_film=True))
     assert len(SIMULATED) == before + 1
+
+
+def test_a_strategy_whose_files_have_changed_is_judged_anew(graph, tmp_path):
+    """Though it has the same name: a film is drawn of the last verdict only where that was by the same goal."""
+    folder = tmp_path / "pulling"
+    save(tmp_path, "pulling", Goal("hook", {"noise": 0.0}))
+    first = ask(graph, goal_message(str(folder), seed=8, repetitions=1))
+    assert first.code == Code.OK, first.message
+    save(tmp_path, "pulling", Goal("hook", {"noise": 0.0, "distance": 2.0}))
+    assert ask(graph, goal_message(str(folder), seed=8, repetitions=1, want_film=True)).code == Code.GOAL_NOT_REACHED
 
 
 def test_what_obstacles_look_like_is_in_the_film_alone(graph):

@@ -91,7 +91,12 @@ def test_a_fast_tool_does_not_slip_past_a_thin_rod_between_two_looks(number):
     def at(x, y=0.0, z=0.0):
         return transforms.make(translation=[0.625 + x, y, z])
 
-    poses = [(at(0.03, 0.5, 0.15), "", 0), (at(0.03, 0.0, 0.15), "approach", 0.5 / 1.6), (at(0.03), "approach", 0.7), (at(0.0), "contact", 0.3)]
+    poses = [
+        (at(0.03, 0.5, 0.15), "", 0),
+        (at(0.03, 0.0, 0.15), "approach", 0.5 / 1.6),
+        (at(0.03), "approach", 0.7),
+        (at(0.0), "contact", 0.3),
+    ]
     motion = scenes.plan([*poses, (at(-0.28), "goal", 2.8)])
     beside = 0.3 + 0.0054 * number
     rod = scenes.item("rod", [scenes.block((0.45, 0.454), (beside, beside + 0.004), (0.0, 0.3))])

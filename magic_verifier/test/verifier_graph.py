@@ -16,7 +16,8 @@ from magic_core.scene import CanonicalView
 from magic_core.testing.served import served
 
 
-def _save(folder, name, goal):
+def save(folder, name, goal):
+    """Write the strategy of a pull with a goal."""
     strategy, *_ = scenes.hooking("L")
     tetrahedron = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     view = CanonicalView(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), 0.01, np.eye(4))
@@ -35,9 +36,9 @@ def verifier(folder, **parameters) -> Iterator:
     from magic_interfaces.action import VerifyMotion
     from magic_verifier.node import VerifierNode
 
-    _save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
-    _save(folder, "pulling", strategies.Goal("hook", {"noise": 0.0}))
-    _save(folder, "juggling", strategies.Goal("juggle"))
+    save(folder, "hooking", strategies.Goal("hook", {"noise": 1.0}))
+    save(folder, "pulling", strategies.Goal("hook", {"noise": 0.0}))
+    save(folder, "juggling", strategies.Goal("juggle"))
     with served(VerifierNode, VerifyMotion, "verify_motion", {"strategies": str(folder), **parameters}) as client:
         yield client
 

@@ -131,7 +131,13 @@ def read(node: Node, preset: str = "") -> Settings:
         ),
         gripper_action=declared("gripper_action", driver.gripper_action, "action of the gripper (control_msgs/GripperCommand)"),
         objects_age=seconds("objects_age", 5.0, "s that the objects may be old where a trajectory is published or the arm begins to move"),
-        object_tolerance=declared("object_tolerance", 0.02, "m that a point of an object may have moved since it was planned for, all of it half as much", 0.0, 0.5),
+        object_tolerance=declared(
+            "object_tolerance",
+            0.02,
+            "m that a point of an object may have moved since it was planned for, all of it half as much",
+            0.0,
+            0.5,
+        ),
         required_rate=declared(
             "required_rate", 0.7, "least lower end of the success rate's 95 % interval; the verifier requires its own besides", 0.0, 0.99
         ),
@@ -192,7 +198,9 @@ def read_loop(node: Node, preset: str = "") -> LoopSettings:
         tool_turn=of("tool_turn", "tool_turn", "rad that the tool may be off in the hand without a new plan", 0.0, 3.2),
         slip_shift=of("slip_shift", "slip_shift", "m beyond which a tool that is off in the hand is given up", 0.0, 0.5),
         slip_turn=of("slip_turn", "slip_turn", "rad beyond which a tool that is off in the hand is given up", 0.0, 3.2),
-        watch_tolerance=of("watch_tolerance", "watch_tolerance", "m that a point of a thing may move while the arm moves, all of it half as much", 0.0, 0.5),
+        watch_tolerance=of(
+            "watch_tolerance", "watch_tolerance", "m that a point of a thing may move while the arm moves, all of it half as much", 0.0, 0.5
+        ),
         accuracy=of("accuracy", "accuracy", "m to which the middle of a thing is known that is seen before and after the task", 0.0, 0.1),
         torque_error=parameter(
             node,

@@ -77,7 +77,10 @@ class SceneWatch:
             if moved is not None:
                 found, allowed = moved
                 raise Changed(
-                    Code.SCENE_CHANGED, f"{name} has moved while the arm moved, in mm", round(1000 * found, 1), f"at most {1000 * allowed:g}"
+                    Code.SCENE_CHANGED,
+                    f"{name} has moved while the arm moved, in mm",
+                    round(1000 * found, 1),
+                    f"at most {1000 * allowed:g}",
                 )
 
 

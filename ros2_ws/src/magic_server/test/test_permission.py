@@ -74,7 +74,11 @@ def test_what_all_speaks_for_is_permitted(purpose):
         (seen(stamp=math.nan), Code.STALE_DATA, "nan"),
         (seen(frame="world"), Code.BAD_REQUEST, "'world' (allowed: panda_link0"),
         ({"scene": look({"tool": 0.4, "target": 0.2})}, Code.STALE_DATA, "tool has moved since the plan, in mm: 39"),
-        ({"scene": look({"tool": 0.011, "target": 0.2})}, Code.STALE_DATA, "tool has moved since the plan, in mm: 11.0 (allowed: at most 10"),
+        (
+            {"scene": look({"tool": 0.011, "target": 0.2})},
+            Code.STALE_DATA,
+            "tool has moved since the plan, in mm: 11.0 (allowed: at most 10",
+        ),
         ({"scene": look({"tool": 0.0})}, Code.STALE_DATA, "gone since the plan: 'target'"),
         ({"scene": look({})}, Code.STALE_DATA, "gone since the plan: 'target, tool'"),
         ({"scene": look({**TABLE, "cup": 0.5})}, Code.STALE_DATA, "come since the plan: 'cup'"),
