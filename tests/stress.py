@@ -296,7 +296,7 @@ def requests(part: Part, logs: Path) -> None:
     with started(logs, parameters=parameters, leave_out=("perception",)) as bench:
         node = bench.watcher.node
         scene = conversions.scene_to_msg(small_scene())
-        publisher = fakes.FakeServers("objects", services=())
+        publisher = fakes.FakeServers("objects", services=("objects",))
         publisher._objects.publish(scene)
         bench.ready(tuple(n for n in NODES if n != "perception"))
         match = node.create_client(MatchContact, "match_contact")

@@ -105,10 +105,10 @@ def test_bad_frames(tmp_path, messages, empty_table, change, code, says):
 
 
 class stand_ins:
-    """Matcher, planner and verifier that need nothing, so that each case only starts what it tests."""
+    """Matcher, planner and verifier that need nothing, so that each case only starts what it tests; perception is the true one."""
 
     def __enter__(self):
-        self.node = fakes.FakeServers()
+        self.node = fakes.FakeServers(services=("match", "plan", "verify"))
         self.executor = ThreadedExecutor(4)
         self.executor.add_node(self.node)
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)

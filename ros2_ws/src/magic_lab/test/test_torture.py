@@ -52,7 +52,7 @@ class Rig:
         # All nodes share one interpreter: what is told may come a second late, on a busy machine more.
         settings = {"objects_age": 1.5, "state_age": 2.0, "objects_timeout": 1.0, "server_timeout": 5.0, "effort": 40.0, **fakes.OPEN_LOOP}
         self.server = self.made(StrategyServer, strategies=folder, execute=True, autostart=True, use_sim_time=True, **settings)
-        self.fakes = fakes.FakeServers(context=self.context)
+        self.fakes = fakes.FakeServers(services=("match", "plan", "verify"), context=self.context)
         self.fakes.on_match = self.match
         self.fakes.on_plan = lambda goal, _canceled: PlanMotion.Result(plan=conversions.plan_to_msg(plan(), goal.tool.id))
         self.node = Node("client", context=self.context)

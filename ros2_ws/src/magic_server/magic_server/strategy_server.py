@@ -337,8 +337,9 @@ class StrategyServer(LifecycleNode):
         return self.robot.forward(np.array([positions[name] for name in names]))[0]
 
     def servers(self) -> dict[str, frozenset[bytes]]:
-        """Those who serve what a run needs, by what they do."""
+        """Those who serve what a run needs, by what they do; of perception those who publish objects."""
         found = {r.server: r.servers() for r in (self.matcher, self.planner, self.verifier)}
+        found[PERCEPTION] = presence.publishers(self, self.objects_topic)
         return {**found, "strategy server": servers_of(self, self._server_name + SEND_GOAL)}
 
     def world(self) -> World:

@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 #: What a process of each role serves.
-SERVICES = {"matcher": ("match",), "planner": ("plan",), "verifier": ("verify",), "perception": ()}
+SERVICES = {"matcher": ("match",), "planner": ("plan",), "verifier": ("verify",), "perception": ("objects",)}
 #: A run with this seed, or match with this top_k, is not answered by the process of the role that it is for.
 HELD = 77
 

@@ -410,7 +410,7 @@ def test_small_moves_stop_nothing_and_what_does_not_come_to_rest_ends_it(bench):
     bench.until(lambda: bench.server.joints.all()[fakes.JOINTS[0]].position == 0.0)  # it has heard that the arm is back
 
     def move(trajectory, canceled):
-        bench.table.target += 0.008
+        bench.table.target += 0.004
         return 0, ""
 
     bench.arm.on_move = move

@@ -67,8 +67,6 @@ class Bench:
         self.fakes.on_match = lambda request: self.at("match", self.fakes.match(request))
         self.fakes.on_plan = lambda goal, canceled: self.at("plan", self.fakes.plan(goal, canceled))
         self.fakes.on_verify = lambda goal, canceled: self.at("verify", self.fakes.verify(goal, canceled))
-        if role == "perception":  # nobody else publishes objects
-            self.fakes.destroy_publisher(self.fakes._objects)
         self.arm = fakes.FakeArm(context=self.context)
         self.arm.on_move = lambda trajectory, canceled: self.at("execute", (0, ""))
         self.node = Node("client", context=self.context)

@@ -23,7 +23,7 @@ from magic_bringup.graph import Process, executable
 from magic_core import conversions, naming, qos, transforms
 from magic_core.errors import Code, MagicError
 from magic_interfaces.action import PlanMotion, VerifyMotion
-from magic_interfaces.msg import SceneObject
+from magic_interfaces.msg import SceneObject, SceneObjectArray
 from magic_interfaces.srv import MatchContact
 from magic_server import pipeline, remote
 from magic_server.ahead import Ahead
@@ -142,6 +142,20 @@ def test_what_perception_says_of_a_scene_stands_beside_what_is_published_for_it(
     assert glass not in bench.run()[0].notes
 
 
+def test_of_two_who_publish_objects_nobody_knows_whose_scene_it_is(bench):
+    """What one of them sees in the way, the other's scene does not have, and the newest of both is looked at."""
+    sees(bench, fakes.scene())
+    other = bench.fakes.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
+    try:
+        bench.until(lambda: len(bench.server.servers()["perception"]) == 2)
+        result, _ = bench.run()
+        assert (result.code, result.verified) == (Code.NOT_ALONE, False) and "servers of perception: 2" in result.message
+    finally:
+        bench.fakes.destroy_publisher(other)
+    bench.until(lambda: len(bench.server.servers()["perception"]) == 1)
+    assert bench.run()[0].code == 0
+
+
 def test_objects_of_one_id_are_refused(bench):
     """By the id of tool or target the other one of that id would be no obstacle to planner and verifier."""
     scene = fakes.scene(("object_1", "object_2", "object_3"))
@@ -253,7 +267,7 @@ def test_what_stands_published_is_taken_back_when_the_scene_is_another_one(bench
     try:
         bench.run()
         bench.wait(lambda: bench.valid["tool"])
-        sees(bench, elsewhere(fakes.scene(), 0.01))
+        sees(bench, elsewhere(fakes.scene(), 0.009))
         assert bench.server.publication.standing is not None
         sees(bench, elsewhere(fakes.scene(), 0.05))
         bench.wait(lambda: not bench.valid["tool"] and not bench.messages["state"][-1].valid)

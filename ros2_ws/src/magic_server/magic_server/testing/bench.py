@@ -52,7 +52,7 @@ class Bench:
             self.server = StrategyServer()
         finally:
             Node.__init__ = original  # type: ignore[method-assign]
-        self.fakes = fakes.FakeServers(services=services, context=context)
+        self.fakes = fakes.FakeServers(services=(*services, "objects"), context=context)
         self.node = Node("client", context=context)
         self.client = ActionClient(self.node, RunStrategy, "run_strategy")
         self.feedback = []

@@ -29,6 +29,8 @@ from magic_interfaces.action import PlanMotion, VerifyMotion
 from magic_interfaces.msg import SceneObjectArray
 from magic_interfaces.srv import MatchContact
 
+#: What :class:`FakeServers` stands in for.
+SERVICES = ("match", "plan", "verify", "objects")
 #: Parameters of a strategy server that leave its loop open: what these stand-ins do not show is not looked for.
 OPEN_LOOP = {"loop.look": False, "loop.watch": False, "loop.judge": False, "loop.executions": 1}
 
@@ -125,14 +127,14 @@ def plan(variant: str = "fg", release: bool = False, lift: bool = False, start: 
 
 
 class FakeServers(Node):
-    """``match_contact``, ``plan_motion`` and ``verify_motion`` in one node, and a publisher of ``objects``.
+    """``match_contact``, ``plan_motion`` and ``verify_motion`` in one node, and a publisher of ``objects``; ``services``: which of them.
 
     ``on_match(request)``, ``on_plan(goal, canceled)`` and ``on_verify(goal, canceled)``
     may be replaced; each returns a response or result.  ``canceled`` is a function.
     ``goals`` lists the goals as (name, goal); ``canceled_goals`` the names of those canceled.
     """
 
-    def __init__(self, name: str = "fakes", services: tuple[str, ...] = ("match", "plan", "verify"), **kwargs: Any) -> None:
+    def __init__(self, name: str = "fakes", services: tuple[str, ...] = SERVICES, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.goals: list[tuple[str, Any]] = []
         self.canceled_goals: list[str] = []
@@ -141,7 +143,8 @@ class FakeServers(Node):
         self.on_plan: Callable[[Any, Callable[[], bool]], Any] = self.plan
         self.on_verify: Callable[[Any, Callable[[], bool]], Any] = self.verify
         group = ReentrantCallbackGroup()
-        self._objects = self.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
+        if "objects" in services:
+            self._objects = self.create_publisher(SceneObjectArray, "objects", qos.LATCHED)
         self._eyes: Callable[[], Scene | None] = lambda: None
         self.create_timer(0.2, self._see, callback_group=group)
         self._servers: list[Any] = []
