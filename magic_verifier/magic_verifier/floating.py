@@ -378,9 +378,9 @@ class FloatingRun:
                     check(0.0)
                 if at < known:
                     continue
-                name, depth = probe.deepest(pose)
-                known = at + harmless - depth
-                if name:
+                depths = probe.depths(pose)
+                known = at + harmless - max(depths.values(), default=0.0)
+                for name, depth in depths.items():  # one may bear what another does not
                     note(name, depth, float(time))
         return tuple(worst.values())
 

@@ -434,7 +434,7 @@ class _Others:
         self._resting = [name for name in self._resting if name not in self._stood]
         for name, (place, pusher) in self._stood.items():
             moved = place.left_by(world.pose(name), world.centre_of_mass(name))
-            if moved > self._limits.shove:
+            if not moved <= self._limits.shove:
                 raise MagicError(
                     Code.OBSTACLE_PUSHED,
                     f"{name} is pushed by the {pusher} at {self._run.time:.2f} s ({self._run.phase})",

@@ -625,15 +625,11 @@ class Probe:
         for name, (other_hulls, pose) in others.items():
             self._world.add(name, other_hulls, pose, STATIC, 1000.0, 0.0)
 
-    def deepest(self, pose: Any) -> tuple[str, float]:
-        """The body that a pose (sapien.Pose) is deepest in, and how deep in metres; ``("", 0.0)`` for none."""
+    def depths(self, pose: Any) -> dict[str, float]:
+        """The bodies that a pose (sapien.Pose) is in, and how deep in metres."""
         component = self._world.component("probe")
         component.entity_pose = pose
         component.linear_velocity = np.zeros(3, np.float32)
         component.angular_velocity = np.zeros(3, np.float32)
         self._world.step()
-        name, depth = "", 0.0
-        for other in self._others:
-            if (found := self._world.depth("probe", other)) > depth:
-                name, depth = other, found
-        return name, depth
+        return {other: depth for other in self._others if (depth := self._world.depth("probe", other)) > 0}

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scenes
 
 from magic_core import transforms
-from magic_core.errors import Code
+from magic_core.errors import Code, MagicError
+from magic_verifier import rollout
 from magic_verifier.displacement import Place
 from magic_verifier.verification import Proposal, verify_proposal
 
@@ -83,6 +85,30 @@ def test_what_the_led_tool_goes_through_is_named():
     verdict = pulled(beside(aside, x=0.4))
     assert verdict.code == Code.OBSTACLE_PUSHED and "the tool goes through block" in verdict.message
     assert pulled(beside(aside, source="known", x=0.4)).success
+
+
+def test_what_the_tool_goes_through_is_named_though_it_is_deeper_in_something_else():
+    """Its shaft slides along a wall, 9 mm deep, which it may, while its end goes 8 mm deep through a loose block."""
+    side = -RADIUS - 0.022
+    wall = scenes.item("wall", [scenes.block((0.0, 0.25), (side - 0.05, side + 0.009), (0.0, 0.05))])
+    assert pulled(wall).success
+    verdict = pulled(wall, beside(2.2 * RADIUS - 0.008 - RADIUS, x=0.4))
+    assert verdict.code == Code.OBSTACLE_PUSHED and "the tool goes through block" in verdict.message
+
+
+def test_a_loose_thing_that_is_nowhere_has_not_stayed():
+    """By an engine that has lost it; a comparison with what is no number is never true."""
+    places = [np.eye(4), np.full((4, 4), np.nan)]
+    world = SimpleNamespace(
+        touched_by=lambda name: ("tool",),
+        let_go=lambda name: None,
+        pose=lambda name: places.pop(0),
+        centre_of_mass=lambda name: np.zeros(3),
+    )
+    block = SimpleNamespace(id="block", loose=True, outermost=scenes.block((-0.1, 0.1), (-0.1, 0.1), (0.0, 0.1)).vertices)
+    run = SimpleNamespace(world=world, setup=SimpleNamespace(obstacles=(block,), table=scenes.TABLE), time=1.0, phase="goal")
+    with pytest.raises(MagicError, match="OBSTACLE_PUSHED"):
+        rollout._Others(run, rollout.Limits()).check()
 
 
 def test_a_fixture_stands_fast():

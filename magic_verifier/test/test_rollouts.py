@@ -441,8 +441,8 @@ def test_a_path_is_looked_at_where_the_tool_may_be_deeper_than_is_harmless(lower
     poses = plan.tool_motion.world_from_tool @ transforms.make(translation=[0.0, 0.0, -lower])
     plan = replace(plan, tool_motion=replace(plan.tool_motion, world_from_tool=poses))
     run = FloatingRun(make_setup(tool, target, (pipe,), scenes.TABLE, strategy.physics, DEFAULTS["fg"]), plan)
-    looked, deepest = [], Probe.deepest
-    monkeypatch.setattr(Probe, "deepest", lambda probe, pose: looked.append(deepest(probe, pose)) or looked[-1])
+    looked, depths = [], Probe.depths
+    monkeypatch.setattr(Probe, "depths", lambda probe, pose: looked.append(depths(probe, pose)) or looked[-1])
     everything, all_looks = run.intrusions(), len(looked)
     looked.clear()
     some = run.intrusions(harmless=0.01)
@@ -458,8 +458,8 @@ def test_no_obstacle_is_looked_at_where_what_the_tool_is_off_by_is_too_little(of
     planned = max((i.depth for i in FloatingRun(setup, plan).intrusions()), default=0.0)
     low = FloatingRun(setup, plan, 0.0, transforms.make(translation=[0.0, 0.0, -off]), setup.tool)
     assert max((i.depth for i in low.intrusions()), default=0.0) <= planned + off
-    looked, deepest = [], Probe.deepest
-    monkeypatch.setattr(Probe, "deepest", lambda probe, pose: looked.append(deepest(probe, pose)) or looked[-1])
+    looked, depths = [], Probe.depths
+    monkeypatch.setattr(Probe, "depths", lambda probe, pose: looked.append(depths(probe, pose)) or looked[-1])
     low.intrusions(harmless=0.01, planned=planned)
     assert bool(looked) == looks
     looked.clear()

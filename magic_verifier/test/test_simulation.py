@@ -92,10 +92,8 @@ def test_reduction_keeps_the_volume():
 @pytest.mark.parametrize("depth", [0.001, 0.005])
 def test_the_probe_measures_how_deep_a_body_is_in_a_static_one(depth):
     probe = Probe(Settings(), CUBE, {"wall": (CUBE, np.eye(4))})
-    name, found = probe.deepest(to_pose(transforms.make(translation=[0.04 - depth, 0, 0])))
-    assert name == "wall"
-    assert found == pytest.approx(depth, abs=1e-4)
-    assert probe.deepest(to_pose(transforms.make(translation=[0.041, 0, 0]))) == ("", 0.0)
+    assert probe.depths(to_pose(transforms.make(translation=[0.04 - depth, 0, 0]))) == {"wall": pytest.approx(depth, abs=1e-4)}
+    assert probe.depths(to_pose(transforms.make(translation=[0.041, 0, 0]))) == {}
 
 
 def test_the_same_calls_give_the_same_poses():
