@@ -24,6 +24,7 @@ from magic_verifier import goals, uncertainty
 from magic_verifier.displacement import Place
 from magic_verifier.floating import TABLE, TARGET, TOOL, Body, FloatingRun, Setup, phase_start
 from magic_verifier.goals import Judgement, Watch
+from magic_verifier.predicates import ARM, FINGERS
 from magic_verifier.simulation import DYNAMIC, STATIC
 from magic_verifier.uncertainty import Draw, Eyes, Uncertainty
 
@@ -387,14 +388,16 @@ def _refuse_intrusions(
 
 
 def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
-    """Raise where, before the contact phase, the tool has pushed a free target away or presses on something fixed.
+    """Raise where, before the contact phase, the tool has pushed a free target away or presses on something fixed, or the hand has pushed that target.
 
     A touch that moves nothing is allowed: the target is then still where the contact was planned.
     """
     for name in watched:
-        if not run.world.touching(TOOL, name, 0.0):
+        free = name == TARGET and run.setup.target_kind == DYNAMIC
+        by = next((part for part in ((TOOL, FINGERS, ARM) if free else (TOOL,)) if run.world.touching(part, name, 0.0)), None)
+        if by is None:
             continue
-        if name == TARGET and run.setup.target_kind == DYNAMIC:
+        if free:
             moved = float(np.linalg.norm((run.world.position(TARGET) - run.setup.target.world_from_object[:3, 3])[:2]))
             if moved < limits.nudge:
                 continue
@@ -407,7 +410,7 @@ def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
             value, allowed = f"{force:.1f} N", f"less than {limits.early_force:g} N"
         raise MagicError(
             Code.PRE_CONTACT_COLLISION,
-            f"the tool hit the {name} at {run.time:.2f} s, before the contact phase at {run.contact_time:.2f} s",
+            f"the {'hand' if by == FINGERS else by} hit the {name} at {run.time:.2f} s, before the contact phase at {run.contact_time:.2f} s",
             value,
             allowed,
         )

@@ -111,6 +111,24 @@ def test_fingertips_that_press_on_a_table_higher_than_planned_for_have_hit_it(pl
     assert verdict.code == Code.PRE_CONTACT_COLLISION and "the hand hit the table" in verdict.message, verdict.message
 
 
+def test_a_hand_that_pushes_the_target_before_the_contact_has_hit_it(planner):
+    """It stands beside where the tool is grasped, and weighs too little to be pressed on."""
+    strategy, tool, target, obstacles, candidate = demonstration("hooking")
+    motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
+    plan = planner.solve(Problem(strategy, tool, target, candidate, "keep", motion, scenes.TABLE, obstacles), budget=Budget(30.0))
+    arm, robot = plan.arm_motion, planner.robot.description
+    at = int(np.searchsorted(arm.times, arm.grasp_time))
+    tcp = robot.forward(np.asarray(arm.positions)[at : at + 1])[0]
+    beside = tcp[:2, 3] + 0.08 * tcp[:2, 1] / np.linalg.norm(tcp[:2, 1])
+    stands = transforms.make(translation=[*beside, target.world_from_object[2, 3]])
+    verdict = verify_proposal(
+        Proposal(strategy, tool, replace(target, world_from_object=stands), obstacles, scenes.TABLE, plan), repetitions=1
+    )
+    assert verdict.code == Code.PRE_CONTACT_COLLISION and "hit the target" in verdict.message and "moved" in verdict.message, (
+        verdict.message
+    )
+
+
 def test_what_is_pulled_does_not_overload_the_grip_on_a_light_tool(planner):
     strategy, tool, target, obstacles, candidate = demonstration("hooking")
     motion = plan_tool_motion(strategy, tool, target, candidate, "keep", scenes.TABLE, obstacles)
