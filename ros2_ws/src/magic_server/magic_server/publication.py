@@ -19,6 +19,9 @@ class Outlet(Protocol):
     def withdraw(self, reason: str) -> None:
         """Say that nothing published is valid."""
 
+    def beat(self) -> None:
+        """Say again what stands."""
+
 
 class Publication:
     """At most one motion stands published, and only while the rule allows it: :func:`magic_server.permission.permit`.
@@ -62,6 +65,11 @@ class Publication:
                 self.take_back(error.message)
             except Exception as error:  # what cannot be judged does not stand
                 self.take_back(f"{type(error).__name__}: {error}")
+
+    def beat(self) -> None:
+        """Say again what stands: not while it is being taken back, after which nobody is to hear that it still does."""
+        with self._lock:
+            self._outlet.beat()
 
     def take_back(self, reason: str, run: str | None = None) -> None:
         """Take back what stands; ``run``: only if it is that run's."""

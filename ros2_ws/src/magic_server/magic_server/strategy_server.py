@@ -379,7 +379,7 @@ class StrategyServer(LifecycleNode):
         level = DiagnosticStatus.WARN if waiting else DiagnosticStatus.OK
         message = "waiting for " + ", ".join(waiting) if waiting else "ready"
         self.publication.look()
-        self._outlet.beat()
+        self.publication.beat()
         values = {
             "running": str(self._token is not None).lower(),
             "lifecycle": self._lifecycle(),

@@ -2,6 +2,7 @@
 
 import math
 import random
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -251,6 +252,32 @@ class Shelf:
     def withdraw(self, reason):
         assert reason
         self.standing = None
+
+
+def test_nobody_hears_that_a_motion_stands_after_it_was_taken_back():
+    """It is said again by another thread than the one that takes it back, and takes a moment to be sent."""
+    heard, sending, sent = [], threading.Event(), threading.Event()
+
+    class Slow(Shelf):
+        def withdraw(self, reason):
+            super().withdraw(reason)
+            heard.append(False)
+
+        def beat(self):
+            stands = self.standing is not None
+            sending.set()
+            sent.wait(0.3)
+            heard.append(stands)
+
+    publication = Publication(Slow(), lambda: WORLD, LIMITS)
+    publication.offer(CLAIM)
+    thread = threading.Thread(target=publication.beat)
+    thread.start()
+    assert sending.wait(5.0)
+    publication.take_back("the scene has changed")
+    sent.set()
+    thread.join(5.0)
+    assert heard[-2:] == [True, False]
 
 
 #: What cameras call the tool in the hand, and where the hand has it, m.
