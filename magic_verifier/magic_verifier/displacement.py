@@ -29,6 +29,5 @@ class Place:
         reaches out of its old outline, whichever is more."""
         seen = transforms.apply(pose, self._corners) @ self._across.T
         beyond = seen @ self._outline[:, :2].T + self._outline[:, 2]
-        return float(
-            np.maximum(np.linalg.norm(self._across @ middle - self._middle), beyond.max())
-        )  # not a number where one of them is none
+        # Not a number where one of them is none.
+        return float(np.maximum(np.linalg.norm(self._across @ middle - self._middle), beyond.max()))

@@ -46,7 +46,8 @@ CONTACT_PHASES = ("contact", "goal", "release", "strike", "retreat")
 #: A tool that overlaps what it is let go on, by no more than is allowed, is pushed out of it so fast (m/s): the fall of a tenth of a
 #: millimetre.  The solver's own speed for bodies that were driven into each other would throw it up by a centimetre.
 PUSHED_OUT = 0.05
-#: A led tool comes no farther than this (m) from one look at what it is in to the next: past a rod that is thicker, together with it, it does not slip unseen.
+#: A led tool comes no farther than this (m) from one look at what it is in to the next: past a rod that is thicker, together with it, it
+#: does not slip unseen.
 BETWEEN_LOOKS = 0.005
 
 
@@ -339,8 +340,8 @@ class FloatingRun:
         planned: float = np.inf,
     ) -> tuple[Intrusion, ...]:
         """The deepest overlap of the planned tool with each static body and the table, before and after the contact
-        phase begins, sampled every ``interval`` seconds up to the release, and every :data:`BETWEEN_LOOKS` of its way; ``check`` may raise to end it
-        early.
+        phase begins, sampled every ``interval`` seconds up to the release, and every :data:`BETWEEN_LOOKS` of its way; ``check`` may raise
+        to end it early.
 
         ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it cannot
         be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.  ``planned``: what this found of the
@@ -386,7 +387,8 @@ class FloatingRun:
 
 
 def _looks(motion: ToolMotion, tool: Body, end: float, interval: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Moments (T,), s from the motion's beginning to ``end``, and the tool's poses then (T, 4, 4): ``interval`` seconds apart, nearer where the tool is fast."""
+    """Moments (T,), s from the motion's beginning to ``end``, and the tool's poses then (T, 4, 4): ``interval`` seconds apart, nearer where
+    the tool is fast."""
 
     def posed(times: NDArray[np.float64]) -> NDArray[np.float64]:
         return transforms.interpolate(motion.times, motion.world_from_tool, motion.times[0] + times)

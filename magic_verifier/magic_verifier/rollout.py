@@ -388,7 +388,7 @@ def _refuse_intrusions(
 
 
 def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
-    """Raise where, before the contact phase, the tool has pushed a free target away or presses on something fixed, or the hand has pushed that target.
+    """Raise where, before the contact phase, tool or hand have pushed a free target away or the tool presses on something fixed.
 
     A touch that moves nothing is allowed: the target is then still where the contact was planned.
     """

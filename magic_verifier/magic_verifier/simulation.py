@@ -567,7 +567,7 @@ class World:
         return max([0.0, *(-point.separation for contact in self._between(first, second) for point in contact.points)])
 
     def force(self, first: str, second: str) -> float:
-        """With how many newtons two bodies pressed on each other in the last step, all their contact points together, whichever way each of them goes."""
+        """With how many newtons two bodies pressed on each other in the last step: all their contact points, whichever way each of them goes."""
         return sum(math.hypot(*p.impulse.tolist()) for contact in self._between(first, second) for p in contact.points) / self.timestep
 
     def _between(self, first: str, second: str) -> list[Any]:

@@ -21,11 +21,11 @@ def _directions(count: int = 200) -> NDArray[np.float64]:
 
 
 DIRECTIONS = _directions()
-#: Of three numbers the ones that, times ``DIRECTIONS``, come nearest to so many: the shift that explains best by how much a hull reaches farther along each.
+#: Makes of how much farther a hull reaches along each of ``DIRECTIONS`` the shift (3,) that explains it best.
 EXPLAINS = np.linalg.pinv(DIRECTIONS)
-#: A thing may have been shifted by this share of what any of its points may be elsewhere by.  Its outline comes out otherwise with each look, by 5.2 mm at
-#: most of 45 pairs of looks at tools and targets (of 30 that nothing was set by: 2.2); where it is as a whole by 1.3 (1.2).  Verified motions failed in up to half of the cases where the target
-#: had been shifted by 15 to 19 mm, and in none up to 10.
+#: A thing may have been shifted by this share of what any of its points may be elsewhere by.  Its outline comes out otherwise with each
+#: look, by 5.2 mm at most of 45 pairs of looks at tools and targets (of 30 that nothing was set by: 2.2); where it is as a whole by 1.3
+#: (1.2).  Verified motions failed in up to half of the cases where the target had been shifted by 15 to 19 mm, and in none up to 10.
 SHIFTED = 0.5
 #: What is seen of a tool in the hand, with what is left of the hand at its edges, reaches so far beyond the tool at most, m.
 ABOUT = 0.1
@@ -71,7 +71,8 @@ def shift(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
 def beyond(before: NDArray[np.float64], after: NDArray[np.float64], partly: bool, tolerance: float) -> tuple[float, float] | None:
     """How far an object has moved, m, and how far it may, where that is less; ``None`` where it stands where it stood.
 
-    No point of it may be elsewhere by more than ``tolerance``, and all of it by no more than :data:`SHIFTED` of that.  ``partly``: as :func:`gap` has it.
+    No point of it may be elsewhere by more than ``tolerance``, and all of it by no more than :data:`SHIFTED` of that.  ``partly``: as
+    :func:`gap` has it.
     """
     found = [(gap(before, after, partly), tolerance)]
     if not partly:

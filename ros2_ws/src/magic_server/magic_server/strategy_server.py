@@ -671,7 +671,7 @@ class StrategyServer(LifecycleNode):
         sentence, metrics = pipeline.split_metrics(result.message)
         try:
             notes = self._when_allowed(lambda: self.publication.offer(claim), token)
-            # Who has told the server that all is recorded need not be told in each sentence, and what perception says it says of each scene.
+            # Who has told the server that all is recorded need not be told in each sentence; what perception says it says of each scene.
             told = {*claim.said, *([RECORDED] if self.settings.recorded else [])}
             sentence = "; ".join([sentence, *(n for n in notes if n not in told)])
             result.notes = [*result.notes, *notes]
