@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
-from test_execution import ACTIONS, folder  # noqa: F401  a fixture
+from test_execution import ACTIONS
 
 from magic_core import conversions, masses, shapes, transforms
 from magic_core.errors import Code
@@ -57,7 +57,7 @@ class Table:
 
 
 @pytest.fixture(scope="module")
-def shared(folder):  # noqa: F811
+def shared(folder):
     loop = {"loop.judge": False, "loop.look_time": 3.0, "loop.executions": 2, "loop.replans": 2}
     bench = Bench(folder, execute=True, state_age=10.0, objects_age=5.0, objects_timeout=2.0, **ACTIONS, **loop)
     bench.arm = fakes.FakeArm(context=bench.context)
