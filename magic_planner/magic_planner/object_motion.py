@@ -62,12 +62,12 @@ ACCELERATION = 1.0
 DWELL = 0.5
 
 
-#: By how much an approach is drawn in, in order of trial, and the room in metres that it then keeps.
+#: By how much an approach is drawn in, in order of trial.
 SHARES = (1.0, 0.75, 0.55, 0.4, 0.28, 0.2, 0.12)
-MARGIN = 0.0015
 #: The gap in metres that a tool keeps to a fixed target until it is let go, in order of trial: what cameras and hand do not know of
-#: where the tool is, two standard deviations, then what room there is.  It falls so far.
-GAPS = (0.006, 0.0045, 0.003, MARGIN)
+#: where the tool is, two standard deviations, then what room there is.  It falls so far.  An approach to a target that moves keeps the first of
+#: them, or as much as there is.
+GAPS = (0.006, 0.0045, 0.003, 0.0015)
 #: Where there is no such place it is let go so much of the way from its approach to the contact, in order of trial.
 SHORT = (0.75, 0.5, 0.25, 0.0)
 #: Room (m) with which a tool is slid over a fixed target, if there is so much, how far aside (m) from how it was shown that is looked for, by
@@ -339,8 +339,9 @@ def drawn_in(
 
     A ring that is lowered over a target has less room than a hook that comes from the open side.  Offsets across the view
     direction are scaled, of the approach's waypoints from that of the contact, of the retreat's from that of the goal; the
-    largest of :data:`SHARES` counts at which the approach keeps :data:`MARGIN` clear of the target; where none does, the approach goes to where
-    there is most room beside the contact.  Where that is not clear either, or the strategy has no approach that ends in a contact, it comes back as it is.
+    largest of :data:`SHARES` counts at which the approach keeps the first of :data:`GAPS` to the target, as neither is quite where it was seen; where
+    none does, the approach goes from the one with most room to where there is most beside it.  Where that is not clear either, or the strategy has no
+    approach that ends in a contact, it comes back as it is.
 
     A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
     there is room, so that a tool that is not quite where it was seen does not press on what cannot give way; where there is none at the
@@ -378,14 +379,16 @@ def drawn_in(
             changed = _stopped_short(middle, meets, share)
             if not _touches_on(held, poses_of(changed, 1), roomy(gap - ROUNDING)):
                 return changed
-    fixed, wall = Body.from_object(target), roomy(MARGIN)
+    fixed, wall = Body.from_object(target), roomy(GAPS[0])
     for share in SHARES:
         changed = _scaled(strategy, meets, share)
-        if not _touches_on(held, poses_of(changed, 0), fixed if share == 1 else wall):
+        if not _touches_on(held, poses_of(changed, 0), wall):
             return changed
     # In a hole that is hardly wider than the target only its middle is clear.
-    closest = _scaled(strategy, meets, SHARES[-1])
-    middle = _with_room(closest, meets, tool, poses_of(closest, 0), target, world_from_contact)
+    around, surface = Raycaster([_solid(target).transformed(target.world_from_object)]), _surface(tool)
+    some = [_scaled(strategy, meets, share) for share in SHARES]
+    roomiest = max(some, key=lambda changed: float(around.distances(_swept(surface, poses_of(changed, 0))).min()))
+    middle = _with_room(roomiest, meets, tool, poses_of(roomiest, 0), target, world_from_contact)
     return strategy if _touches_on(held, poses_of(middle, 0), fixed) else middle
 
 
@@ -418,15 +421,8 @@ def _with_room(
 ) -> Strategy:
     """The strategy, its approach shifted across the view direction to where the tool, at the poses (T, 4, 4) of it, is farthest from the target; no
     farther than it takes for :data:`ROOM`.  Uphill from where it is, so that what goes round the target goes on round it."""
-    import trimesh
-
-    def solid(item: SceneObject) -> Mesh:
-        return concatenate([Mesh(*hull(piece.vertices)) for piece in solid_pieces(item)])
-
-    wall = Raycaster([solid(target).transformed(target.world_from_object)])
-    points = np.asarray(trimesh.sample.sample_surface(solid(tool).to_trimesh(), ROOM_POINTS, seed=0)[0])
-    some = poses[np.unique(np.linspace(0, len(poses) - 1, ROOM_POSES).round().astype(int))]
-    swept = np.concatenate([transforms.apply(pose, points) for pose in some])
+    wall = Raycaster([_solid(target).transformed(target.world_from_object)])
+    swept = _swept(_surface(tool), poses)
 
     def apart(shift: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float32]:
         return wall.distances(points + world_from_contact[:3, :2] @ shift)
@@ -447,6 +443,24 @@ def _with_room(
         replace(w, offset=np.asarray(w.offset, dtype=float) + [*best, 0.0]) if i < meets else w for i, w in enumerate(strategy.waypoints)
     ]
     return replace(strategy, waypoints=tuple(waypoints))
+
+
+def _solid(item: SceneObject) -> Mesh:
+    """An object's convex pieces as one mesh, in its frame."""
+    return concatenate([Mesh(*hull(piece.vertices)) for piece in solid_pieces(item)])
+
+
+def _surface(item: SceneObject) -> NDArray[np.float64]:
+    """Points (:data:`ROOM_POINTS`, 3) all over an object, in its frame."""
+    import trimesh
+
+    return np.asarray(trimesh.sample.sample_surface(_solid(item).to_trimesh(), ROOM_POINTS, seed=0)[0])
+
+
+def _swept(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (N, 3) of a tool at :data:`ROOM_POSES` of its poses (T, 4, 4) at most, all together, in the world."""
+    some = poses[np.unique(np.linspace(0, len(poses) - 1, ROOM_POSES).round().astype(int))]
+    return np.concatenate([transforms.apply(pose, points) for pose in some])
 
 
 def _touches_on(body: Body, poses: NDArray[np.float64], other: Body) -> bool:

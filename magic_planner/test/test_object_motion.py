@@ -361,6 +361,24 @@ def test_a_ring_is_lowered_over_its_target_where_the_hook_comes_from_behind():
     np.testing.assert_allclose(met[:3, 3], (target.world_from_object @ target_contact.object_from_contact)[:3, 3], atol=1e-9)
 
 
+@pytest.mark.parametrize(("radius", "room"), [(0.029, 0.0035), (0.03, 0.0045), (0.0405, 0.006)])
+def test_a_tool_is_lowered_over_its_target_with_the_room_that_there_is(radius, room):
+    """Of a cylinder of 50 mm a ring of 60 mm is 5 mm clear about its middle, and 1.6 mm at the first share of the approach that is clear at all; one
+    of 81 mm is 1 mm clear of its far side as the approach was shown."""
+    tool, tool_contact = ring(radius)
+    target, target_contact = scenes.standing_cylinder(0.025)
+    motion = plan_tool_motion(scenes.pulling(), tool, target, scenes.candidate(tool, tool_contact, target_contact))
+    wide, _ = scenes.standing_cylinder(0.025 + room)
+    body, wall = Body("tool", tool.pieces), Body("target", wide.pieces)
+    wall.move(target.world_from_object)
+    approach = motion.world_from_tool[motion.times <= motion.phases[0].end + 1e-9]
+    for pose in approach:
+        body.move(pose)
+        assert not body.touches(wall)
+    # Straight from there to the contact: the target is not passed by.
+    assert abs(approach[-1, 1, 3] - target.world_from_object[1, 3]) < 0.002
+
+
 def test_an_approach_with_room_is_left_as_it_is_and_so_is_one_without_hope():
     strategy, tool, target, candidate = setup()
     motion = plan_tool_motion(strategy, tool, target, candidate)
