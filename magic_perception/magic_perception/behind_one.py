@@ -11,7 +11,7 @@ from magic_perception import convexity
 from magic_perception.labels import sizeable
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
-from magic_perception.pixels import where
+from magic_perception.pixels import where, window
 
 #: Two parts on both sides of what hides the middle of one thing: how much nearer that is, and how far the tops may differ in height, m; least
 #: common share of their histograms of colour; and so many pixels are between what is compared across an edge, of which there are so many at least.
@@ -64,7 +64,7 @@ def one_face(look: Looked, image: NDArray[np.int32], a: int, b: int) -> bool:
     x, y, w, h = cv2.boundingRect(((image == a) | (image == b)).view(np.uint8))
     height, width = image.shape
     cut = (slice(max(y - 8, 0), min(y + h + 8, height)), slice(max(x - 8, 0), min(x + w + 8, width)))
-    points = look.points(*np.mgrid[cut])
+    points = look.cloud(cut)
     normal = convexity.normals(points, look.frame.world_from_camera[:3, 3])
     up = look.normal.astype(np.float32)
     faces = []
@@ -95,6 +95,8 @@ def one_face(look: Looked, image: NDArray[np.int32], a: int, b: int) -> bool:
 def _hides(image: NDArray[np.int32], depth: NDArray[np.float32]) -> list[tuple[int, int]]:
     """Pairs of labels (behind, before) that meet in a picture along an edge where the second is nearer; what is behind may have lost its depth there."""
     found: dict[tuple[int, int], int] = {}
+    cut = window(image > 0)
+    image, depth = image[cut], depth[cut]
     for axis, across in ((axis, across) for axis in range(2) for across in ACROSS):
         first, second = (np.moveaxis(image, axis, 0)[part] for part in (slice(None, -across), slice(across, None)))
         rows, columns = where((first != second) & (first > 0) & (second > 0))

@@ -186,8 +186,7 @@ def surfaces(looks: list[Looked], found: Clusters) -> Surfaces:
             v, u = rows[here], columns[here]
             r0, r1 = max(int(v.min()) - 8, 0), min(int(v.max()) + 9, looked.heights.shape[0])
             c0, c1 = max(int(u.min()) - 8, 0), min(int(u.max()) + 9, looked.heights.shape[1])
-            window = looked.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
-            field = convexity.normals(window, looked.frame.world_from_camera[:3, 3])
+            field = convexity.normals(looked.cloud((slice(r0, r1), slice(c0, c1))), looked.frame.world_from_camera[:3, 3])
             near = np.nonzero((rows >= r0) & (rows < r1) & (columns >= c0) & (columns < c1))[0]
             normal[start + near] = field[rows[near] - r0, columns[near] - c0]
         start += len(rows)

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magic_perception.pixels import window
+
 
 def thin(points: NDArray[np.floating], voxel: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """One mean point (M, 3) for each occupied voxel of edge ``voxel`` metres, and for each point (N,) the index of its voxel."""
@@ -26,17 +28,15 @@ def cluster(points: NDArray[np.floating], eps: float, min_points: int, voxel: fl
     """
     if len(points) == 0:
         return np.zeros(0, np.int64)
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     mean, index = thin(points, voxel) if voxel else (np.asarray(points, float), np.arange(len(points)))
     n = len(mean)
-    a, b = cKDTree(mean, balanced_tree=False, compact_nodes=False).query_pairs(eps, output_type="ndarray").T
+    pairs = cKDTree(mean, balanced_tree=False, compact_nodes=False).query_pairs(eps, output_type="ndarray")
+    a, b = np.ascontiguousarray(pairs.T)
     core = np.bincount(a, minlength=n) + np.bincount(b, minlength=n) + 1 >= min_points
     both = core[a] & core[b]
-    _, labels = connected_components(coo_matrix((np.ones(int(both.sum()), np.int8), (a[both], b[both])), shape=(n, n)), directed=False)
-    labels = labels.astype(np.int64)
+    labels = linked(n, a[both], b[both])
     labels[~core] = -1
     first = np.full(n, n)
     for here, there in ((a, b), (b, a)):
@@ -49,6 +49,24 @@ def cluster(points: NDArray[np.floating], eps: float, min_points: int, voxel: fl
     return labels[index]
 
 
+#: Every so many-th link joins most of what all of them do.
+FEW = 8
+
+
+def linked(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The part (count,) that each of so many things belongs to where links (L,) join things ``a`` and ``b``, numbered in the order of their first ones."""
+    part = _linked(count, a[::FEW], b[::FEW])
+    rest = part[a] != part[b]
+    return _linked(int(part.max(initial=-1)) + 1, part[a[rest]], part[b[rest]])[part]
+
+
+def _linked(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    return connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1].astype(np.int64)
+
+
 def largest(points: NDArray[np.floating], eps: float, min_points: int, voxel: float | None = None) -> NDArray[np.bool_]:
     """(N,): the points of the cluster that has most of them (paper, IV-B); all where there is no cluster."""
     labels = cluster(points, eps, min_points, voxel)
@@ -59,8 +77,13 @@ def largest(points: NDArray[np.floating], eps: float, min_points: int, voxel: fl
 
 def connected(field: NDArray[np.bool_], seed: NDArray[np.bool_], connectivity: int = 4) -> NDArray[np.bool_]:
     """The connected regions of a field (H, W) in which there is something of the seed (H, W)."""
-    count, regions = cv2.connectedComponents(field.astype(np.uint8), connectivity=connectivity)
+    result = np.zeros_like(field)
+    cut = window(field)
+    if result[cut].size == 0:
+        return result
+    count, regions = cv2.connectedComponents(field[cut].view(np.uint8), connectivity=connectivity)
     touched = np.zeros(count, bool)
-    touched[regions[seed & field]] = True
+    touched[regions[seed[cut] & field[cut]]] = True
     touched[0] = False
-    return touched[regions]
+    result[cut] = touched[regions]
+    return result

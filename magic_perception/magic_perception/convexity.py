@@ -290,6 +290,8 @@ INWARD = 0.8
 OUTWARD, WITHIN = 0.75, 0.7
 #: Its highest points lie at such a share of the rim's radius: depth rounds the near rim off, and the far one outwards.
 BESIDE_RIM = 0.75
+#: The tops of both are so near each other, m.
+AS_HIGH = 0.02
 
 
 def _walls(normal: NDArray[np.floating], labels: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -310,8 +312,11 @@ def _outsides(
     from magic_perception.primitives import fit_circle, likeliest_circle
 
     members = _walls(normal, labels)
-    for mine in members:
-        top = float(np.percentile(heights[mine], 97))
+    tops = [float(np.percentile(heights[mine], 97)) for mine in members]
+    for mine, top in zip(members, tops, strict=True):
+        alike = [m for m, high in zip(members, tops, strict=True) if abs(high - top) < AS_HIGH and labels[m[0]] != labels[mine[0]]]
+        if not alike:
+            continue
         place = np.column_stack([points[mine, :2], heights[mine]]).astype(float)
         # Of all points alike, and of most of them.
         for circle in (fit_circle(place[:, :2]), likeliest_circle(place, top, WALL, np.random.default_rng(0))):
@@ -324,7 +329,7 @@ def _outsides(
             if not 0.02 < radius < 0.2 or near.mean() < MOST or np.mean(np.sum(normal[mine, :2] * away, axis=1) < 0) < INWARD:
                 continue
             rim = float(np.percentile(distance[near], 97))
-            for other in members:
+            for other in alike:
                 if labels[other[0]] == labels[mine[0]]:
                     continue
                 away = points[other, :2] - centre
@@ -334,7 +339,6 @@ def _outsides(
                     np.mean(np.sum(normal[other, :2] * away, axis=1) > 0) > OUTWARD
                     and np.mean(far < 1.15 * rim + 0.005) > WITHIN
                     and np.median(far[high]) > BESIDE_RIM * rim
-                    and abs(float(np.percentile(heights[other], 97)) - top) < 0.02
                 ):
                     labels[labels == labels[other[0]]] = labels[mine[0]]
     return labels
@@ -368,6 +372,13 @@ def with_handles(
     labels, members = labels.copy(), _walls(normal, labels)
     shades = [shade(rgb[m]) for m in members]
     for mine, color in zip(members, shades, strict=True):
+        alike = [
+            m
+            for m, other in zip(members, shades, strict=True)
+            if np.linalg.norm(color - other) <= COLOR and labels[m[0]] != labels[mine[0]]
+        ]
+        if not alike:
+            continue
         centre, radius = fit_circle(points[mine, :2].astype(float))
         away = points[mine, :2] - centre
         distance = np.linalg.norm(away, axis=1)
@@ -376,8 +387,8 @@ def with_handles(
             continue
         rim, top = float(np.percentile(distance, 97)), float(np.percentile(heights[mine], 97))
         tree = cKDTree(points[labels == labels[mine[0]]])
-        for other, like in zip(members, shades, strict=True):
-            if labels[other[0]] == labels[mine[0]] or np.linalg.norm(color - like) > COLOR:
+        for other in alike:
+            if labels[other[0]] == labels[mine[0]]:
                 continue
             away = points[other, :2] - centre
             far = np.linalg.norm(away, axis=1)

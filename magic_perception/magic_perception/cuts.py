@@ -216,8 +216,8 @@ def _inside(place: NDArray[np.float64], outline: NDArray[np.float32]) -> NDArray
     """Which of the places (N, 2) are inside a convex outline."""
     ring = outline[:, 0].astype(float)
     edge = np.roll(ring, -1, axis=0) - ring
-    side = edge[:, 0] * (place[:, None, 1] - ring[:, 1]) - edge[:, 1] * (place[:, None, 0] - ring[:, 0])
-    return np.all(side >= 0, axis=1) | np.all(side <= 0, axis=1)
+    side = edge[:, :1] * (place[:, 1] - ring[:, 1:]) - edge[:, 1:] * (place[:, 0] - ring[:, :1])
+    return np.all(side >= 0, axis=0) | np.all(side <= 0, axis=0)
 
 
 @cache

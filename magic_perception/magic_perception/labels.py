@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magic_perception import smear
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
-from magic_perception.pixels import where
+from magic_perception.pixels import where, window
 
 #: Least share of a thing's pixels that has depth of its own in one camera at least.
 MEASURED = 0.2
@@ -33,24 +33,26 @@ def with_depth(labels: list[NDArray[np.int32]], looks: list[Looked], parameters:
 
 def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0) -> NDArray[np.int32]:
     """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels, if both are of one connected region."""
-    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
-    if w == 0 or h == 0:
-        return labels
     margin = int(np.ceil(reach))
-    cut = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+    cut = window(mask, margin)
     part = labels[cut]
     seen = part > 0
-    missing = np.nonzero(mask[cut] & (part == 0))
-    if len(missing[0]) == 0 or not seen.any():
+    if not seen.any():
+        return labels
+    count, regions = cv2.connectedComponents(mask[cut].view(np.uint8), connectivity=8)
+    labelled = np.zeros(count, bool)
+    labelled[regions[seen]] = True
+    labelled[0] = False
+    missing = (part == 0) & labelled[regions]
+    near = window(missing, margin)
+    part, seen, missing = part[near], seen[near], missing[near]
+    if not seen.any():
         return labels
     distance, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     table = np.zeros(int(np.count_nonzero(seen)) + 1, np.int32)
     table[index[seen]] = part[seen]
-    count, regions = cv2.connectedComponents(mask[cut].view(np.uint8), connectivity=8)
-    labelled = np.zeros(count, bool)
-    labelled[regions[seen]] = True
     result = labels.copy()
-    result[cut][missing] = np.where((distance[missing] <= reach) & labelled[regions[missing]], table[index[missing]], 0)
+    result[cut][near] = np.where(missing & (distance <= reach), table[index], part)
     return result
 
 

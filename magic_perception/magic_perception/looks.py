@@ -40,8 +40,16 @@ class Looked:
 
     def points(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         """World points (..., 3) in metres at pixels, row and column (...) each; NaN without depth."""
+        return self._placed(self.frame.depth[rows, columns], rows, columns)
+
+    def cloud(self, cut: tuple[slice, slice]) -> NDArray[np.float32]:
+        """The same (h, w, 3) of a window of the picture, its rows and columns."""
+        rows, columns = (np.arange(*part.indices(size)) for part, size in zip(cut, self.frame.depth.shape, strict=True))
+        return self._placed(self.frame.depth[cut], rows[:, None], columns[None])
+
+    def _placed(self, depth: NDArray[np.float32], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         k, pose = self.frame.intrinsics, self.frame.world_from_camera
-        z = self.frame.depth[rows, columns].astype(np.float32)
+        z = depth.astype(np.float32)
         local = np.empty((*z.shape, 3), np.float32)
         np.multiply((columns.astype(np.float32) - np.float32(k.cx)) / np.float32(k.fx), z, out=local[..., 0])
         np.multiply((rows.astype(np.float32) - np.float32(k.cy)) / np.float32(k.fy), z, out=local[..., 1])

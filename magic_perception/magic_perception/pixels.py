@@ -1,4 +1,4 @@
-"""Which pixels of a picture something holds of, and which of them together are broad."""
+"""Which pixels of a picture something holds of, where they are, and which of them together are broad."""
 
 from __future__ import annotations
 
@@ -17,3 +17,14 @@ def where(mask: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
     """What of a mask (H, W) is no narrower than so many pixels, in rows and in columns."""
     return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)
+
+
+def window(mask: NDArray, margin: int = 0) -> tuple[slice, slice]:
+    """The rows and columns that hold all pixels of a picture (H, W) of one byte each that are not 0, and so many around.
+
+    None where there are no such pixels.  What is done there costs by the size of a thing, and not by that of the picture.
+    """
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    if w == 0:
+        return slice(0, 0), slice(0, 0)
+    return slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin)

@@ -254,6 +254,8 @@ def _bridged(voxels: Voxels, part: NDArray[np.int64]) -> Voxels:
 def joined(voxels: Voxels, part: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
     """Parts (V,) of voxels joined, the likeliest to be one thing first, until all that touch are likelier two."""
     part = np.unique(part, return_inverse=True)[1]
+    if part.max() == 0:
+        return part
     voxels = _bridged(voxels, part)
     shade = voxels.shade
     parts = {i: _part(voxels, part, i, shade) for i in range(int(part.max()) + 1)}

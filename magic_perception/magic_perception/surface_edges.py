@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception.looks import Looked
+from magic_perception.pixels import window
 
 #: Pixels beside the seam of two labels that are judged anew, and half the window around them in which surfaces are fitted.
 BAND, FITTED = 6, 14
@@ -22,12 +23,13 @@ def on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:
     Near a seam a pixel that lies off the plane through its own label's pixels farther in, and on that of the other's, is the other's.  Of a plane the inverse
     depth is linear in the picture, so that moments over a window fit all planes at once.
     """
-    meets = np.zeros(labels.shape, bool)
+    meets, things = np.zeros(labels.shape, bool), window(labels > 0)
     for axis in range(2):
-        one, two = (np.moveaxis(labels, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        image, there = (np.moveaxis(picture[things], axis, 0) for picture in (labels, meets))
+        one, two = image[:-1], image[1:]
         seam = (one != two) & (one > 0) & (two > 0)
-        np.moveaxis(meets, axis, 0)[:-1] |= seam
-        np.moveaxis(meets, axis, 0)[1:] |= seam
+        there[:-1] |= seam
+        there[1:] |= seam
     if not meets.any():
         return labels
     size = 2 * BAND + 1
