@@ -11,6 +11,7 @@ from magic_core.mesh import Mesh
 from magic_perception import clusters, smear
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
+from magic_perception.pixels import window
 
 
 def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -45,14 +46,13 @@ def _total(values: NDArray[np.float32]) -> NDArray[np.float32]:
 DARKEST = 0.45
 
 
-def color_distance(looked: Looked, table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """How far each pixel's colour is from the table's around it, in squared standard deviations, and the same where darkness
-    may be a shadow's (both (H, W)).
+def color_distance(lab: NDArray[np.uint8], table: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How far each pixel's colour (``lab``, (H, W, 3): :func:`magic_perception.smear.softened`) is from the table's around it, in squared
+    standard deviations, and the same where darkness may be a shadow's (both (H, W)).
 
     The table's colour and its spread are local means over the pixels of ``table``: a wooden grain has a large
     spread, so nothing stands out from it lightly.
     """
-    lab = cv2.cvtColor(cv2.GaussianBlur(looked.frame.color, (3, 3), 0), cv2.COLOR_RGB2LAB)
     small = cv2.resize(lab, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32)
     weights = (cv2.resize(table.astype(np.float32), small.shape[1::-1], interpolation=cv2.INTER_AREA) > 0.99).astype(np.float32)
     mean, share = masked_mean(small, weights, 31)
@@ -113,8 +113,10 @@ def _plates(faint: NDArray[np.bool_], core: NDArray[np.bool_], looked: Looked) -
     """
     size = 2 * round(0.5 * MIRRORED * looked.frame.intrinsics.fx / 615) + 1
     broad = cv2.morphologyEx((faint | core).view(np.uint8), cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-    _, regions, stats, _ = cv2.connectedComponentsWithStats((broad.view(bool) & ~core).view(np.uint8), connectivity=4)
-    result = np.zeros_like(core)
+    beside, result = broad.view(bool) & ~core, np.zeros_like(core)
+    if np.count_nonzero(beside) < size**2:
+        return result
+    _, regions, stats, _ = cv2.connectedComponentsWithStats(beside.view(np.uint8), connectivity=4)
     for label, (x, y, w, h, area) in enumerate(stats[1:], 1):
         if area < size**2:
             continue
@@ -146,12 +148,13 @@ def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_
     table = _outside(valid & (np.abs(zero) < limit) & inside & ~around, raised)
     if np.count_nonzero(table) < 500:
         return raised, np.zeros_like(raised)
-    distance, shaded = color_distance(looked, table)
+    lab = smear.softened(looked.frame.color)
+    distance, shaded = color_distance(lab, table)
     sample = np.flatnonzero(table)[::7]
     other = (distance > max(OTHER, notice(distance, sample))) & inside
     core = raised | lifted(other, looked, zero)
     core |= _plates((shaded > max(FAINT, notice(shaded, sample))) & (distance > FAINT) & inside, core, looked)
-    color, depth, focal = looked.frame.color, looked.frame.depth, looked.frame.intrinsics.fx
+    depth, focal = looked.frame.depth, looked.frame.intrinsics.fx
 
     def of(core: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
         """The mask by what is surely of things, what of it stays whatever its colour, and whether depth is not carried past edges."""
@@ -160,7 +163,7 @@ def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_
         result = _fill_bowls(result, looked, other, parameters)
         # Where depth goes on beyond a thing's edge it was not carried there.
         firm = result & ~(jump := smear.falls_back(result, depth, focal))
-        result, sharp = smear.cleared(result, color, depth, table, shaded, inside & (distance > 9), jump, focal)
+        result, sharp = smear.cleared(result, lab, depth, table, shaded, inside & (distance > 9), jump, focal)
         return result, firm, sharp
 
     result, firm, sharp = of(core)
@@ -207,28 +210,33 @@ def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float =
 
 def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_], parameters: Parameters) -> NDArray[np.bool_]:
     """Fill holes of a mask that are not the table: of another colour, or a little higher (the floor of a spoon's bowl is a few mm up)."""
-    outside = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
+    result, cut = mask.copy(), window(mask)
+    outside = np.pad((~mask[cut]).view(np.uint8), 1, constant_values=1)
     cv2.floodFill(outside, None, (0, 0), 2)
-    holes = (outside[1:-1, 1:-1] == 1).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
-    result = mask.copy()
-    for i in range(1, count):
-        x, y, w, h, area = stats[i]
-        window = (slice(y, y + h), slice(x, x + w))
-        part = labels[window] == i
-        if area < 12 or other[window][part].mean() > 0.7:
-            result[window] |= part
+    holes = (outside[1:-1, 1:-1] == 1).view(np.uint8)
+    if not holes.any():
+        return result
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] < 12
+    small[0] = False
+    result[cut] |= small[labels]
+    for i in np.flatnonzero(~small)[1:]:
+        x, y, w, h, _ = stats[i]
+        part = labels[y : y + h, x : x + w] == i
+        around = (slice(cut[0].start + y, cut[0].start + y + h), slice(cut[1].start + x, cut[1].start + x + w))
+        if other[around][part].mean() > 0.7:
+            result[around] |= part
             continue
-        heights = looked.raw[window][part]
+        heights = looked.raw[around][part]
         heights = heights[np.isfinite(heights)]
         # The fewer that are raised one by one are smear of the hole's rim: they tell nothing of its floor.
-        high = heights > max(parameters.min_height, 4.0 * float(np.median(looked.sigma[window][part])))
+        high = heights > max(parameters.min_height, 4.0 * float(np.median(looked.sigma[around][part])))
         heights = heights[~high] if 2 * np.count_nonzero(high) <= len(heights) else heights
         if len(heights) > 15:
             # Standard error of the middle of a hole, for noise that is correlated over some 5 pixels.
-            error = float(np.median(looked.sigma[window][part])) * 3.0 / np.sqrt(len(heights) / 5)
+            error = float(np.median(looked.sigma[around][part])) * 3.0 / np.sqrt(len(heights) / 5)
             if np.median(heights) > max(0.0012, 3 * error):
-                result[window] |= part
+                result[around] |= part
     return result
 
 

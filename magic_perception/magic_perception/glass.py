@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magic_perception.foreground import color_distance
 from magic_perception.looks import Looked
+from magic_perception.smear import softened
 
 #: Least size of a region without depth, m; least share of its surroundings that is seen to be the table; least share of its pixels
 #: of another colour than the table there, and how that differs, in squared standard deviations.
@@ -59,7 +60,7 @@ def unmeasured(look: Looked, labels: NDArray[np.int32], world_from_table: NDArra
             free = cv2.erode(table.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
             if np.count_nonzero(free) < 500:
                 return []
-            distance = color_distance(look, free)[1]
+            distance = color_distance(softened(look.frame.color), free)[1]
         if float((distance[cut][mine] > UNLIKE).mean()) < OTHER:
             continue
         # Its foot is its lowest pixel in the picture; its middle lies about half its width behind.

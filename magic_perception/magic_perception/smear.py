@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception.clusters import connected
+from magic_perception.pixels import where
 
 #: Pixels, at a focal length of 615, by which depth reaches past an edge or falls short of it, and to which a hole may lie inside a mask's edge.
 REACH, DEEP = 9, 26
@@ -60,7 +61,7 @@ def _density(index: NDArray[np.int32]) -> NDArray[np.float32]:
     from scipy.ndimage import gaussian_filter
 
     counts = np.bincount(index, minlength=int(np.prod(_SHAPE))).reshape(_SHAPE).astype(np.float32)
-    used = np.unravel_index(np.flatnonzero(counts), _SHAPE)
+    used = np.unravel_index(np.flatnonzero(counts > 0), _SHAPE)
     cut = tuple(slice(max(int(along.min()) - 3, 0), int(along.max()) + 4) for along in used)
     counts[cut] = gaussian_filter(counts[cut], 0.9, mode="constant")
     return (counts / counts.sum()).ravel()
@@ -70,17 +71,27 @@ def _density(index: NDArray[np.int32]) -> NDArray[np.float32]:
 SHADES, SHADED = (0.9, 0.8, 0.7, 0.6), 0.15
 
 
-def _shaded(lab: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The density of the table's colours (N, 3), its own and those that it has in a shadow of that darkness: in proportion nearer to black."""
-    own = _density(_index(lab[:, None])[:, 0])
-    few = lab[:: max(1, len(lab) // 2000)].astype(np.float32) - np.float32([0, 128, 128])
+def _shaded(lab: NDArray[np.uint8], index: NDArray[np.int32], table: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The density of the table's colours, its own and those that it has in a shadow of that darkness: in proportion nearer to black.
+
+    lab (H, W, 3), index (H, W): the picture, and the bins of its pixels; table (H, W): where it shows the table.
+    """
+    rows, columns = where(table)
+    step = max(1, len(rows) // 2000)
+    own = _density(index[rows, columns])
+    few = lab[rows[::step], columns[::step]].astype(np.float32) - np.float32([0, 128, 128])
     dark = np.concatenate([few * shade for shade in SHADES]) + np.float32([0, 128, 128])
     return (1 - SHADED) * own + SHADED * _density(_index(np.round(dark).astype(np.uint8)[:, None])[:, 0])
 
 
+def softened(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) RGB in OpenCV's Lab of 8 bits, without the noise of single pixels."""
+    return cv2.cvtColor(cv2.GaussianBlur(color, (3, 3), 0), cv2.COLOR_RGB2LAB)
+
+
 def cleared(
     mask: NDArray[np.bool_],
-    color: NDArray[np.uint8],
+    lab: NDArray[np.uint8],
     depth: NDArray[np.float32],
     table: NDArray[np.bool_],
     unlike: NDArray[np.float32],
@@ -90,13 +101,12 @@ def cleared(
 ) -> tuple[NDArray[np.bool_], bool]:
     """The mask (H, W) with smear taken out and lost rims put back; and whether things with an edge of colour show that depth is not carried past edges.
 
-    color (H, W, 3) RGB; depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W): squared distance of the colour from
+    lab (H, W, 3): the picture (:func:`softened`); depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W): squared distance of the colour from
     that of the table around, in the light or in a shadow, in standard deviations; possible (H, W): where the mask may grow; jump (H, W): :func:`falls_back`; focal: focal length, pixels.
     """
     scale = focal / 615
     most, deep = max(3, round(REACH * scale)), round(DEEP * scale)
     result = mask.copy()
-    lab = cv2.cvtColor(cv2.GaussianBlur(color, (3, 3), 0), cv2.COLOR_RGB2LAB)
     wide = cv2.dilate(mask.view(np.uint8), np.ones((5, 5), np.uint8))
     _, regions, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
     judged = []
@@ -152,7 +162,7 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
     if np.count_nonzero(mine) < SAMPLE or np.count_nonzero(near.around) < SAMPLE:
         return None
     index = _index(near.lab)
-    ground = _shaded(near.lab[near.around])
+    ground = _shaded(near.lab, index, near.around)
     padded = np.pad(mine, 1)
     within = cv2.distanceTransform(padded.view(np.uint8), cv2.DIST_L2, 3)
     nearest = cv2.distanceTransformWithLabels(padded.view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
@@ -351,7 +361,7 @@ def behind(mask: NDArray[np.bool_], heights: NDArray[np.float32]) -> NDArray[np.
     if w == 0:
         return result
     cut = (slice(y, y + h), slice(x, x + w))
-    zero = np.where(mask[cut], np.nan_to_num(heights[cut]), np.float32(0))
+    zero = np.where(mask[cut] & np.isfinite(heights[cut]), heights[cut], np.float32(0))
     around = cv2.dilate(zero, np.ones((2 * NEARBY + 1,) * 2, np.uint8))
     within = cv2.distanceTransform(np.pad(mask[cut], 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     bar = mask[cut] & ~_around(within > BAR / 2, BAR / 2)
@@ -375,6 +385,8 @@ def before(mask: NDArray[np.bool_], others: NDArray[np.bool_], depth: NDArray[np
     x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
     cut = (slice(max(y - reach, 0), y + h + reach), slice(max(x - reach, 0), x + w + reach))
     mine, measured = mask[cut], depth[cut]
+    if not others[cut].any():
+        return result
     around = np.ones((2 * reach + 1,) * 2, np.uint8)
     nearest = cv2.erode(np.where(others[cut] & np.isfinite(measured), measured, np.float32(np.inf)), around)
     inner = mine & np.isinf(nearest) & np.isfinite(measured)

@@ -32,7 +32,9 @@ def picture(thing: np.ndarray, color: tuple[int, int, int] = THING, seed: int = 
 def cleared(mask: np.ndarray, color: np.ndarray, depth: np.ndarray, seen: np.ndarray, unlike: float = 0.0) -> np.ndarray:
     table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     everywhere = np.ones(mask.shape, bool)
-    return smear.cleared(mask, color, depth, table, np.where(seen, 100, unlike).astype(np.float32), everywhere, everywhere, 615.0)[0]
+    return smear.cleared(
+        mask, smear.softened(color), depth, table, np.where(seen, 100, unlike).astype(np.float32), everywhere, everywhere, 615.0
+    )[0]
 
 
 @pytest.mark.parametrize("hollow", [0.0, 0.02])
@@ -54,7 +56,7 @@ def test_a_hole_that_depth_filled_almost_is_open_also_where_depth_goes_on_past_t
     depth = np.where(ring(200, 12), 0.6, 0.6 + hollow).astype(np.float32)
     unlike, everywhere = np.where(truth, 100, 0.0).astype(np.float32), np.ones(truth.shape, bool)
     color = picture(truth)
-    found, _ = smear.cleared(ring(24, 0), color, depth, table, unlike, everywhere, np.zeros(truth.shape, bool), 615.0)
+    found, _ = smear.cleared(ring(24, 0), smear.softened(color), depth, table, unlike, everywhere, np.zeros(truth.shape, bool), 615.0)
     assert found[96:104, 96:104].any() == remains
 
 
@@ -145,7 +147,7 @@ def test_a_foot_of_the_tables_colour_is_no_hole_where_depth_goes_on_past_it(stan
     table = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     unlike = np.where(mask & ~foot, 100, 1).astype(np.float32)
     jump = mask & ~(stands & (rows > 130) & (np.mgrid[0:200, 0:200][1] > 62) & (np.mgrid[0:200, 0:200][1] < 137))
-    found = smear.cleared(mask, picture(mask & ~foot), depth, table, unlike, np.ones(mask.shape, bool), jump, 615.0)[0]
+    found = smear.cleared(mask, smear.softened(picture(mask & ~foot)), depth, table, unlike, np.ones(mask.shape, bool), jump, 615.0)[0]
     assert found[60:116, 66:134].mean() > 0.98
     assert (found[122:134, 80:120].mean() > 0.95) == stands
 
