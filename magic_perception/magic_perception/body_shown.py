@@ -82,26 +82,45 @@ def _unlike(
     stiff = np.zeros((basis.shape[-1],) * 2)
     stiff[: 2 * WAVES, : 2 * WAVES] = CALM * np.diag(np.repeat(np.arange(1.0, WAVES + 1) ** 2, 2))
     stiff[2 * WAVES :, 2 * WAVES :] = EVEN * bends.T @ bends + 1e-6 * np.eye(levels)
-    log, around = np.log(color + DARK), np.ones((2 * ON + 1,) * 2, np.uint8)
-    unlike = None
+    bright, around = color + DARK, np.ones((2 * ON + 1,) * 2, np.uint8)
+    log, found = np.log(bright), None
     for _ in range(TIMES):
-        a, b, c = basis[own], log[own], color[own] + DARK
-        keep = np.ones(len(a), bool)
-        for _ in range(3):
-            if np.count_nonzero(keep) < ENOUGH:
-                return unlike
-            model = np.linalg.solve(a[keep].T @ a[keep] + len(a) * stiff, a[keep].T @ b[keep])
-            off = np.abs(c - np.exp(a @ model))
-            sigma = 1.48 * np.median(off, axis=0)
-            keep = (off < np.maximum(2.5 * sigma, 1.0)).all(axis=1)
-        if sigma.max() > UNEVEN:
-            return unlike
-        unlike = (np.abs(color + DARK - np.exp(basis @ model)) / np.maximum(DEVIATIONS * sigma, LEAST)).max(axis=-1)
-        more = (cv2.dilate(own.view(np.uint8), around) > 0) & may_be & (unlike < 1) & ~own
+        look = _look_of(basis[own], log[own], bright[own], stiff)
+        if look is None:
+            break
+        found = look
+        more = (cv2.dilate(own.view(np.uint8), around) > 0) & may_be & ~own
+        more[more] = _off(basis[more], bright[more], *look) < 1
         if not more.any():
             break
         own = own | more
-    return unlike
+    return None if found is None else _off(basis, bright, *found)
+
+
+def _look_of(
+    basis: NDArray[np.float64], log: NDArray[np.float32], bright: NDArray[np.float32], stiff: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """The look (B, 3) of pixels by their waves and levels (N, B), with what each channel is off by (3,); ``None`` where they are too few or too uneven.
+
+    bright (N, 3): their colour above :data:`DARK`; log: of that; stiff (B, B).
+    """
+    keep = np.ones(len(basis), bool)
+    for _ in range(3):
+        if np.count_nonzero(keep) < ENOUGH:
+            return None
+        kept = basis[keep]
+        model = np.linalg.solve(kept.T @ kept + len(basis) * stiff, kept.T @ log[keep])
+        off = np.abs(bright - np.exp(basis @ model))
+        sigma = 1.48 * np.median(off, axis=0)
+        keep = (off < np.maximum(2.5 * sigma, 1.0)).all(axis=1)
+    return None if sigma.max() > UNEVEN else (model, sigma)
+
+
+def _off(
+    basis: NDArray[np.float64], bright: NDArray[np.float32], model: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How far pixels (...) are from a look, as a share of what they may be; arguments as :func:`_look_of` has them."""
+    return (np.abs(bright - np.exp(basis @ model)) / np.maximum(DEVIATIONS * sigma, LEAST)).max(axis=-1)
 
 
 def body_shown(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.mesh import Mesh
-from magic_perception.sight import Sight, measured
+from magic_perception.sight import Sight
 from magic_perception.solids import Reconstruction, hull_of
 
 #: Least size, m, and least share of the points on each of two faces.
@@ -90,7 +90,7 @@ def recognise_box(sights: list[Sight], height: float, noise: float) -> Reconstru
     if not LEAST < height < 0.4:
         return None
     # What depth has lost is not told by what lies beside it.
-    told = np.concatenate([measured(sight) for sight in sights])
+    told = np.concatenate([sight.measured for sight in sights])
     sample = told[:: max(1, len(told) // 800)]
     if len(sample) < 80:
         return None
@@ -132,7 +132,8 @@ def _sound(box: Box, points: NDArray[np.float64], sights: list[Sight], edges: li
     if float(np.percentile(distance, 90)) > limit or float(np.mean(distance > AWAY)) > PART or _faces(box, points, limit) < 2:
         return False
     return all(
-        len(pixels) <= 20 or float(np.median(np.abs(_outline(box, s, pixels)))) <= EDGE for s, pixels in zip(sights, edges, strict=True)
+        len(pixels) <= 20 or float(np.median(np.abs(_outlines(box.corners()[None], s, pixels)[0]))) <= EDGE
+        for s, pixels in zip(sights, edges, strict=True)
     )
 
 
@@ -166,18 +167,19 @@ def _edges(sight: Sight, most: int = 150) -> NDArray[np.float64]:
     return np.column_stack([columns[::step], rows[::step]]).astype(float)
 
 
-def _outline(box: Box, sight: Sight, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Signed distances (N,) of pixels (N, 2) to the outline of the box in a picture, positive outside."""
-    corners = sight.pixels(box.corners())
-    # OpenCV takes numbers of 32 bits, in which a step of the search hardly moves a corner: only the order is taken from it.
-    hull = corners[cv2.convexHull(corners.astype(np.float32), returnPoints=False)[:, 0]]
-    edge = np.roll(hull, -1, axis=0) - hull
-    length = np.linalg.norm(edge, axis=1)
-    hull, edge, length = hull[length > 1e-6], edge[length > 1e-6], length[length > 1e-6]
-    normal = np.column_stack([edge[:, 1], -edge[:, 0]]) / length[:, None]
-    if np.mean(np.sum((hull.mean(axis=0) - hull) * normal, axis=1)) > 0:
-        normal = -normal
-    return (pixels @ normal.T - np.sum(hull * normal, axis=1)).max(axis=1)
+def _outlines(corners: NDArray[np.float64], sight: Sight, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Signed distances (B, N) of pixels (N, 2) to the outlines in a picture of boxes with these corners (B, K, 3), positive outside."""
+    seen = sight.pixels(corners)
+    hulls = [cv2.convexHull(points, returnPoints=False)[:, 0] for points in seen]
+    # Counter-clockwise, all of as many corners: the last one again, and edges of no length.
+    count = max(len(hull) for hull in hulls)
+    order = np.stack([np.pad(hull, (0, count - len(hull)), mode="edge") for hull in hulls])
+    ring = np.take_along_axis(seen, order[..., None], axis=1)
+    edge = np.roll(ring, -1, axis=1) - ring
+    length = np.linalg.norm(edge, axis=2)
+    normal = np.stack([edge[..., 1], -edge[..., 0]], axis=-1) / np.maximum(length, 1e-6)[..., None]
+    away = pixels @ normal.transpose(0, 2, 1) - np.sum(ring * normal, axis=2)[:, None]
+    return np.where(length[:, None] > 1e-6, away, -np.inf).max(axis=2)
 
 
 def _fitted(start: Box, points: NDArray[np.float64], sights: list[Sight], edges: list[NDArray[np.float64]]) -> tuple[Box, float] | None:
@@ -199,14 +201,22 @@ def _fitted(start: Box, points: NDArray[np.float64], sights: list[Sight], edges:
         size = np.maximum(x[2:5], 1e-3)
         return Box(x[:2], size, float(x[5]), float(np.clip(x[6], 1e-3, size[:2].min() / 2)) if len(x) > 6 else 0.0)
 
-    def errors(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        box = made(x)
-        parts = [box.distance(points) / np.sqrt(len(points))]
+    def errors(tried: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of boxes by their numbers (B, P): (B, errors)."""
+        boxes = [made(x) for x in first + (tried - 1) * scales]
+        parts = [np.stack([box.distance(points) for box in boxes]) / np.sqrt(len(points))]
+        corners = np.stack([box.corners() for box in boxes])
         for sight, pixels, size in zip(sights, edges, scale, strict=True):
             if len(pixels):
                 # The middles of a mask's outermost pixels lie half a pixel within.
-                parts.append(size * (_outline(box, sight, pixels) + 0.5) / np.sqrt(len(pixels)))
-        return 30 * np.concatenate(parts)
+                parts.append(size * (_outlines(corners, sight, pixels) + 0.5) / np.sqrt(len(pixels)))
+        return 30 * np.concatenate(parts, axis=1)
+
+    def slopes(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(errors, P), by differences, all of them at once."""
+        beside = x + np.diag(STEP * x)
+        here, there = np.split(errors(np.vstack([x, beside])), [1])
+        return ((there - here) / (np.diag(beside) - x)[:, None]).T
 
     if circle:
         first, scales = np.array([*start.middle, start.size[0], start.size[2]]), np.full(4, 0.1)
@@ -215,11 +225,11 @@ def _fitted(start: Box, points: NDArray[np.float64], sights: list[Sight], edges:
         scales = np.array([0.1] * 5 + [1.0, 0.1])[: len(first)]
     # Errors have kinks, where a point or a pixel changes from one face to another: differences are taken over more than these are apart.
     found = least_squares(
-        lambda u: errors(first + (u - 1) * scales),
+        lambda x: errors(x[None])[0],
         np.ones(len(first)),
+        jac=slopes,
         loss="soft_l1",
         f_scale=30 * ROBUST / np.sqrt(len(points)),
-        diff_step=STEP,
         ftol=1e-4,
         max_nfev=30,
     )

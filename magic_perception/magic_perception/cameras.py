@@ -97,13 +97,14 @@ class Disagreement:
 @dataclass(frozen=True)
 class _Witness:
     """What one camera tells: points (N, 3) on things and their normals (N, 3); pictures of the distance to its masks (H, W), m at unit depth,
-    and of the normals around them (h, w, 3), which begin at row and column ``corner``."""
+    and of the places and the normals around them (h, w, 3), in the world, which begin at row and column ``corner``."""
 
     camera_from_world: NDArray[np.float64]
     look: Looked
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     outside: NDArray[np.float32]
+    places: NDArray[np.float32]
     field: NDArray[np.float32]
     corner: tuple[int, int]
 
@@ -117,8 +118,8 @@ def _witness(look: Looked, labels: NDArray[np.int32], count: int, rng: np.random
     pad = 12
     r0, r1 = max(y - pad, 0), min(y + h + pad, mask.shape[0])
     c0, c1 = max(x - pad, 0), min(x + w + pad, mask.shape[1])
-    window = look.points(*np.meshgrid(np.arange(r0, r1), np.arange(c0, c1), indexing="ij"))
-    field = convexity.normals(window, look.frame.world_from_camera[:3, 3])
+    places = look.cloud((slice(r0, r1), slice(c0, c1)))
+    field = convexity.normals(places, look.frame.world_from_camera[:3, 3])
     # Depth at the very edge of a mask may be that of what lies behind.
     rows, columns = where(mask & np.isfinite(look.heights) & (look.heights > 0))
     if len(rows) < 60:
@@ -137,6 +138,7 @@ def _witness(look: Looked, labels: NDArray[np.int32], count: int, rng: np.random
         points,
         field[rows - r0, columns - c0].astype(float),
         outside,
+        places,
         field,
         (r0, c0),
     )
@@ -182,7 +184,7 @@ def _compared(
         inside & (outside == 0) & np.isfinite(depth) & (r >= 0) & (c >= 0) & (r < other.field.shape[0]) & (c < other.field.shape[1])
     )
     normal = other.field[r[on], c[on]].astype(float)
-    away = moved[on] - other.look.points(row[on], column[on])
+    away = moved[on] - other.places[r[on], c[on]]
     gap = np.einsum("ij,ij->i", away, normal)
     alike, off = np.zeros(len(moved), bool), np.full(len(moved), unseen)
     with np.errstate(invalid="ignore"):
@@ -212,6 +214,7 @@ class _Believed:
 class _Pair:
     """Two cameras, and the middle (3,), in the table frame, of what they see, about which the second is turned; motions are (3,): x, y, turn.
 
+    away (N, 3): the points of the second camera, then those of the first, in the table frame from the middle.
     unseen: what a point costs that only one of them sees: as much as others do that both see, so that it is neither good nor bad to be seen by both.
     """
 
@@ -219,18 +222,20 @@ class _Pair:
     second: _Witness
     world_from_table: NDArray[np.float64]
     centre: NDArray[np.float64]
+    away: NDArray[np.float64]
     unseen: float = UNSEEN
 
     @classmethod
     def of(cls, first: _Witness, second: _Witness, world_from_table: NDArray[np.float64]) -> _Pair:
         """About the middle of all points."""
-        points = np.concatenate([second.points, first.points])
-        return cls(first, second, world_from_table, transforms.apply(transforms.inverse(world_from_table), points).mean(axis=0))
+        points = transforms.apply(transforms.inverse(world_from_table), np.concatenate([second.points, first.points]))
+        centre = points.mean(axis=0)
+        return cls(first, second, world_from_table, centre, points - centre)
 
     def points(self, every: int = 1) -> NDArray[np.float64]:
-        """(N, 3): those of the second camera, then those of the first, in the table frame from the middle."""
-        points = np.concatenate([self.second.points[::every], self.first.points[::every]])
-        return transforms.apply(transforms.inverse(self.world_from_table), points) - self.centre
+        """(N, 3): some of ``away``, every so many-th of each camera."""
+        split = len(self.second.points)
+        return np.concatenate([self.away[:split:every], self.away[split::every]])
 
     def compared(self, motions: NDArray[np.float64], every: int = 1, gate: float = GATE) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """What each point costs (M, N), and whether both cameras see it (M, N), with the second camera moved by ``motions`` (M, 3)."""

@@ -10,7 +10,7 @@ from magic_core import transforms
 from magic_core.camera import SURELY
 from magic_core.mesh import Mesh
 from magic_perception.looks import Looked
-from magic_perception.pixels import opened, where
+from magic_perception.pixels import opened, where, window
 
 #: In images of labels: the robot, or what else of no interest stands before the scene (``RgbdFrame.blind``).
 ROBOT = -2
@@ -194,7 +194,10 @@ def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixt
     """
     clouds, heights = [], []
     for look, image in zip(looks, labels, strict=True):
-        rows, columns = where((image == label) & np.isfinite(look.heights))
+        mask = image == label
+        cut = window(mask)
+        rows, columns = where(mask[cut] & np.isfinite(look.heights[cut]))
+        rows, columns = rows + cut[0].start, columns + cut[1].start
         clouds.append(look.points(rows, columns).astype(float))
         heights.append(look.heights[rows, columns])
     points, height = np.concatenate(clouds), np.concatenate(heights)

@@ -44,9 +44,9 @@ def height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> Gri
         )
     index = np.round((points[:, :2] - low) / cell).astype(int)
     flat = index[:, 1] * size[0] + index[:, 0]
-    order = np.argsort(points[:, 2], kind="stable")
-    top = np.full(size[0] * size[1], np.nan, np.float32)
-    top[flat[order]] = points[order, 2]  # the last, highest, wins
+    top = np.full(size[0] * size[1], -np.inf, np.float32)
+    np.maximum.at(top, flat, points[:, 2].astype(np.float32))
+    top[np.isneginf(top)] = np.nan
     top = top.reshape(size[1], size[0])
     occupied = np.isfinite(top).astype(np.uint8)
     closed = cv2.morphologyEx(occupied, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
@@ -105,13 +105,12 @@ def lay(sights: list[Sight], noise: float, parameters: Parameters) -> Laid:
         occupied = np.isfinite(grid.top)
     centres = grid.centres()
     if flat and thickness < 0.06:
-        columns = [
-            np.concatenate([centres, np.full((*centres.shape[:2], 1), z)], axis=-1)
-            for z in np.linspace(0, thickness, 2 + int(thickness / 0.006))
-        ]
-        field = carve(sights, columns)
-        near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
-        field = cv2.GaussianBlur(field * near, (0, 0), 0.8)
+        near = cv2.dilate(occupied.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))) > 0
+        spots = centres[near]
+        levels = np.linspace(0, thickness, 2 + int(thickness / 0.006))
+        field = np.zeros(near.shape, np.float32)
+        field[near] = carve(sights, [np.column_stack([spots, np.full(len(spots), z)])[:, None] for z in levels])[:, 0]
+        field = cv2.GaussianBlur(field, (0, 0), 0.8)
         if slim:
             field = np.maximum(field, polygons.smooth_field(_lost(sights, grid, field > 0.5), 0.8))
     else:

@@ -516,7 +516,8 @@ def _seen(label: int, views: _Views, parameters: Parameters) -> _Seen:
         hidden = (image != 0) & ~mask
         # What colour gives to the thing and depth to the table behind it, or to another thing before it, has no depth.
         lost = behind(mask, looked.heights) | before(mask, hidden, looked.frame.depth, looked.frame.intrinsics.fx)
-        depth, heights = (np.where(lost, np.float32(np.nan), values) for values in (looked.frame.depth, looked.heights))
+        depth, heights = looked.frame.depth.copy(), looked.heights.copy()
+        depth[cut][lost[cut]] = heights[cut][lost[cut]] = np.nan
         table_from_camera = table_from_world @ looked.frame.world_from_camera
         sights.append(Sight(looked.frame.intrinsics, table_from_camera, mask, hidden, looked.frame.color, depth, heights, sigma))
         rows, columns = np.nonzero(mask[cut] & np.isfinite(heights[cut]))

@@ -151,12 +151,16 @@ def convex_parts(polygon: Polygon, tolerance: float = 0.0) -> list[NDArray[np.fl
         return i
 
     merged = True
+    apart: set[tuple[int, int]] = set()  # that are not merged as they are
     while merged:
         merged = False
         rest = []
         for length, (a, b) in shared:
             i, j = root(a), root(b)
             if i == j:
+                continue
+            if (i, j) in apart:
+                rest.append((length, (a, b)))
                 continue
             hull = convex_hull(np.concatenate([rings[i], rings[j]]))
             if len(hull) < 3:
@@ -168,8 +172,10 @@ def convex_parts(polygon: Polygon, tolerance: float = 0.0) -> list[NDArray[np.fl
                 owner[j] = i
                 rings[i], areas[i], filled[i] = hull, area, filled[i] + filled[j]
                 del rings[j]
+                apart = {pair for pair in apart if i not in pair}
                 merged = True
             else:
+                apart.add((i, j))
                 rest.append((length, (a, b)))
         shared = rest
     return [ring for ring in rings.values() if area_of(ring) > 1e-9]

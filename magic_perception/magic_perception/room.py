@@ -78,7 +78,8 @@ def room(
     possible = np.arange(len(points))
     seen_as: list[NDArray[np.int32]] = []
     for look, image in zip(looks, labels, strict=True):
-        there, empty = _looked_at(look, image, transforms.apply(world_from_table, points[possible]))
+        camera_from_table = transforms.inverse(look.frame.world_from_camera) @ world_from_table
+        there, empty = _looked_at(look, image, transforms.apply(camera_from_table, points[possible]))
         possible, seen_as = possible[~empty], [before[~empty] for before in (*seen_as, there)]
     seen = np.stack(seen_as)
     hidden = np.any((seen != 0) & (seen != label) & (seen != ROBOT), axis=0)
@@ -108,10 +109,9 @@ def room(
     return Room(behind, around, tuple(sorted(by)))
 
 
-def _looked_at(look: Looked, labels: NDArray[np.int32], points: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """At world points (N, 3): the label of their pixels (0 outside of the picture), and whether the camera sees the places to be empty."""
+def _looked_at(look: Looked, labels: NDArray[np.int32], local: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """At points (N, 3) in the camera's frame: the label of their pixels (0 outside of the picture), and whether the camera sees the places to be empty."""
     k = look.frame.intrinsics
-    local = transforms.apply(transforms.inverse(look.frame.world_from_camera), points)
     z = np.maximum(local[:, 2], 1e-3)
     u, v = np.rint(k.fx * local[:, 0] / z + k.cx), np.rint(k.fy * local[:, 1] / z + k.cy)
     inside = (local[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)

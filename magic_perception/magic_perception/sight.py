@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magic_core import transforms
 from magic_core.camera import Intrinsics
 from magic_core.mesh import Mesh
-from magic_perception.pixels import where
+from magic_perception.pixels import where, window
 from magic_perception.smear import LOW, REACH
 
 
@@ -101,12 +101,25 @@ class Sight:
         pad = 6 * reach
         cut = (slice(max(y - pad, 0), y + h + pad), slice(max(x - pad, 0), x + w + pad))
         mask, heights = self.mask[cut], self.heights[cut]
-        raised = ~mask & (np.nan_to_num(heights) > LOW)
+        with np.errstate(invalid="ignore"):
+            raised = ~mask & (heights > LOW)
         far = raised & (cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3) > reach)
         thing = mask | (raised & (cv2.dilate(far.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0))
         known = np.where(thing & np.isfinite(heights), heights, np.float32(np.inf))
         result[cut][thing] = cv2.dilate(known, np.ones((3, 3), np.uint8))[thing]
         return result
+
+    @cached_property
+    def measured(self) -> NDArray[np.float64]:
+        """Points (N, 3) of the thing where depth was measured, a pixel within the mask's edge, above the table."""
+        cut = window(self.mask, 1)
+        inner = cv2.erode(self.mask[cut].view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+        rows, columns = where(inner & np.isfinite(self.depth[cut]))
+        rows, columns = rows + cut[0].start, columns + cut[1].start
+        z, k = self.depth[rows, columns].astype(float), self.intrinsics
+        local = np.column_stack([(columns - k.cx) / k.fx * z, (rows - k.cy) / k.fy * z, z])
+        points = transforms.apply(self.table_from_camera, local)
+        return points[points[:, 2] > 0]
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Column and row (..., 2) at which points (..., 3) are seen, also outside of the picture; -1e4 behind the camera."""
@@ -148,16 +161,6 @@ def surface(sight: Sight, upsample: int = 1) -> NDArray[np.float64]:
     # A grazing ray turns a small error of height into a large one in the plane.
     near = np.einsum("ij,ij->i", rays, rays) < 4.0**2
     return (rays if near.all() else rays[near]) + sight.eye
-
-
-def measured(sight: Sight) -> NDArray[np.float64]:
-    """Points (N, 3) of the thing where depth was measured, a pixel within the mask's edge, above the table."""
-    inner = cv2.erode(sight.mask.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
-    rows, columns = where(inner & np.isfinite(sight.depth))
-    z, k = sight.depth[rows, columns].astype(float), sight.intrinsics
-    local = np.column_stack([(columns - k.cx) / k.fx * z, (rows - k.cy) / k.fy * z, z])
-    points = transforms.apply(sight.table_from_camera, local)
-    return points[points[:, 2] > 0]
 
 
 def surfaces(sights: list[Sight], upsample: int = 1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -21,7 +21,7 @@ from magic_core.mesh import Mesh
 from magic_core.rendering import Raycaster
 from magic_perception.confidence import ENDED, ROUND, TURNED, Evidence
 from magic_perception.logistic import load_linear, save_linear
-from magic_perception.sight import Sight, measured
+from magic_perception.sight import Sight
 
 #: The share of things whose surface is off by less than is stated.
 SHARE = 5 / 6
@@ -98,7 +98,7 @@ def departure(mesh: Mesh, sights: list[Sight]) -> Departure:
                 away = cv2.distanceTransform((~other).view(np.uint8), cv2.DIST_L2, 5)[one]
                 if len(away) > PIXELS:
                     astray.append(pixel * float(np.partition(away, -PIXELS)[-PIXELS]))
-        points = measured(sight)
+        points = sight.measured
         points = points[:: max(1, len(points) // POINTS)]
         if len(points):
             gaps.append(scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy())
