@@ -55,25 +55,28 @@ class Clusters:
 def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Parameters, workers: Workers | None = None) -> Clusters:
     """The clusters in all looks together; known: meshes (world) that are left out."""
     pixels = [looked.heights.size for looked in looks]
-    masks, tables = zip(*shared_out(_foreground, (looks, parameters), range(len(looks)), pixels, workers), strict=True)
-    fixed = [near_known(looked, mask, known, parameters.known_margin) for looked, mask in zip(looks, masks, strict=True)]
-    masks = [mask & ~known_pixels for mask, known_pixels in zip(masks, fixed, strict=True)]
-    spots = [
-        where(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights)) for mask, looked in zip(masks, looks, strict=True)
-    ]
-    cloud = np.concatenate([looked.points(*where) for looked, where in zip(looks, spots, strict=True)])
-    made = [_bridges(looked, mask) for looked, mask in zip(looks, masks, strict=True)]
+    told = shared_out(_in_look, (looks, known, parameters), range(len(looks)), pixels, workers)
+    masks, fixed, tables, spots, clouds, made = map(list, zip(*told, strict=True))
+    cloud = np.concatenate(clouds)
     between = [bridges.place.reshape(-1, 3) for bridges in made]
     instance = clusters.cluster(np.concatenate([cloud, *between]), parameters.cluster_eps, parameters.cluster_points, voxel=0.004)
     bridges = _of_cloud(made, spots, masks)
     # A cluster of nothing but bridges is none.
     instance = _bridged(instance[: len(cloud)], bridges)
-    return Clusters(masks, fixed, list(tables), spots, cloud, instance, bridges)
+    return Clusters(masks, fixed, tables, spots, cloud, instance, bridges)
 
 
-def _foreground(given: tuple[list[Looked], Parameters], number: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    looks, parameters = given
-    return foreground(looks[number], parameters)
+def _in_look(
+    given: tuple[list[Looked], tuple[Mesh, ...], Parameters], number: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], tuple[NDArray, NDArray], NDArray[np.float32], Bridges]:
+    """What one look tells: mask, fixed, table and spots as :class:`Clusters` has them, the points (N, 3) at the spots, and the bridges between pixels."""
+    looks, known, parameters = given
+    looked = looks[number]
+    mask, table = foreground(looked, parameters)
+    fixed = near_known(looked, mask, known, parameters.known_margin)
+    mask &= ~fixed
+    spots = where(mask & np.isfinite(looked.heights) & ~smear.behind(mask, looked.heights))
+    return mask, fixed, table, spots, looked.points(*spots), _bridges(looked, mask)
 
 
 #: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise, m.

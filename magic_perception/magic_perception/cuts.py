@@ -10,7 +10,7 @@ the weights, made by ``python -m magic_perception.learn_cuts`` from procedural s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,10 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core import transforms
+from magic_core.workers import Workers
 from magic_perception import clusters, logistic
 from magic_perception.clustered import Clusters
 from magic_perception.looks import Looked
 from magic_perception.percentiles import extents, percentile
+from magic_perception.shared_out import shared_out
 
 #: What is measured at an upright plane between two sides of a cluster, and what it means.
 CRITERIA = {
@@ -226,14 +228,16 @@ def learned() -> Judge:
     return logistic.load(Path(__file__).with_name("cuts.json"), CRITERIA).odds
 
 
-def best(seen: Seen, judge: Judge) -> Plane | None:
-    """The plane that is likeliest to part two things; ``None`` where none is likelier to than not."""
-    found, most = None, 0.0
-    for plane in planes(seen.points):
-        row = measured(seen, plane)
-        if row is not None and not convex(row) and (odds := judge(row)) > most:
-            found, most = plane, odds
-    return found
+def rated(seen: Seen) -> list[tuple[Plane, NDArray[np.float64]]]:
+    """The planes whose sides are no one convex body, with their criteria (C,)."""
+    rows = [(plane, measured(seen, plane)) for plane in planes(seen.points)]
+    return [(plane, row) for plane, row in rows if row is not None and not convex(row)]
+
+
+def best(found: list[tuple[Plane, NDArray[np.float64]]], judge: Judge) -> Plane | None:
+    """Of planes with their criteria (C,) that which is likeliest to part two things; ``None`` where none is likelier to than not."""
+    odds = [judge(row) for _, row in found]
+    return found[int(np.argmax(odds))][0] if odds and max(odds) > 0 else None
 
 
 def points_of(looks: list[Looked], found: Clusters) -> Points:
@@ -270,27 +274,38 @@ def seen_of(looks: list[Looked], bared: list[NDArray[np.bool_]], cloud: NDArray[
     return Seen.of(points, lambda asked: empty(looks, bared, asked + ground))
 
 
-def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge) -> NDArray[np.int64]:
-    """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things."""
+def parted(
+    looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge, workers: Workers | None = None
+) -> NDArray[np.int64]:
+    """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things; workers: processes that look for planes as well."""
     instance = instance.copy()
     points, bared = points_of(looks, found), bare(looks, found)
-    todo = list(range(int(instance.max(initial=-1)) + 1))
+
+    def seen(labels: Iterable[int]) -> list[tuple[int, Seen]]:
+        members = [(label, np.nonzero(instance == label)[0]) for label in labels]
+        return [(label, seen_of(looks, bared, found.cloud[mine], points.of(mine))) for label, mine in members if len(mine) >= 2 * LEAST]
+
+    whole = seen(range(int(instance.max(initial=-1)) + 1))
+    things = [thing for _, thing in whole]
+    ratings = shared_out(_rated, None, things, [len(thing.points.place) for thing in things], workers)
+    todo = [(label, rating) for (label, _), rating in zip(whole, ratings, strict=True)]
     while todo:
-        label = todo.pop()
-        mine = np.nonzero(instance == label)[0]
-        if len(mine) < 2 * LEAST:
-            continue
-        own = points.of(mine)
-        plane = best(seen_of(looks, bared, found.cloud[mine], own), judge)
+        label, rating = todo.pop()
+        plane = best(rating, judge)
         if plane is None:
             continue
-        first = _first(own, plane)
+        mine = np.nonzero(instance == label)[0]
+        first = _first(points.of(mine), plane)
         if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST:
             continue
         new = int(instance.max()) + 1
         instance[mine[first]] = new
-        todo += [label, new]
+        todo += [(part, rated(thing)) for part, thing in seen((label, new))]
     return instance
+
+
+def _rated(_: None, thing: Seen) -> list[tuple[Plane, NDArray[np.float64]]]:
+    return rated(thing)
 
 
 def _first(points: Points, plane: Plane) -> NDArray[np.bool_]:

@@ -40,6 +40,8 @@ def unmeasured(look: Looked, labels: NDArray[np.int32], world_from_table: NDArra
     # Shadows beside things and lone pixels are thin.
     width = 2 * max(1, round(SHADOW / scale / 2)) + 1
     thick = cv2.morphologyEx(blank, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
+    if not thick.any():
+        return []
     count, regions, stats, _ = cv2.connectedComponentsWithStats(thick, connectivity=8)
     with np.errstate(invalid="ignore"):
         table = valid & look.inside & (np.abs(look.heights) < np.maximum(0.006, 4 * look.sigma)) & (labels == 0)

@@ -152,7 +152,7 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
             where += np.float32(pose[axis, 3])
             inside &= where > low
             inside &= where < high
-    raw[~valid] = np.nan
+    np.copyto(raw, np.float32(np.nan), where=~valid)
     with np.errstate(invalid="ignore"):
         inside &= ~((raw < np.float32(parameters.region_low[2])) | (raw > np.float32(parameters.region_high[2])))
     zero = np.where(valid, raw, np.float32(0))
@@ -178,7 +178,7 @@ def look(frame: RgbdFrame, plane: Plane, world_from_table: NDArray[np.float64], 
         sigma *= np.float32(1.4826 * np.median(np.abs(np.take(heights, sample)) / np.take(sigma, sample)))
     else:
         sigma *= np.float32(1.4826 * 0.002)
-    sigma[~valid] = 0.002
+    np.copyto(sigma, np.float32(0.002), where=~valid)
     return Looked(frame, raw, heights, inside, np.maximum(sigma, np.float32(3e-4)), world_from_table[:3, 2].copy())
 
 

@@ -75,19 +75,19 @@ def room(
     cells = np.stack(np.meshgrid(x, y, np.arange(cell / 2, high[2] + cell, cell), indexing="ij"), axis=-1)
     shape, points = cells.shape[:3], cells.reshape(-1, 3)
     # Most cells are empty to the first camera: the others are asked for what is left.
-    possible = np.arange(len(points))
+    possible, left = np.arange(len(points)), points
     seen_as: list[NDArray[np.int32]] = []
     for look, image in zip(looks, labels, strict=True):
         camera_from_table = transforms.inverse(look.frame.world_from_camera) @ world_from_table
-        there, empty = _looked_at(look, image, transforms.apply(camera_from_table, points[possible]))
-        possible, seen_as = possible[~empty], [before[~empty] for before in (*seen_as, there)]
+        there, empty = _looked_at(look, image, transforms.apply(camera_from_table, left))
+        possible, left, *seen_as = (of_all[~empty] for of_all in (possible, left, *seen_as, there))
     seen = np.stack(seen_as)
     hidden = np.any((seen != 0) & (seen != label) & (seen != ROBOT), axis=0)
     for other in others:
-        bottom, top = other.bounds
-        near = np.nonzero(hidden & np.all((points[possible] > bottom - OWN) & (points[possible] < top + OWN), axis=1))[0]
+        near, (bottom, top) = np.flatnonzero(hidden), other.bounds
+        near = near[np.all((left[near] > bottom - OWN) & (left[near] < top + OWN), axis=1)]
         if len(near):
-            hidden[near[_distances(other, points[possible[near]]) < OWN]] = False
+            hidden[near[_distances(other, left[near]) < OWN]] = False
 
     def reach(open_: NDArray[np.bool_]) -> tuple[float, NDArray[np.float32]]:
         field = np.zeros(len(points), bool)

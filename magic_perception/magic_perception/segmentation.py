@@ -53,7 +53,7 @@ class DepthSegmenter:
         instance = found.instance
         if parameters.split:
             seen = surfaces(looks, found)
-            instance = cuts.parted(looks, found, uncut(looks, found, seen, self._judge, parameters), self._cut)
+            instance = cuts.parted(looks, found, uncut(looks, found, seen, self._judge, parameters), self._cut, self._workers)
             instance = _borne(looks, found, seen, instance, self._judge)
         labels = []
         start = 0

@@ -116,7 +116,7 @@ def test_what_is_one_convex_body_is_not_asked_for_its_colours(other, one):
     seen = cuts.Seen.of(side_by_side(0.08, other, 0.0), lambda asked: seen_past(asked, other))
     row = cuts.measured(seen, cuts.planes(seen.points)[0])
     assert cuts.convex(row) == one
-    assert (cuts.best(seen, lambda _: 1.0) is None) == one
+    assert (cuts.best(cuts.rated(seen), lambda _: 1.0) is None) == one
 
 
 def test_criteria_of_two_rectangles(monkeypatch):
