@@ -307,12 +307,12 @@ class _Pair:
     def solved(self, far: bool = True) -> _Believed | None:
         """The motion that contradicts least, and what is believed of it; ``None`` where too few points are seen by both.  far: it may be far from none."""
         nothing = np.zeros(3)
-        shift = self.cheapest([self.least(x, 2) for x in ((nothing, self.begin()) if far else (nothing,))])
+        shift = self.descended([nothing, self.begin()] if far else [nothing])
         costs, seen = self.compared(shift)
         if np.count_nonzero(seen) < SEEN:
             return None
         pair = replace(self, unseen=float(np.mean(np.minimum(costs[seen], DEAREST))))
-        shift = pair.cheapest([pair.least(x, 2) for x in (nothing, shift)])
+        shift = pair.descended([nothing, shift])
         motion = pair.least(shift, 3) if far else shift
         x = motion if pair.fall(shift, motion) > FALL else shift
         errors = pair.errors(x)
@@ -329,9 +329,11 @@ class _Pair:
         middle = transforms.apply(transforms.inverse(second), transforms.apply(self.world_from_table, self.centre))
         return float(np.linalg.norm(transforms.apply(whole, middle) - middle)), transforms.rotation_angle(whole, np.eye(4))
 
-    def cheapest(self, motions: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """That of several motions (3,) which costs least."""
-        return motions[int(np.argmin(self.cost(np.stack(motions))))]
+    def descended(self, starts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Of the shifts (3,) that these lead to that which costs least; those that are the same lead to one."""
+        apart = [x for i, x in enumerate(starts) if not any(np.allclose(x, other, rtol=0, atol=1e-9) for other in starts[:i])]
+        found = [self.least(x, 2) for x in apart]
+        return found[int(np.argmin(self.cost(np.stack(found))))] if len(found) > 1 else found[0]
 
 
 def _prior(motions: NDArray[np.float64]) -> NDArray[np.float64]:
