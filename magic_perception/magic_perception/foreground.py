@@ -11,7 +11,7 @@ from magic_core.mesh import Mesh
 from magic_perception import clusters, smear
 from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
-from magic_perception.pixels import window
+from magic_perception.pixels import where, window
 
 
 def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -249,42 +249,49 @@ def _two_colors(
     anew by the share of the thing's colour in theirs, wherever the two colours differ enough to tell; those of ``firm`` (H, W) stay.
     """
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    small = mask.astype(np.uint8)
+    # The means look at most 15 pixels around, so that what lies farther off changes nothing.
+    margin = 16
+    result, things = mask.copy(), window(mask, reach + margin)
+    own, table, firm, open_, heights, color = (
+        picture[things] for picture in (mask, table, firm, looked.open, looked.heights, looked.frame.color)
+    )
+    if own.size == 0:
+        return mask
+    small = own.view(np.uint8)
     wide = cv2.dilate(small, kernel)
-    band = (wide > 0) & ~(cv2.erode(small, kernel) > 0) & looked.open
+    band = (wide > 0) & ~(cv2.erode(small, kernel) > 0) & open_
     if not band.any():
         return mask
     inner = (cv2.erode(small, np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
     # A thread of two pixels has no inside: its own pixels stand for it.
-    thin = mask & (cv2.dilate(inner, np.ones((7, 7), np.uint8)) == 0)
+    thin = own & (cv2.dilate(inner, np.ones((7, 7), np.uint8)) == 0)
     inner[thin] = 1.0
     free = (table & ~(cv2.dilate(small, np.ones((5, 5), np.uint8)) > 0)).astype(np.float32)
-    result = mask.copy()
-    # Each thing in its own window; the means look at most 15 pixels around, so that the windows change nothing.
+    moved = result[things]
+    # Each thing in its own window.
     _, _, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
     for x, y, w, h, _ in stats[1:]:
-        margin = 16
-        r0, r1, c0, c1 = max(y - margin, 0), min(y + h + margin, mask.shape[0]), max(x - margin, 0), min(x + w + margin, mask.shape[1])
-        cut = (slice(r0, r1), slice(c0, c1))
-        lab = cv2.cvtColor(np.ascontiguousarray(looked.frame.color[cut]), cv2.COLOR_RGB2LAB).astype(np.float32)
-        where = np.zeros(lab.shape[:2], bool)
+        r0, c0 = max(y - margin, 0), max(x - margin, 0)
+        cut = (slice(r0, y + h + margin), slice(c0, x + w + margin))
+        lab = cv2.cvtColor(np.ascontiguousarray(color[cut]), cv2.COLOR_RGB2LAB).astype(np.float32)
+        near = np.zeros(lab.shape[:2], bool)
         middle = (slice(y - r0, y - r0 + h), slice(x - c0, x - c0 + w))
-        where[middle] = band[cut][middle]
-        where = np.nonzero(where)
-        own, share = masked_mean_at(lab, inner[cut], 13, where)
-        ground, ground_share = masked_mean_at(lab, free[cut], 31, where)
-        difference = own - ground
+        near[middle] = band[cut][middle]
+        spots = where(near)
+        thing, share = masked_mean_at(lab, inner[cut], 13, spots)
+        ground, ground_share = masked_mean_at(lab, free[cut], 31, spots)
+        difference = thing - ground
         length = _total(difference**2)
-        offset = lab[where] - ground
+        offset = lab[spots] - ground
         part = _total(offset * difference) / np.maximum(length, 1.0)
         # A pixel on the edge has a mixture of the two colours; a third colour (a side in the shade) tells nothing.
         rest = _total((offset - part[..., None] * difference) ** 2)
-        before = mask[cut][where]
-        told = ~(firm[cut][where] & before) & ((rest < 9.0**2) | ~before) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
+        before = own[cut][spots]
+        told = ~(firm[cut][spots] & before) & ((rest < 9.0**2) | ~before) & (length > 15.0**2) & (share > 0.02) & (ground_share > 0.05)
         # Grow only into what depth does not contradict, and by what touches the mask.
         with np.errstate(invalid="ignore"):
-            possible = ~(looked.heights[cut][where] <= -0.006)
-        result[cut][where] = np.where(told, (part > 0.5) & (before | possible), result[cut][where])
+            possible = ~(heights[cut][spots] <= -0.006)
+        moved[cut][spots] = np.where(told, (part > 0.5) & (before | possible), moved[cut][spots])
     return clusters.connected(result, mask, 8)
 
 
