@@ -15,6 +15,7 @@ from magic_core.mesh import Mesh, concatenate
 from magic_perception import polygons
 from magic_perception.foreground import open_by_two
 from magic_perception.parameters import Parameters
+from magic_perception.percentiles import bounds
 from magic_perception.sight import Sight, carve, surfaces
 from magic_perception.solids import Reconstruction, extruded, joined
 
@@ -36,8 +37,9 @@ class Grid:
 
 def height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> Grid:
     """The highest points (N, 3) over each cell; gaps of two cells closed, threads of one cell dropped."""
-    low = points[:, :2].min(axis=0) - margin * cell
-    size = np.ceil((points[:, :2].max(axis=0) - low) / cell).astype(int) + margin + 1
+    low, high = bounds(points[:, :2])
+    low = low - margin * cell
+    size = np.ceil((high - low) / cell).astype(int) + margin + 1
     if size.max() > 1200:
         raise MagicError(
             Code.RECONSTRUCTION_FAILED, "extent of one object in metres", np.round(size * cell, 2).tolist(), f"below {1200 * cell}"

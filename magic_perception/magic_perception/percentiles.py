@@ -1,4 +1,4 @@
-"""Percentiles of few numbers, which numpy takes longer to look at than to find, and extents by them."""
+"""Percentiles of few numbers, which numpy takes longer to look at than to find, extents by them, and bounds."""
 
 from __future__ import annotations
 
@@ -22,3 +22,9 @@ def extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
     local = place - place.mean(axis=0)
     axes = np.linalg.eigh(local.T @ local)[1]
     return np.array([percentile(along, 95) - percentile(along, 5) for along in (local @ axes).T])
+
+
+def bounds(points: NDArray) -> tuple[NDArray, NDArray]:
+    """The lowest and the highest coordinates (D,) of points (N, D): along the longer side of an array numpy takes many times as long to find them."""
+    axes = points.T
+    return np.array([along.min() for along in axes]), np.array([along.max() for along in axes])

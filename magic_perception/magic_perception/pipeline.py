@@ -26,6 +26,7 @@ from magic_perception.glass import once, unmeasured
 from magic_perception.hidden import ROBOT, hangs, mostly_held, parted, veil
 from magic_perception.looks import Looked, find_table, frame_on, look
 from magic_perception.parameters import Parameters
+from magic_perception.percentiles import bounds
 from magic_perception.reconstruction import Reconstruction, Sight, reconstruct
 from magic_perception.room import bordered, room
 from magic_perception.seen import cut_off, joined, witnessed
@@ -417,7 +418,7 @@ class _Built:
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The lowest and the highest coordinates (3,) of its points."""
-        return self.points.min(axis=0), self.points.max(axis=0)
+        return bounds(self.points)
 
     @cached_property
     def shade(self) -> NDArray[np.float32]:

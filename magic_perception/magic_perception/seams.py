@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_perception import logistic
+from magic_perception.percentiles import percentile
 
 #: What is measured at a seam between two parts, and what it means.
 CRITERIA = {
@@ -93,7 +94,7 @@ def _part(voxels: Voxels, part: NDArray[np.int64], number: int, shade: NDArray[n
     inside = (part[voxels.a] == number) & (part[voxels.b] == number)
     change = np.linalg.norm(voxels.rgb[voxels.a[inside]] - voxels.rgb[voxels.b[inside]], axis=1)
     return _Part(
-        members, np.sort(extents), float(np.percentile(height, 2)), float(np.percentile(height, 97)), float(np.median(height)),
+        members, np.sort(extents), percentile(height, 2), percentile(height, 97), float(np.median(height)),
         shade[members].mean(axis=0), axes[0], float(np.median(change)) if len(change) else 0.0,
     )  # fmt: skip
 

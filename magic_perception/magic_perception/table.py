@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
-from magic_perception.percentiles import extents
+from magic_perception.percentiles import bounds, extents
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ def standing(
     level by more than 12 mm, and around which at least six tenths of what is seen is the level.  It counts by the share of its outline at which the level
     is seen: specks of noise on a floor far below have gaps around them.
     """
-    low = xy.min(axis=0) - 4 * cell
+    low = bounds(xy)[0] - 4 * cell
     index = np.floor((xy - low) / cell).astype(int)
-    size = index.max(axis=0) + 5
+    size = bounds(index)[1] + 5
     if size.max() > 1000:
         return 0.0, 0.0
     flat = index[:, 0] * size[1] + index[:, 1]
