@@ -184,11 +184,11 @@ def witnessed(mesh: Mesh, sights: list[Sight], count: int = 800, seed: int = 0) 
         toward = sight.eye - points
         distance = np.linalg.norm(toward, axis=1)
         facing = np.sum(normals * toward, axis=1) > 0.1 * distance
-        start = points + 0.0015 * toward / distance[:, None]
-        rays = np.concatenate([start, sight.eye - start], axis=1).astype(np.float32)
-        free = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() > 1
         inside, blind, z, measured = sight.sample(points)
-        visible = facing & free & (inside > 0.5) & ~blind
+        visible = facing & (inside > 0.5) & ~blind
+        start = (points + 0.0015 * toward / distance[:, None])[visible]
+        rays = np.concatenate([start, sight.eye - start], axis=1).astype(np.float32)
+        visible[visible] = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() > 1
         with np.errstate(invalid="ignore"):
             near = ~np.isfinite(measured) | (np.abs(measured - z) < 0.012)
         seen |= visible & near

@@ -266,17 +266,19 @@ def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.
         )
         depth = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
         drawn = np.isfinite(depth)
-        far = np.float32(5.0)
-        rays[..., :3] += far * rays[..., 3:]
-        rays[..., 3:] *= -1
-        thickness = far - scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() - depth
         where = np.ix_(v, u)
-        mask, told = sight.mask[where], ~sight.hidden[where]
+        mask, told, seen = sight.mask[where], ~sight.hidden[where], sight.depth[where]
         with np.errstate(invalid="ignore"):
-            told &= mask | ~(sight.depth[where] < depth - 0.02)  # something in front of it
+            told &= mask | ~(seen < depth - 0.02)  # something in front of it
         overlaps.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
         inner = cv2.erode(drawn.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & told
         with np.errstate(invalid="ignore"):
-            on = inner & (~mask | (sight.depth[where] > depth + np.maximum(max(margin, 3 * sight.sigma), 0.25 * thickness)))
-        passed.append(np.count_nonzero(on) / max(np.count_nonzero(inner), 1))
+            into = inner & mask & (seen > depth + max(margin, 3 * sight.sigma))
+        if into.any():
+            far, back = np.float32(5.0), rays[into]
+            back[:, :3] += far * back[:, 3:]
+            back[:, 3:] *= -1
+            thickness = far - scene.cast_rays(o3d.core.Tensor(back))["t_hit"].numpy() - depth[into]
+            into[into] = seen[into] > depth[into] + 0.25 * thickness
+        passed.append(np.count_nonzero(into | (inner & ~mask)) / max(np.count_nonzero(inner), 1))
     return Agreement(float(np.mean(overlaps)), float(max(passed)))
