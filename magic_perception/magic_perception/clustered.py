@@ -98,7 +98,7 @@ def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> Bridg
     _, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     source = np.zeros(int(index.max()) + 1, np.int64)
     source[index[seen]] = np.flatnonzero(seen)
-    goes, flat = source[index], cv2.connectedComponents(own.view(np.uint8), connectivity=8)[1].ravel()
+    goes, flat = np.take(source, index), cv2.connectedComponents(own.view(np.uint8), connectivity=8)[1].ravel()
     meetings = []
     for axis in range(2):
         one, two, here, there, first, second = (

@@ -86,5 +86,5 @@ def connected(field: NDArray[np.bool_], seed: NDArray[np.bool_], connectivity: i
     touched = np.zeros(count, bool)
     touched[regions[seed[cut] & field[cut]]] = True
     touched[0] = False
-    result[cut] = touched[regions]
+    result[cut] = np.take(touched, regions)  # in half the time of ``touched[regions]``
     return result

@@ -191,7 +191,7 @@ def _closed(high: NDArray[np.bool_], missing: NDArray[np.bool_], other: NDArray[
     size, told, inner = (np.bincount(regions[where], minlength=count) for where in (closed > 0, other, broad))
     plain = (inner > 0) & (told < 0.5 * size)
     plain[0] = False
-    return plain[regions] & ~other
+    return np.take(plain, regions) & ~other
 
 
 def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:
@@ -219,7 +219,7 @@ def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_
     _, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
     small = stats[:, cv2.CC_STAT_AREA] < 12
     small[0] = False
-    result[cut] |= small[labels]
+    result[cut] |= np.take(small, labels)
     for i in np.flatnonzero(~small)[1:]:
         x, y, w, h, _ = stats[i]
         part = labels[y : y + h, x : x + w] == i

@@ -43,7 +43,7 @@ def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0
     labelled = np.zeros(count, bool)
     labelled[regions[seen]] = True
     labelled[0] = False
-    missing = (part == 0) & labelled[regions]
+    missing = (part == 0) & np.take(labelled, regions)
     near = window(missing, margin)
     part, seen, missing = part[near], seen[near], missing[near]
     if not seen.any():
@@ -52,7 +52,7 @@ def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0
     table = np.zeros(int(np.count_nonzero(seen)) + 1, np.int32)
     table[index[seen]] = part[seen]
     result = labels.copy()
-    result[cut][near] = np.where(missing & (distance <= reach), table[index], part)
+    result[cut][near] = np.where(missing & (distance <= reach), np.take(table, index), part)
     return result
 
 
@@ -96,4 +96,4 @@ def sizeable(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: P
     table[-1] = -1
     for new, (_, old) in enumerate(keep):
         table[old] = new + 1
-    return [table[image] for image in labels]
+    return [np.take(table, image) for image in labels]

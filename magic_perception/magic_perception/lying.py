@@ -65,7 +65,7 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
     _, index = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     table = np.zeros(int(index.max()) + 1, np.float32)
     table[index[known]] = values[known]
-    return table[index]
+    return np.take(table, index)
 
 
 @dataclass(frozen=True)

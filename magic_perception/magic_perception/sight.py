@@ -55,7 +55,7 @@ class Sight:
         distance, index = cv2.distanceTransformWithLabels((~known).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
         value = np.zeros(int(np.count_nonzero(known)) + 1, np.float32)
         value[index[known]] = heights[known]
-        return mask & (distance < 12), cv2.medianBlur(value[index], 5), distance, r0, c0
+        return mask & (distance < 12), cv2.medianBlur(np.take(value, index), 5), distance, r0, c0
 
     @cached_property
     def _camera_from_table(self) -> NDArray[np.float64]:

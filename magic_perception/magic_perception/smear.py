@@ -168,11 +168,11 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
     nearest = cv2.distanceTransformWithLabels(padded.view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     firm = np.zeros(int(nearest.max()) + 1, bool)
     firm[nearest[padded & (within < 1.5) & ~np.pad(near.jump, 1)]] = True
-    within, goes_on = within[1:-1, 1:-1], firm[nearest[1:-1, 1:-1]]
+    within, goes_on = within[1:-1, 1:-1], np.take(firm, nearest[1:-1, 1:-1])
 
     def field(own: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log of how much likelier each pixel's colour is around the thing than on it, of which ``own`` is a sample."""
-        return cv2.blur(np.log((ground + FLAT) / (_density(index[own]) + FLAT))[index], (3, 3))
+        return cv2.blur(np.take(np.log((ground + FLAT) / (_density(index[own]) + FLAT)), index), (3, 3))
 
     inner = mine & (within > min(most, 0.6 * float(within.max())))
     other = inner & (near.unlike >= LIKE)
@@ -213,7 +213,7 @@ def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float
     table[nearest[outside]] = np.pad(far, 1, constant_values=np.inf)[outside]
     result = np.zeros_like(mask)
     with np.errstate(invalid="ignore"):
-        result[cut] = own & ~(table[nearest[1:-1, 1:-1]] - z < STEP + within[1:-1, 1:-1] * z / focal)
+        result[cut] = own & ~(np.take(table, nearest[1:-1, 1:-1]) - z < STEP + within[1:-1, 1:-1] * z / focal)
     return result
 
 
@@ -395,7 +395,7 @@ def before(mask: NDArray[np.bool_], others: NDArray[np.bool_], depth: NDArray[np
     _, index = cv2.distanceTransformWithLabels((~inner).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     value = np.zeros(int(np.count_nonzero(inner)) + 1, np.float32)
     value[index[inner]] = measured[inner]
-    own = value[index]
+    own = np.take(value, index)
     with np.errstate(invalid="ignore"):
         result[cut] = mine & (own - nearest > APART_IN_DEPTH) & (measured < 0.75 * own + 0.25 * nearest)
     return result
