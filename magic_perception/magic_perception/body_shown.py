@@ -100,8 +100,9 @@ def _unlike(
 def _look_of(
     basis: NDArray[np.float64], log: NDArray[np.float32], bright: NDArray[np.float32], stiff: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """The look (B, 3) of pixels by their waves and levels (N, B), with what each channel is off by (3,); ``None`` where they are too few or too uneven.
+    """The look (B, 3) of pixels by their waves and levels (N, B), with what each channel is off by (3,).
 
+    ``None`` where they are too few or too uneven.
     bright (N, 3): their colour above :data:`DARK`; log: of that; stiff (B, B).
     """
     keep = np.ones(len(basis), bool)

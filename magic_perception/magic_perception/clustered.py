@@ -69,7 +69,7 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
 def _in_look(
     given: tuple[list[Looked], tuple[Mesh, ...], Parameters], number: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], tuple[NDArray, NDArray], NDArray[np.float32], Bridges]:
-    """What one look tells: mask, fixed, table and spots as :class:`Clusters` has them, the points (N, 3) at the spots, and the bridges between pixels."""
+    """What one look tells: mask, fixed, table and spots as :class:`Clusters` has them, the points (N, 3) at the spots, and bridges between pixels."""
     looks, known, parameters = given
     looked = looks[number]
     mask, table = foreground(looked, parameters)

@@ -55,7 +55,10 @@ FEW = 8
 
 
 def linked(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The part (count,) that each of so many things belongs to where links (L,) join things ``a`` and ``b``, numbered in the order of their first ones."""
+    """The part (count,) that each of so many things belongs to where links (L,) join things ``a`` and ``b``.
+
+    Parts are numbered in the order of their first things.
+    """
     part = _linked(count, a[::FEW], b[::FEW])
     rest = part[a] != part[b]
     return _linked(int(part.max(initial=-1)) + 1, part[a[rest]], part[b[rest]])[part]

@@ -277,7 +277,10 @@ def seen_of(looks: list[Looked], bared: list[NDArray[np.bool_]], cloud: NDArray[
 def parted(
     looks: list[Looked], found: Clusters, instance: NDArray[np.int64], judge: Judge, workers: Workers | None = None
 ) -> NDArray[np.int64]:
-    """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things; workers: processes that look for planes as well."""
+    """The instances (N,) of the cloud's points with those parted that an upright plane parts into two things.
+
+    workers: processes that look for planes as well.
+    """
     instance = instance.copy()
     points, bared = points_of(looks, found), bare(looks, found)
 

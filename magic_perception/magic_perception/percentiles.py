@@ -25,6 +25,9 @@ def extents(place: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def bounds(points: NDArray) -> tuple[NDArray, NDArray]:
-    """The lowest and the highest coordinates (D,) of points (N, D): along the longer side of an array numpy takes many times as long to find them."""
+    """The lowest and the highest coordinates (D,) of points (N, D).
+
+    Along the longer side of an array numpy takes many times as long to find them.
+    """
     axes = points.T
     return np.array([along.min() for along in axes]), np.array([along.max() for along in axes])

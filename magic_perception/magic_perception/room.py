@@ -110,7 +110,7 @@ def room(
 
 
 def _looked_at(look: Looked, labels: NDArray[np.int32], local: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """At points (N, 3) in the camera's frame: the label of their pixels (0 outside of the picture), and whether the camera sees the places to be empty."""
+    """At points (N, 3) in the camera's frame: the label of their pixels (0 outside of the picture), and whether the camera sees them to be empty."""
     k = look.frame.intrinsics
     z = np.maximum(local[:, 2], 1e-3)
     u, v = np.rint(k.fx * local[:, 0] / z + k.cx), np.rint(k.fy * local[:, 1] / z + k.cy)
