@@ -387,7 +387,8 @@ def drawn_in(
     # In a hole that is hardly wider than the target only its middle is clear.
     around, surface = Raycaster([_solid(target).transformed(target.world_from_object)]), _surface(tool)
     some = [_scaled(strategy, meets, share) for share in SHARES]
-    roomiest = max(some, key=lambda changed: float(around.distances(_swept(surface, poses_of(changed, 0))).min()))
+    clear = [changed for changed in some if not _touches_on(held, poses_of(changed, 0), fixed)] or some[-1:]
+    roomiest = max(clear, key=lambda changed: float(around.distances(_swept(surface, poses_of(changed, 0))).min()))
     middle = _with_room(roomiest, meets, tool, poses_of(roomiest, 0), target, world_from_contact)
     return strategy if _touches_on(held, poses_of(middle, 0), fixed) else middle
 
