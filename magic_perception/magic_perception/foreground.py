@@ -133,6 +133,81 @@ def _plates(faint: NDArray[np.bool_], core: NDArray[np.bool_], looked: Looked) -
     return result
 
 
+#: What is so high, m, shades and mirrors itself beside its foot.
+TALL = 0.012
+
+
+def _beyond(raised: NDArray[np.bool_], looked: Looked) -> NDArray[np.bool_]:
+    """(H, W): what is beyond the strip in which something tall of what is ``raised`` is mirrored, shades the table and has its depth
+    carried to."""
+    with np.errstate(invalid="ignore"):
+        low = ~(raised & (looked.heights > TALL))
+    return cv2.distanceTransform(low.view(np.uint8), cv2.DIST_L2, 3) > MIRRORED * looked.frame.intrinsics.fx / 615 + 1
+
+
+#: The rest of a thing of which parts are seen to be higher than the noise is as a whole so many metres above the table beside it.
+LOW_REST = 0.0015
+#: The table beside it is what is so many pixels from it, at a focal length of 615.
+RING = (6, 18)
+#: It tells its height where it has so many pixels.
+RING_PIXELS = 100
+
+
+def _rest(
+    vivid: NDArray[np.bool_],
+    core: NDArray[np.bool_],
+    raised: NDArray[np.bool_],
+    beyond: NDArray[np.bool_],
+    table: NDArray[np.bool_],
+    looked: Looked,
+) -> NDArray[np.bool_]:
+    """(H, W): what goes on from the ``core`` in a colour that no shadow makes of the table's (``vivid``), lower than the noise of a
+    pixel, and is above the table as a whole.
+
+    Of a thin thing noise lifts a part here and there, and what those alone tell is none of its shape.  A print on the table has no
+    height, and a strip no wider than that in which a thing is mirrored and shades the table at its foot tells nothing.
+    """
+    result = np.zeros_like(core)
+    high = cv2.dilate(raised.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    more = vivid & ~core & ~high & beyond
+    if not more.any():
+        return result
+    _, regions, stats, _ = cv2.connectedComponentsWithStats(((vivid | core) & ~high).view(np.uint8), connectivity=8)
+    touched = cv2.dilate(core.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
+    scale = looked.frame.intrinsics.fx / 615
+    margin = round(RING[1] * scale) + 1
+    for label in np.intersect1d(regions[more], regions[touched & (regions > 0)]):
+        x, y, w, h, _ = stats[label]
+        cut = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+        mine = regions[cut] == label
+        far = mine & beyond[cut]
+        apart = cv2.distanceTransform((~mine).view(np.uint8), cv2.DIST_L2, 3)
+        beside = table[cut] & ~touched[cut] & (apart > RING[0] * scale) & (apart < RING[1] * scale)
+        heights, ground = (looked.raw[cut][where & np.isfinite(looked.raw[cut])] for where in (far, beside))
+        if 2 * len(heights) <= np.count_nonzero(far) or len(ground) < RING_PIXELS:
+            continue
+        error = float(np.median(looked.sigma[cut][mine])) * np.sqrt(GRAIN / len(heights) + GRAIN / len(ground))
+        if float(heights.mean() - ground.mean()) > max(LOW_REST, SURE * error):
+            result[cut] |= mine
+    return result
+
+
+#: A colour is a thing's where it is so many times as frequent on what is seen to be of things as on the table (logarithm).
+FREQUENT = 2.5
+#: What is seen to be of things tells its colours where it has so many pixels.
+SEEDS = 60
+
+
+def _own_colors(lab: NDArray[np.uint8], low: NDArray[np.bool_], table: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W): what has the colours of parts of thin things that are seen to be above the table (``low``), which hardly anything else of
+    the table has; lab (H, W, 3).
+
+    The rest of such a thing is lower than the noise, and taken for the table it would hide the thing from all that compares with the
+    table's colours.
+    """
+    return table & (smear.likelier(lab, low, table) > FREQUENT)
+
+
 def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(H, W): pixels of things on the table: higher than the noise, or of another colour than the table and not lying in it; and (H, W)
     those of the table's colour, in the light or in a shadow."""
@@ -148,12 +223,30 @@ def foreground(looked: Looked, parameters: Parameters) -> tuple[NDArray[np.bool_
     table = _outside(valid & (np.abs(zero) < limit) & inside & ~around, raised)
     if np.count_nonzero(table) < 500:
         return raised, np.zeros_like(raised)
+
     lab = smear.softened(looked.frame.color)
-    distance, shaded = color_distance(lab, table)
-    sample = np.flatnonzero(table)[::7]
-    other = (distance > max(OTHER, notice(distance, sample))) & inside
-    core = raised | lifted(other, looked, zero)
-    core |= _plates((shaded > max(FAINT, notice(shaded, sample))) & (distance > FAINT) & inside, core, looked)
+    beyond = _beyond(raised, looked)
+
+    def seen(table: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+        """What is surely of things, what has another colour than the table, and how far from the table's all colours are, in the light
+        and in a shadow."""
+        distance, shaded = color_distance(lab, table)
+        sample = np.flatnonzero(table)[::7]
+        other = (distance > max(OTHER, notice(distance, sample))) & inside
+        unshaded = notice(shaded, sample)
+        core = raised | lifted(other, looked, zero)
+        core |= _plates((shaded > max(FAINT, unshaded)) & (distance > FAINT) & inside, core, looked)
+        core |= _rest(other & (shaded > max(OTHER, unshaded)), core, raised, beyond, table, looked)
+        return core, other, distance, shaded
+
+    core, other, distance, shaded = seen(table)
+    low = core & beyond
+    if np.count_nonzero(low) >= SEEDS and np.count_nonzero(low := _outside(low, raised)) >= SEEDS:
+        own = table & _rest(_own_colors(lab, low, table), low, raised, beyond, table, looked)
+        # Where most of a thing is seen nothing of the table has to be told anew.
+        if np.count_nonzero(own) > np.count_nonzero(low):
+            table &= ~own
+            core, other, distance, shaded = seen(table)
     depth, focal = looked.frame.depth, looked.frame.intrinsics.fx
 
     def of(core: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
@@ -195,7 +288,8 @@ def _closed(high: NDArray[np.bool_], missing: NDArray[np.bool_], other: NDArray[
 
 
 def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:
-    """The table without what lies in the convex hull of something raised: the floor of a bowl is as low as the table, but has the bowl's colour.
+    """The table, or what else (H, W), without what lies in the convex hull of something raised: the floor of a bowl is as low as the table,
+    but has the bowl's colour.
 
     What spans more than ``share`` of the picture (a tray's rim, a wall) encloses the table itself.
     """

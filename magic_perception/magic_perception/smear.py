@@ -67,6 +67,12 @@ def _density(index: NDArray[np.int32]) -> NDArray[np.float32]:
     return (counts / counts.sum()).ravel()
 
 
+def likelier(lab: NDArray[np.uint8], one: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Log of how much likelier each pixel's colour (H, W, 3) is in a region ``one`` (H, W) than in another."""
+    index = _index(lab)
+    return cv2.blur(np.take(np.log((_density(index[one]) + FLAT) / (_density(index[other]) + FLAT)), index), (3, 3))
+
+
 #: How dark a shadow beside a thing makes the table, and how much of the table is taken to lie in one.
 SHADES, SHADED = (0.9, 0.8, 0.7, 0.6), 0.15
 
