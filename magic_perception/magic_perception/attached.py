@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from magic_core import transforms
 from magic_perception import smear
+from magic_perception.hidden import CLEAR, FOOT, hangs, seen_through
 from magic_perception.looks import Looked
 
 #: The widest gap and the least height over the table of what hangs in the air, m.
@@ -36,7 +37,8 @@ def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.i
     """For each label (top + 1,) the one it belongs to, itself mostly: a smaller one of the same colour that touches a larger one in every picture which shows it.
 
     It belongs to the other where it hangs in the air, carried by nothing; where they meet in a thin bar that has lost its depth; or where both enclose a hole,
-    as a handle does with its mug, or it is a strip along the other's edge, and no camera sees between them.
+    as a handle does with its mug, or it is a strip along the other's edge, and no camera sees between them; or where one would hang over
+    the other, and something that no camera sees may carry it, as the stem does a goblet's cup.
     """
     top = max((int(image.max()) for image in labels), default=0)
     owner = np.arange(top + 1)
@@ -57,6 +59,9 @@ def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.i
             one, two = part(label), part(other)
             if min(len(one.points), len(two.points)) < 20 or float(np.linalg.norm(one.shade - two.shade)) > COLOR:
                 continue
+            if _over(labels, looks, (label, one), (other, two)):
+                owner[label] = other
+                break
             ways, gap = _ways(one, two)
             if gap > LOST_BAR:
                 continue
@@ -77,6 +82,23 @@ def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.i
         while owner[owner[label]] != owner[label]:
             owner[label] = owner[owner[label]]
     return owner
+
+
+def doubtful(labels: list[NDArray[np.int32]], looks: list[Looked]) -> list[tuple[int, int]]:
+    """The pairs of labels that may be parts of one thing, though nothing says that they are: of one colour, beside each other in every
+    picture that shows the one or the other, and no camera sees between."""
+    beside = {label: _beside(labels, label) for label in range(1, max((int(image.max()) for image in labels), default=0) + 1)}
+    near = {(min(label, other), max(label, other)) for label, others in beside.items() for other in others}
+    parts = {label: _Part.of(label, labels, looks) for label in {label for pair in near for label in pair}}
+    found = []
+    for pair in sorted(near):
+        one, two = (parts[label] for label in pair)
+        if min(len(one.points), len(two.points)) < 20 or float(np.linalg.norm(one.shade - two.shade)) > COLOR:
+            continue
+        ways, gap = _ways(one, two)
+        if gap <= LOST_BAR and not _seen_between(ways, labels, looks, pair):
+            found.append(pair)
+    return found
 
 
 @dataclass(frozen=True)
@@ -137,6 +159,30 @@ def _hangs(part: _Part, other: _Part) -> bool:
     # Carried: the other ends at its foot.
     below = cKDTree(other.points[:, :2]).query_ball_point(np.median(foot[:, :2], axis=0), 0.02)
     return not (len(below) > 4 and bottom - 0.015 < float(np.percentile(other.heights[below], 95)) < bottom + 0.010)
+
+
+def _over(labels: list[NDArray[np.int32]], looks: list[Looked], *both: tuple[int, _Part]) -> bool:
+    """Whether one of two labels would hang over the other, which stands on the table under its middle, and no camera sees that the column
+    between is empty."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    (_, lower), (label, upper) = sorted(both, key=lambda pair: float(np.percentile(pair[1].heights, 5)))
+    bottom = float(np.percentile(upper.heights, 5))
+    if np.percentile(lower.heights, 10) >= LIFTED or bottom < CLEAR or not hangs(looks, labels, label):
+        return False
+    feet = upper.points - upper.heights[:, None] * looks[0].normal
+    low, high = np.percentile(feet, [2, 98], axis=0)
+    middle = (low + high) / 2
+    plan = lower.points[:, :2].astype(float)
+    try:
+        corners = plan[ConvexHull(plan).vertices]
+    except QhullError:
+        return False
+    outline = np.append(corners, corners[:1], axis=0).astype(np.float32)[:, None]
+    if cv2.pointPolygonTest(outline, (float(middle[0]), float(middle[1])), True) < -GAP:
+        return False
+    beside = np.stack(np.meshgrid(*[np.linspace(-FOOT, FOOT, 5)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    return not seen_through(looks, labels, middle + beside, np.full(len(beside), bottom)).all()
 
 
 def _loop(labels: list[NDArray[np.int32]], label: int, other: int) -> bool:

@@ -208,18 +208,18 @@ def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixt
     order = np.argsort(height)[: max(20, len(points) // 10)]
     order = order[:: max(1, len(order) // 150)]
     feet = points - height[:, None] * looks[0].normal
-    seen_through = _seen_through(looks, labels, feet[order], height[order])
-    if np.mean(seen_through) <= MOST:
+    empty = seen_through(looks, labels, feet[order], height[order])
+    if np.mean(empty) <= MOST:
         return False
     if np.percentile(height, 1) > UNDERSIDE * np.percentile(height, 98):
         return True
     low, high = np.percentile(feet, [2, 98], axis=0)
     beside = np.stack(np.meshgrid(*[np.linspace(-FOOT, FOOT, 5)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     under = (low + high) / 2 + beside
-    return float(np.mean(_seen_through(looks, labels, under, np.full(len(under), np.percentile(height, 5))))) > MOST
+    return float(np.mean(seen_through(looks, labels, under, np.full(len(under), np.percentile(height, 5))))) > MOST
 
 
-def _seen_through(
+def seen_through(
     looks: list[Looked], labels: list[NDArray[np.int32]], feet: NDArray[np.float64], height: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
     """(N,): whether a camera sees an empty place in the columns that rise from the table at ``feet`` (N, 3) to just below ``height`` (N,), m."""

@@ -35,7 +35,7 @@ from magic_perception.shared_out import Shared, shared_out
 from magic_perception.sight import agreement
 from magic_perception.smear import before, behind
 from magic_perception.solids import hangs_together, hull_of
-from magic_perception.surface_error import Departure, departure, likely
+from magic_perception.surface_error import MOST, Departure, beyond, departure, likely
 from magic_perception.table import Plane
 
 #: A frame with fewer pixels of depth shows nothing; nor does one with fewer of a thing tell of that.
@@ -168,15 +168,22 @@ def perceive(
             report.labels = [
                 next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)
             ]
-            hidden = shared_out(_hidden, (solids, views), range(len(solids)), [len(built.points) for built in solids], workers)
+            sizes = [len(built.points) for built in solids]
+            hidden = shared_out(_hidden, (solids, views), range(len(solids)), sizes, workers)
+            pairs = attached.doubtful(views.labels, views.looks)
+            off = shared_out(_off_at_most, (solids, views, pairs), range(len(solids)), sizes, workers)
 
     with report.stage("views"):
         objects = []
-        for built, by in zip(solids, hidden, strict=True):
+        for built, by, at_most in zip(solids, hidden, off, strict=True):
             item = _as_object(built, world_from_table)
             # What hides a thing and was left out itself is as nameless as a fixture.
             names = dict.fromkeys(name if isinstance(name, str) else ids.get(name, FIXTURE) for name in by)
-            objects.append(replace(item, id=ids[built.label], cut_off=tuple(names)))
+            objects.append(
+                replace(
+                    item, id=ids[built.label], cut_off=tuple(names), surface_error=min(float(np.hypot(item.surface_error, at_most)), MOST)
+                )
+            )
             _tell(report, built, objects[-1])
     plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
     stamp = max(frame.stamp for frame in used)
@@ -527,6 +534,8 @@ def _seen(label: int, views: _Views, parameters: Parameters) -> _Seen:
     if not sights:
         raise MagicError(Code.RECONSTRUCTION_FAILED, "pixels of the object", max(counts), f"at least {FEW} in one camera")
     points, colors = np.concatenate(clouds).astype(float), np.concatenate(paints)
+    if not len(points):
+        raise MagicError(Code.RECONSTRUCTION_FAILED, "pixels of the object with depth of its own", 0, "at least 1")
     keep = clusters.largest(points, parameters.cluster_eps, parameters.cluster_points, 0.006)
     return _Seen(sights, points[keep], colors[keep], counts)
 
@@ -573,6 +582,20 @@ def _goes_on(one: _Built, other: _Built, normal: NDArray[np.float64]) -> bool:
         ends.append((float(np.percentile(built.points[near] @ normal, 95)), attached.shade(built.colors[near])))
     (height, shade), (level, tint) = ends
     return abs(height - level) < LEVEL and float(np.linalg.norm(shade - tint)) < SHADE
+
+
+def _off_at_most(given: tuple[list[_Built], _Views, list[tuple[int, int]]], number: int) -> float:
+    """How far the surface of one of the things is off, m, if all that may be a part of it is; 0 where nothing may.
+
+    given: with the pairs of labels that may be parts of one thing (:func:`magic_perception.attached.doubtful`).
+    """
+    solids, views, pairs = given
+    built = solids[number]
+    rest = [other for other in solids if (built.label, other.label) in pairs or (other.label, built.label) in pairs]
+    if not rest:
+        return 0.0
+    table_from_world = transforms.inverse(views.world_from_table)
+    return beyond(built.solid.mesh, *(transforms.apply(table_from_world, one.points) for one in (built, *rest)))
 
 
 def _nearest(one: _Built, other: _Built, reach: float, most: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

@@ -185,6 +185,17 @@ def likely(evidence: Evidence, departed: Departure) -> float:
     return _learned().error(row(evidence, departed))
 
 
+def beyond(mesh: Mesh, own: NDArray[np.float64], *others: NDArray[np.float64]) -> float:
+    """How far a surface is off, m, as :func:`distance` has it, if what was seen of other things is a part of this one.
+
+    own (N, 3), others (M, 3) each: the points that were seen, in the frame of ``mesh``.
+    """
+    clouds = [points[:: max(1, len(points) // POINTS)] for points in (own, *others)]
+    squares = [float(np.square(Raycaster([mesh]).distances(points)).mean()) for points in clouds]
+    # The surface itself is none of it off: half of the mean over both.
+    return float(np.sqrt(np.average(squares, weights=[len(own), *(len(points) for points in others)]) / 2))
+
+
 def distance(one: Mesh, other: Mesh, points: int = 1500) -> float:
     """How far two surfaces are apart: root mean square distance, m, from points on each to the other."""
     import trimesh

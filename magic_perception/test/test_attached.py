@@ -96,6 +96,48 @@ def test_a_bar_that_has_lost_its_depth_where_it_meets_a_thing_belongs_to_it(widt
     assert attached.owners(labels, looks)[2] == owner
 
 
+def disc(radius: float, low: float, high: float, color: tuple[int, int, int] = BLUE) -> Mesh:
+    """An upright disc between two heights, m."""
+    solid = trimesh.creation.cylinder(radius, segment=[[0.5, 0.0, low], [0.5, 0.0, high]])
+    return mesh(solid, color)
+
+
+@pytest.mark.parametrize(
+    ("color", "radius", "post", "owner"),
+    [
+        pytest.param(BLUE, 0.045, 0.018, 1, id="a post that the cameras do not see through carries it"),
+        pytest.param(BLUE, 0.025, None, 2, id="the cameras see that nothing carries it"),
+        pytest.param(RED, 0.045, 0.018, 2, id="another colour"),
+    ],
+)
+def test_what_would_hang_over_a_foot_of_its_colour_is_carried_by_it(color, radius, post, owner):
+    top, foot = disc(radius, 0.07, 0.085), disc(0.045, 0.0, 0.012, color)
+    hidden = [] if post is None else [disc(post, 0.012, 0.07, color)]
+    looks, labels = [], []
+    for i, name in enumerate(("left", "right")):
+        frame, ids = scenes.capture([top, foot, *hidden], name, seed=i)
+        looks.append(look(frame, PLANE, np.eye(4), Parameters()))
+        labels.append(np.where(ids == 2, 0, ids + 1).astype(np.int32))  # what depth lost of the post is nobody's
+    assert attached.owners(labels, looks)[2] == owner
+
+
+@pytest.mark.parametrize(
+    ("other", "doubt"),
+    [
+        pytest.param(bar(0.0), [(1, 2)], id="beside it, of its colour"),
+        pytest.param(bar(0.02), [], id="the table shows between"),
+        pytest.param(bow(0.0, RED), [], id="another colour"),
+    ],
+)
+def test_what_may_be_a_part_of_a_thing(other, doubt):
+    looks, labels = [], []
+    for i, name in enumerate(("left", "right")):
+        frame, ids = scenes.capture([block(), other], name, seed=i)
+        looks.append(look(frame, PLANE, np.eye(4), Parameters()))
+        labels.append((ids + 1).astype(np.int32))
+    assert attached.doubtful(labels, looks) == doubt
+
+
 @pytest.mark.parametrize(("width", "owner"), [(3, 1), (12, 2)])
 def test_a_strip_along_the_edge_of_a_thing_is_its_rim(width, owner):
     frame, ids = scenes.capture([block()], "left")

@@ -400,6 +400,36 @@ def test_what_goes_on_as_another_thing_is_cut_off_by_it():
         assert [item.cut_off for item in found] == ([("object_2",), ("object_1",)] if cut else [(), ()])
 
 
+def test_what_may_be_a_part_of_a_thing_is_counted_in_what_its_surface_may_be_off_by():
+    """Each half of a bar that was parted is off by all of the other; of two colours they are two things, each as right as it is."""
+    stated = {}
+    for name, color in (("one", (120, 60, 50)), ("two", (60, 90, 150))):
+        bars = [slab([0.02, 0.1, 0.03], [0.55, y, 0.015], c) for y, c in ((-0.05, (120, 60, 50)), (0.05, color))]
+        caster = sensor.scene_raycaster(bars)
+        frames = [
+            sensor.capture([], sensor.D435, pose, [8, i], camera=camera, raycaster=caster)
+            for i, (camera, pose) in enumerate(sensor.STATION.items())
+        ]
+        labels = [caster.perspective(sensor.D435, pose)[0].ids.clip(0).astype(np.int32) for pose in sensor.STATION.values()]
+        found = perceive(frames, parameters=Parameters(region_low=(0.0, -0.7, -0.05)), segmenter=Told(labels)).objects
+        whole = concatenate(bars) if name == "one" else None
+        for item, bar in zip(found, bars, strict=True):
+            assert distance(whole or bar, item.mesh.transformed(item.world_from_object)) < item.surface_error
+        stated[name] = max(item.surface_error for item in found)
+    assert stated["two"] < 0.010 < 0.025 < stated["one"]
+
+
+def test_what_has_no_depth_of_its_own_is_left_out_with_a_note():
+    bar = slab([0.02, 0.1, 0.03], [0.55, 0.0, 0.015], (120, 60, 50))
+    frame = sensor.capture([bar], sensor.D435, sensor.STATION["left"], 9)
+    blank = np.zeros(frame.depth.shape, bool)
+    blank[60:90, 60:100] = True
+    frame = replace(frame, depth=np.where(blank, np.float32(np.nan), frame.depth))
+    report = Report()
+    assert perceive([frame], segmenter=Told([blank.astype(np.int32)]), report=report).objects == ()
+    assert any("is no object" in note for note in report.notes)
+
+
 def test_a_thing_whose_parts_nothing_joins_is_not_whole():
     bar, rest = (slab([0.1, 0.02, 0.016], [x, 0, 0.008], (120, 60, 50)) for x in (0.0, 0.13))
     assert not hangs_together(concatenate([bar, rest]), 0.006)
