@@ -44,6 +44,10 @@ class Made:
         """Whether it need not be looked at again yet."""
         return self._age(frames) < AFRESH
 
+    def earlier(self, frames: list[RgbdFrame]) -> bool:
+        """Whether its last look is earlier than frames; those of the same stamp are the same pictures, of a bag that is played again."""
+        return _stamp(self.looks[-1]) < _stamp(frames)
+
     def _age(self, frames: list[RgbdFrame]) -> float:
         return _stamp(frames) - _stamp(self.frames)
 

@@ -338,7 +338,7 @@ class Perception(Node):
             same = made is not None and made.same(frames)
             looks: tuple[list[RgbdFrame], ...] = (frames,)
             if made is not None:
-                if same:
+                if same and made.earlier(frames):
                     made = self.made = made.seen_again(frames)
                 if self.tell_again(made, frames, same):
                     self.done += 1
@@ -463,6 +463,11 @@ class Perception(Node):
             return None
         if newest < self.done_stamp - 1.0:
             self.done_stamp = -math.inf  # a bag began again
+        elif newest >= self.done_stamp and any(stream.repeated for stream in self.streams.values()):
+            # A bag shorter than that is played again, and is where it was: its things stand there as they did.
+            self.again = True
+            for stream in self.streams.values():
+                stream.repeated = False
         if newest - self.done_stamp < self.settings.period * (1 - 1e-6) and not self.again:
             return None  # the next scene's stamp is still to come
         streams = []

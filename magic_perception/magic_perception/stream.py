@@ -48,7 +48,8 @@ class Stream:
 
     tolerance: largest difference in seconds of the stamps of a pair.  keep: pairs kept, in the order of their stamps.  unit: of
     the newest depth image's numbers.  unplaced: since when no pair's transform is known (infinite: one is).  few: since when there
-    have been frames, but fewer than are averaged (infinite: there are enough, or none has come yet).
+    have been frames, but fewer than are averaged (infinite: there are enough, or none has come yet).  repeated: a pair has come whose
+    stamp is not later than those before, as of a bag that began again.
     Times called ``now`` are monotonic seconds.
     """
 
@@ -58,6 +59,7 @@ class Stream:
     unit: str = "mm"
     unplaced: float = math.inf
     few: float = math.inf
+    repeated: bool = False
     intrinsics: Intrinsics | None = None
     depth_intrinsics: Intrinsics | None = None
     pairs: list[Pair] = field(default_factory=list)
@@ -140,6 +142,7 @@ class Stream:
             # Of a bag that is played again what comes later in it is dropped: it comes again, too.  The frame itself came when it came
             # first: one that is played again and again would be young for ever, and what is waited for with it as well.
             first = next((p.arrived for p in self.pairs if p.stamp == stamp), now)
+            self.repeated |= any(p.stamp >= stamp for p in self.pairs)
             self.pairs = [p for p in self.pairs if p.stamp < stamp][-self.keep + 1 :]
             self.pairs.append(Pair(color, depth, frame_id, depth_frame_id, stamp, first))
 

@@ -509,6 +509,22 @@ def test_a_bag_with_fewer_frames_than_are_averaged_is_not_waited_for_without_end
         bench.until(lambda: bench.objects, "objects", tick=lambda: bench.send(later(frames[0], next(clock))))
 
 
+@pytest.mark.parametrize("stamps", [(10.0,), (10.0, 10.2, 10.4)], ids=["one frame", "shorter than a second"])
+def test_the_things_of_a_short_bag_are_told_each_time_it_is_played(frames, stamps, monkeypatch):
+    """Who asks how long ago they came hears that they are still there; the pictures being the same, nothing is perceived anew."""
+    perceived = []
+    monkeypatch.setattr(node, "perceive", lambda *given: perceived.append(1) or perceive(*given))
+    with Bench(cameras=["left"], camera_timeout=0.5, average=3) as bench:
+        perceived.clear()  # that of the warm-up
+        bench.transforms()
+        clock = iter(stamps * 1000)
+        bench.until(
+            lambda: len(bench.objects) > LOOKS + 1, "the same objects again", tick=lambda: bench.send(later(frames[0], next(clock)))
+        )
+        assert {m.header.stamp.nanosec for m in bench.objects[1:]} == {bench.objects[-1].header.stamp.nanosec}
+    assert len(perceived) <= 2  # of the first frames, and of all of them
+
+
 def test_a_frame_that_is_played_again_and_again_waits_once_for_joint_states(frames):
     """A bag of one frame whose only joint state is a little older."""
     with Bench(cameras=["left"], camera_timeout=0.5, average=3) as bench:

@@ -27,7 +27,7 @@ from magic_bringup import rerun_recording
 from magic_bringup.connection import Client, connected
 from magic_bringup.doctor import examine
 from magic_bringup.record import IMAGES, Record, empty_summary, is_picture, raw_topic, shown, take, write_summary
-from magic_core import conversions, qos
+from magic_core import conversions, presence, qos
 from magic_core import strategy as strategies
 from magic_core.arguments import split
 from magic_core.entry import version
@@ -44,8 +44,9 @@ GRACE = 30.0
 
 
 def say(line: str = "") -> None:
-    """One line, at once."""
-    print(line, flush=True)
+    """One line, at once: whole, as feedback comes in several threads."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 # ------------------------------------------------------------ run
@@ -224,16 +225,19 @@ def match(client: Client, given: argparse.Namespace) -> int:
 
 def objects(client: Client, given: argparse.Namespace) -> int:
     """What stands on the table."""
-    for line in object_lines(client.objects(given.timeout), client.node.get_clock().now().nanoseconds * 1e-9):
+    scene = client.objects(given.timeout)
+    now = None if presence.playing(client.node) else client.node.get_clock().now().nanoseconds * 1e-9
+    for line in object_lines(scene, now):
         say(line)
     return 0
 
 
-def object_lines(scene: Any, now: float) -> list[str]:
-    """An ``objects`` message in lines; now in s."""
+def object_lines(scene: Any, now: float | None) -> list[str]:
+    """An ``objects`` message in lines; now in s, ``None`` while a bag is played."""
     stamp = scene.header.stamp.sec + 1e-9 * scene.header.stamp.nanosec
     plural = "" if len(scene.objects) == 1 else "s"
-    lines = [f"{len(scene.objects)} object{plural} in {scene.header.frame_id or 'no frame'}, seen {now - stamp:.1f} s ago"]
+    seen = "of the bag that is played" if now is None else f"seen {now - stamp:.1f} s ago"
+    lines = [f"{len(scene.objects)} object{plural} in {scene.header.frame_id or 'no frame'}, {seen}"]
     lines.append(f"  {'id':<14} {'source':<8} {'size in mm':<18} {'middle in mm':<20} {'sure':>5} {'seen':>5}")
     for o in scene.objects:
         size = " x ".join(f"{1000 * v:.0f}" for v in sorted((o.box_size.x, o.box_size.y, o.box_size.z), reverse=True))

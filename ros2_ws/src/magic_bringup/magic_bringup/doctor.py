@@ -23,7 +23,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from magic_bringup.connection import Client
 from magic_bringup.graph import NODES
-from magic_core import conversions, qos
+from magic_core import conversions, presence, qos
 from magic_core.entry import version
 from magic_core.errors import Code, MagicError
 from magic_core.remedies import REMEDIES
@@ -198,7 +198,7 @@ class Look:
             action = seen.parameters.get("strategy_server", {}).get(key)
             if action:
                 seen.actions[action] = len(servers_of(self.node, self.node.resolve_service_name(f"{action}/_action/send_goal")))
-        seen.playing = "rosbag2_player" in self.node.get_node_names()
+        seen.playing = presence.playing(self.node)
 
 
 def examine(client: Client, timeout: float, cameras: Sequence[str] = ()) -> list[Finding]:

@@ -145,6 +145,7 @@ def test_what_keeps_an_object_from_being_a_tool_stands_beside_it():
     assert lines[2].endswith("cut off by picture")
     assert lines[3].endswith("hangs above the table")
     assert lines[-1] == "  note: cameras disagree by 4 mm"
+    assert " s ago" in lines[0] and "bag" in client.object_lines(message, None)[0]  # a recording's stamps are years old
 
 
 def test_strategies_are_listed_and_so_is_one_that_cannot_be_used(folder, capsys, tmp_path):

@@ -1,4 +1,4 @@
-"""Who serves a service and who waits for its answers, by DDS endpoint: a server that was restarted is another one than before."""
+"""Who serves a service and who waits for its answers, by DDS endpoint: a server that was restarted is another one than before.  Whether a bag is played."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from rclpy.node import Node
 #: How long an endpoint may be missing before it counts as gone, s.  A participant that the middleware has dropped because a busy
 #: machine held up its announcements is found again with its next one (``ros2_ws/fastdds.xml``: 0.3 s).
 BLINK = 0.6
+#: What those who play bags call their node.
+PLAYER = "rosbag2_player"
 
 
 def servers(node: Node, service: str) -> frozenset[bytes]:
@@ -25,6 +27,11 @@ def askers(node: Node, service: str) -> frozenset[bytes]:
 def publishers(node: Node, topic: str) -> frozenset[bytes]:
     """Those who publish a topic, given by its full name."""
     return frozenset(bytes(i.endpoint_gid) for i in node.get_publishers_info_by_topic(topic))
+
+
+def playing(node: Node) -> bool:
+    """Whether somebody plays a bag, whose stamps are of another time."""
+    return PLAYER in node.get_node_names()
 
 
 def _readers(node: Node, dds_topic: str) -> frozenset[bytes]:

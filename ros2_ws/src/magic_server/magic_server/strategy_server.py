@@ -65,8 +65,6 @@ PERCEPTION = "perception"
 COMPLAINT_AGE = 30.0
 #: Where a run ends so, a clock that stands still may be why.
 OUT_OF_TIME = (Code.NO_FRAMES, Code.NO_OBJECTS, Code.STALE_DATA)
-#: The node that plays a bag, the project's as rosbag2's: what comes in while it is there has stamps of another time.
-PLAYER = "rosbag2_player"
 #: How far the objects' frame may be turned against the robot's base for them to be carried from one into the other, degrees.
 TURNED = 1.0
 #: Between two questions whether a trajectory may be published or the arm may move, where that takes waiting, s.
@@ -354,7 +352,7 @@ class StrategyServer(LifecycleNode):
             scene=self.look(),
             joints=self.joints.all(),
             recorded=self.settings.recorded,
-            replaying=PLAYER in self.get_node_names(),
+            replaying=presence.playing(self),
             active=self._active,
             stopped=self._stopped,
             simulated=self.patience > 1.0,
