@@ -28,6 +28,8 @@ from magic_planner.linkage import Jaws, Ungripped
 
 #: Configurations that are looked at; with none of them touching, a pair touches in less than 3 / SAMPLES of all (95 %).
 SAMPLES = 10000
+#: With fewer of them a pair that touches in 3 of 100 may be taken for one that never does.
+FEWEST = 100
 #: Share of configurations from which on a pair touches always: neighbours whose shapes overlap.
 ALWAYS = 0.98
 #: Limit of the joints' accelerations until somebody sets the maker's, rad/s^2: a URDF has none.
@@ -186,6 +188,8 @@ def describe(
     base_frame: str = "", package_root: str = "", samples: int = SAMPLES, seed: int = 0,
 ) -> Described:  # fmt: skip
     """Write an arm's files into a folder; raises BAD_REQUEST with what is wrong with the description."""
+    if samples < FEWEST:
+        raise MagicError(Code.BAD_REQUEST, "--samples", samples, f"at least {FEWEST}: pairs that touch in none of them are not checked")
     root = document(path, arguments)
     out.mkdir(parents=True, exist_ok=True)
     if tip_at:
@@ -221,11 +225,18 @@ def describe(
     return Described(config, pairs, jaws)
 
 
+class _Anywhere(Ungripped):
+    """An arm whose ready pose is still to be chosen."""
+
+    def _check_home(self) -> None:
+        pass
+
+
 def _middle(config: RobotConfig) -> tuple[float, ...]:
     """The middle of each joint's range; 0 where it turns without end."""
     for count in range(1, 16):
         try:
-            robot = Ungripped(replace(config, home=(0.0,) * count))
+            robot = _Anywhere(replace(config, home=(0.0,) * count))
         except MagicError as error:
             if error.message.startswith("home configuration"):
                 continue

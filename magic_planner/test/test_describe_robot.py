@@ -189,7 +189,7 @@ def test_the_command_says_what_it_found_and_what_is_wrong(tmp_path, capsys):
     path = six_axis_file(tmp_path)
     assert (
         describe_robot.main(
-            [str(path), "--tip-at", "flange", "0", "0", "0.12", "0", "0", "0", "--samples", "50", "--out", str(tmp_path / "out")]
+            [str(path), "--tip-at", "flange", "0", "0", "0.12", "0", "0", "0", "--samples", "100", "--out", str(tmp_path / "out")]
         )
         == 0
     )
@@ -198,3 +198,6 @@ def test_the_command_says_what_it_found_and_what_is_wrong(tmp_path, capsys):
     assert describe_robot.main([str(path), "--tip", "nothing", "--out", str(tmp_path / "out")]) == 1
     assert "nothing" in capsys.readouterr().err
     assert describe_robot.main([str(tmp_path / "none.urdf"), "--tip", "tip"]) == 1
+    for wrong in ("--samples=0", "--samples=-5"):  # which would leave no pair to be checked
+        assert describe_robot.main([str(path), "--tip", "tip", wrong, "--out", str(tmp_path / "never")]) == 1
+        assert "--samples" in capsys.readouterr().err and not (tmp_path / "never").exists()

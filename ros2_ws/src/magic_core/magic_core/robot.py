@@ -33,6 +33,8 @@ PANDA_ACCELERATION, PANDA_JERK = PUBLISHED["panda"].acceleration, PUBLISHED["pan
 TURNING, SLIDING = ("revolute", "continuous"), "prismatic"
 #: How far the fingers' way may deviate from the closing axis: cosine of about 8 degrees.
 ALONG = 0.99
+#: How far beyond a joint's end a ready pose may be, for numbers that were rounded, rad (m).
+SLACK = 1e-3
 
 
 @dataclass(frozen=True)
@@ -220,7 +222,16 @@ class Description:
             raise MagicError(Code.BAD_REQUEST, "home configuration", list(home), f"{len(self.arm)} joint positions")
         if self.published is not None:
             self.arm = tuple(_narrowed(joint, self.published, index) for index, joint in enumerate(self.arm))
+        self._check_home()
         self.arm = tuple(_within_a_turn(joint, float(position)) for joint, position in zip(self.arm, home, strict=True))
+
+    def _check_home(self) -> None:
+        """The ready pose is within the joints' limits: one in degrees is not."""
+        for joint, position in zip(self.arm, self.config.home, strict=True):
+            low, high = (-math.inf, math.inf) if joint.kind == "continuous" else (joint.lower, joint.upper)
+            if not (math.isfinite(position) and low - SLACK <= position <= high + SLACK):
+                unit = "m" if joint.sliding else "rad"
+                raise MagicError(Code.BAD_REQUEST, f"home position of {joint.name} in {unit}", position, f"{low:.4g} to {high:.4g}")
 
     def _read_gripper(self) -> None:
         """The two fingers, and where they are closed and open."""

@@ -175,6 +175,8 @@ def test_what_is_wrong_with_a_urdf_is_said(config, changes, words):
         ({"move_group": "elsewhere"}, "tip link"),
         ({"move_group": "foot"}, "tip link"),
         ({"home": (0.0,) * 7}, "home"),
+        ({"home": tuple(np.degrees(six_axis.HOME))}, "home position of joint_"),
+        ({"home": (*six_axis.HOME[:-1], np.nan)}, "home position of joint_"),
         ({"urdf": "nowhere.urdf"}, "URDF"),
         ({"srdf": "nowhere.srdf"}, "SRDF"),
         ({"closing_axis": "y"}, "closing axis"),
