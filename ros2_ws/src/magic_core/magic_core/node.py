@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
@@ -19,12 +19,13 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from magic_core import presence, presets
+from magic_core.arguments import split
 from magic_core.diagnostics import Diagnostics, status
 from magic_core.errors import Code, MagicError
 from magic_core.executor import ThreadedExecutor
@@ -64,7 +65,12 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
     the node still spins, until it says that all is over.  A node that cannot start (a bad parameter, for one) logs why; the
     status is 1 then, else 0.
     """
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    name = getattr(node_type, "__name__", "node")
+    try:
+        _begin_ros(sys.argv[1:] if args is None else args)
+    except MagicError as error:
+        print(f"{name} cannot start: {error}", file=sys.stderr)
+        sys.exit(1)
     spinning = False
 
     def stop(_signum: int, _frame: Any) -> None:
@@ -94,8 +100,8 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         _wind_down(node, executor)
     except KeyboardInterrupt:
         pass
-    except (MagicError, ParameterException) as error:
-        print(f"{getattr(node_type, '__name__', 'node')} cannot start: {error}", file=sys.stderr)
+    except (MagicError, ParameterException, NameValidationException) as error:
+        print(f"{name} cannot start: {error}", file=sys.stderr)
         status = 1
     except Exception:
         # A library that the interrupt meets while it is being loaded makes an error of its own of it (Open3D: an ImportError).
@@ -120,6 +126,18 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
         sys.stderr.flush()
         os._exit(status)
     sys.exit(status)
+
+
+def _begin_ros(arguments: Sequence[str]) -> None:
+    """Initialise rclpy; raises BAD_REQUEST for arguments that ROS would ignore, as those of who forgot ``--ros-args``, and for such as it cannot read."""
+    own, ros = split(arguments)
+    if any(":=" not in word for word in own):  # ROS 1's remappings ROS still heeds
+        allowed = "--ros-args -p PARAMETER:=VALUE, --ros-args --params-file FILE, --ros-args -r NAME:=NAME, --version"
+        raise MagicError(Code.BAD_REQUEST, "arguments", " ".join(own), allowed)
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # of rcl, whose message has lines of where in its sources
+        raise MagicError(Code.BAD_REQUEST, "arguments of ROS", " ".join(ros), str(error).splitlines()[0]) from error
 
 
 def _wind_down(node: Node, executor: ThreadedExecutor) -> None:
@@ -176,6 +194,8 @@ def _fit(node: Node, name: str, default: Any, choices: tuple[str, ...] | None) -
     if given is None:
         return
     value: Any = given.value
+    if value is None and default:  # what rclpy makes of an empty list
+        raise MagicError(Code.BAD_REQUEST, f"parameter {name}", "an empty list", f"values, as {list(default)}")
     if isinstance(default, float) and type(value) is int:
         value = float(value)
     elif isinstance(default, (list, tuple)) and default and isinstance(default[0], float) and isinstance(value, (list, tuple, array)):

@@ -26,10 +26,10 @@ class Spun(Node):
 class Process:
     """A node as a program; ``said(text)`` waits until it has printed that."""
 
-    def __init__(self, body):
+    def __init__(self, body, *arguments):
         env = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "OPENBLAS_NUM_THREADS": "2"}
         self.popen = subprocess.Popen(
-            [sys.executable, "-c", HEAD + body], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
+            [sys.executable, "-c", HEAD + body, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
         )
         self.lines = []
         self._heard = threading.Condition()
@@ -56,9 +56,9 @@ class Process:
 def start():
     started = []
 
-    def begin(init, methods="", after="run(Spun)"):
+    def begin(init, methods="", after="run(Spun)", arguments=()):
         parts = [textwrap.indent(textwrap.dedent(init), 8 * " "), textwrap.indent(textwrap.dedent(methods), 4 * " "), after]
-        started.append(Process("\n".join(parts)))
+        started.append(Process("\n".join(parts), *arguments))
         return started[-1]
 
     yield begin
@@ -199,6 +199,29 @@ def test_an_error_during_the_start_that_no_signal_made_is_not_hidden(start):
     process = start('raise ImportError("initialization failed")')
     assert process.wait() == 1
     assert any("ImportError: initialization failed" in line for line in process.lines), process.lines
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (("-p", "rate:=2.0"), "'-p rate:=2.0' (allowed: --ros-args -p"),
+        (("--help",), "'--help' (allowed: --ros-args -p"),
+        (("--ros-args", "--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
+        (("--ros-args", "-p", "rate"), "-p rate"),
+    ],
+    ids=["--ros-args was forgotten", "help", "a parameters file that is not there", "a parameter without a value"],
+)
+def test_arguments_that_ros_ignores_or_cannot_read_are_refused_in_a_line(start, arguments, said):
+    process = start("", arguments=arguments)
+    assert process.wait() == 1, process.lines
+    line = process.lines[-1]  # before it there may be rcl's own
+    assert len(process.lines) <= 2 and "Spun cannot start: [506 BAD_REQUEST]" in line and said in line, process.lines
+
+
+def test_a_name_that_is_none_of_ros_is_refused_without_a_traceback(start):
+    process = start('self.create_subscription(__import__("std_msgs.msg").msg.Empty, "camera/a b", print, 1)')
+    assert process.wait() == 1
+    assert "Spun cannot start: Invalid topic name" in process.lines[0], process.lines
 
 
 def test_a_goal_at_work_hears_that_its_process_is_to_end(start):

@@ -41,6 +41,12 @@ def declared(found):
     }
 
 
+def test_an_empty_list_is_refused_where_values_are_meant(node):
+    with pytest.raises(MagicError, match="parameter home: 'an empty list'") as caught:
+        declared(node("-p", "home:=[]"))
+    assert caught.value.code is Code.BAD_REQUEST
+
+
 @pytest.mark.parametrize(
     "arguments, text",
     [
