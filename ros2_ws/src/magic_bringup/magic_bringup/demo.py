@@ -589,15 +589,14 @@ def _run(options: Options) -> int:
     # Once everything has stopped, a further signal must not leave half a file.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    write_summary(record, options.out)
+    page = options.out / "report.html"
     try:
-        from magic_bringup import report, rerun_recording, run_bag
-
-        report.save(record, options.out)
-        report.write(record, options.out / "report.html", options.out / "logs")
-        run_bag.write(record, options.out)
-        if options.rerun:
-            rerun_recording.write(record, options.out)
+        for old in ("summary.json", page.name):  # of a run before: what cannot be written must not look as if it were there
+            (options.out / old).unlink(missing_ok=True)
+        write_summary(record, options.out)
+        _write_report(record, page, options.rerun)
+    except OSError as error:
+        print(f"demo: cannot write into {options.out}: {error.strerror}", file=sys.stderr)
     except Exception as error:  # the summary counts, the pictures are an addition
         import traceback
 
@@ -608,10 +607,24 @@ def _run(options: Options) -> int:
     seconds = ", ".join(f"{k} {v:.2f}" for k, v in summary["seconds"].items())
     demo.say(f"seconds: {seconds}; simulations: {summary['simulations']}")
     demo.say("peak memory, MB: " + ", ".join(f"{k} {v:.0f}" for k, v in summary["peak_memory_mb"].items()))
-    print(f"summary: {options.out / 'summary.json'}\nreport:  {options.out / 'report.html'}", flush=True)
+    for what, path in (("summary: ", options.out / "summary.json"), ("report:  ", page)):
+        if path.is_file():
+            print(f"{what}{path}", flush=True)
     if summary["success"]:
         return 0
     return 130 if summary["code"] == Code.CANCELED else 1
+
+
+def _write_report(record: Record, page: Path, rerun: bool) -> None:
+    """The page and, beside it, what it was drawn from."""
+    from magic_bringup import report, rerun_recording, run_bag
+
+    folder = page.parent
+    report.save(record, folder)
+    report.write(record, page, folder / "logs")
+    run_bag.write(record, folder)
+    if rerun:
+        rerun_recording.write(record, folder)
 
 
 if __name__ == "__main__":

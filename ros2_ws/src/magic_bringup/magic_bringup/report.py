@@ -490,8 +490,8 @@ def _environment() -> jinja2.Environment:
 
 
 def write(record: Record, path: Path, logs: Path | None = None) -> None:
-    """Write the page of a record."""
-    path.write_text(render(record, logs), encoding="utf-8")
+    """Write the page of a record; names of files that are no UTF-8 are shown with question marks."""
+    path.write_text(render(record, logs), encoding="utf-8", errors="replace")
 
 
 # ---------------------------------------------------------------- records on disk

@@ -1,5 +1,7 @@
 """What the demo measures and makes of answers, without any node."""
 
+import errno
+import os
 import threading
 from types import SimpleNamespace
 
@@ -8,7 +10,8 @@ import pytest
 from rclpy.task import Future
 
 from magic_bags.recording import Recording
-from magic_bringup.demo import Pending, first_images, look_into, parse, perceive_seconds
+from magic_bringup import report
+from magic_bringup.demo import Pending, first_images, look_into, main, parse, perceive_seconds
 from magic_core import conversions
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
@@ -38,6 +41,18 @@ def test_a_refused_goal_is_an_answer():
     assert pending.result is None
     sent.set_result(SimpleNamespace(accepted=False))
     assert (pending.result.code, pending.result.verified) == (Code.SERVER_UNAVAILABLE, False)
+
+
+def test_a_page_that_cannot_be_written_is_not_named_nor_is_an_older_one_left(tmp_path, monkeypatch, capsys):
+    def full(*_given):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / "report.html").write_text("of a run before")
+    monkeypatch.setattr(report, "save", full)
+    assert main(["--bag", str(tmp_path / "none"), "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert "summary: " in said.out and "report: " not in said.out and not (tmp_path / "report.html").exists()
+    assert said.err == f"demo: cannot write into {tmp_path}: No space left on device\n"
 
 
 def test_what_the_command_line_names_is_looked_for_before_anything_starts(tmp_path, capsys):

@@ -182,6 +182,13 @@ def test_a_run_that_never_began_has_a_report_too(tmp_path):
     assert "the bag is empty" in page
 
 
+def test_names_of_files_need_not_be_utf8(tmp_path):
+    record = Record(empty_summary("hooking", "arm"))
+    record.summary.update(code=int(Code.BAD_BAG), message="no such bag: bag\udcff")
+    report.write(record, tmp_path / "report.html")
+    assert "no such bag: bag?" in (tmp_path / "report.html").read_text()
+
+
 def test_broken_parts_leave_the_others_alone(folder, tmp_path):
     record = full(folder, tmp_path)
     record.images["/camera/left/color/image_raw"].encoding = "bayer_rggb8"
