@@ -1,4 +1,4 @@
-"""Every command in the READMEs and in docs/ is one that works: quick ones are run, the others go through their own argument parser.
+"""Every command in the READMEs and the folders docs/ is one that works: quick ones are run, the others go through their own argument parser.
 
 What a command names has to be there: scripts, packages, executables, launch files and their arguments, parameters, fields of goals, files of
 this repository.  Words in capitals stand for the reader's own files.
@@ -28,6 +28,7 @@ DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "bags/README.md")),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted(ROOT.glob("magic_*/README.md")),
+    *sorted(ROOT.glob("magic_*/docs/*.md")),
     *(path for path in sorted((ROOT / "ros2_ws/src").glob("*/README.md")) if not path.parent.is_symlink()),
 ]
 #: Commands of other packages that a reader has beside these: they are not looked into.
@@ -306,6 +307,6 @@ def test_every_verb_of_the_small_ros2_stands_in_the_readme():
 
 
 def test_methods_that_the_documents_name_are_methods():
-    for path in [*DOCUMENTS, *sorted(ROOT.glob("magic_*/docs/*.md"))]:
+    for path in DOCUMENTS:
         named = set(re.findall(r"--method (\w+)", path.read_text()))
         assert named <= {*evaluated.METHODS, *perceived.METHODS}, path

@@ -2,7 +2,8 @@
 
 A thing is right where its masks and its solid overlap the truth (intersection over union, seen by each camera and by volume) by more
 than 0.8.  The chance of that is a logistic function of a few numbers.  ``confidence.json`` holds its weights, fitted with a
-ridge penalty to 260 things of procedural scenes; ``ros2 run magic_perception learn_confidence`` fits them anew. README.md says how it does on others.
+ridge penalty to 260 things of procedural scenes; ``ros2 run magic_perception learn_confidence`` fits them anew.
+``docs/results_perception.md`` says how it does on others.
 """
 
 from __future__ import annotations

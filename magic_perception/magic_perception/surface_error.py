@@ -3,7 +3,7 @@
 A thing may overlap the truth by little and be right to a millimetre, as what is thin does (:mod:`magic_perception.confidence`), or overlap it well and have its
 handle elsewhere.  What a motion meets is the surface.  The root mean square distance between it and the true one, below which it is for five of six things,
 is the exponential of a linear function of a few numbers: the quantile regression whose weights ``surface_error.json`` holds.
-``ros2 run magic_perception learn_surface_error`` fits them anew; README.md says how it does on others.
+``ros2 run magic_perception learn_surface_error`` fits them anew; ``docs/results_perception.md`` says how it does on others.
 """
 
 from __future__ import annotations

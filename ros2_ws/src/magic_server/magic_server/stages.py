@@ -40,7 +40,7 @@ ID_LAG = 1.0
 #: Points of a contact that are nearer than this are the same, m: it went through messages, but nobody measured it anew.
 SAME_POINT = 1e-6
 #: A reconstruction whose surface may be off by more than this, m, is no longer what a hook, a handle or a hollow is judged by; where
-#: nobody says by how much, one below this confidence, which is hardly ever right (``magic_perception/README.md``).
+#: nobody says by how much, one below this confidence, which is hardly ever right (``docs/results_perception.md``).
 OFF, DOUBTFUL = 0.004, 0.2
 
 
