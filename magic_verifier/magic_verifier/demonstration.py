@@ -29,6 +29,8 @@ from magic_verifier.simulation import DYNAMIC, Settings
 HELD_DENSITY = 5e4
 #: Tool and target meet again when they did not touch for so long, s.
 APART = 0.3
+#: What is tilted by so much (rad) while its middle is so much (m) higher or lower than at first tips over; what rolls keeps its height.
+TILTED, RAISED = np.deg2rad(10.0), 0.001
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class Meeting:
 class Replay:
     """What a replay found: contact points p_T in the tool's and p_O in the target's frame (3,) metres, the unit outward
     normal of each surface there (3,) in the same frames, the share of the goal phase in contact, how many points were read,
-    when in the phase they touched first and last, seconds from the motion's start, and each stretch of contact in the phase."""
+    when in the phase they touched first and last, seconds from the motion's start, and each stretch of contact in the phase; tips: when in the phase
+    the target begins to tip over, infinite where it does not."""
 
     tool_point: NDArray[np.float64]
     tool_normal: NDArray[np.float64]
@@ -61,6 +64,7 @@ class Replay:
     first: float
     last: float
     meetings: tuple[Meeting, ...] = ()
+    tips: float = np.inf
 
 
 class Shown(Protocol):
@@ -123,7 +127,7 @@ def replay(
     names = [phase.name for phase in motion.phases]
     if watched not in names:
         raise MagicError(Code.BAD_REQUEST, "phase to read contacts in", watched, names)
-    stretches, share = _contacts(run, watched, target, held, (TOOL,) if releases else (TOOL, TARGET))
+    stretches, share, tips = _contacts(run, watched, target, held, (TOOL,) if releases else (TOOL, TARGET))
     if not stretches:
         raise MagicError(
             Code.LOST_CONTACT,
@@ -132,7 +136,7 @@ def replay(
             "at least one contact that carries a force",
         )
     whole = _Stretch.joined(stretches)
-    return Replay(*whole.read(), share, whole.points, whole.first, whole.last, tuple(stretch.meeting() for stretch in stretches))
+    return Replay(*whole.read(), share, whole.points, whole.first, whole.last, tuple(stretch.meeting() for stretch in stretches), tips)
 
 
 def _motion(strategy: Shown, target: SceneObject, phases: tuple[Phase, ...], releases: bool) -> ToolMotion:
@@ -152,8 +156,11 @@ def _motion(strategy: Shown, target: SceneObject, phases: tuple[Phase, ...], rel
     return ToolMotion(np.append(times[keep], start + 1.0), np.concatenate([world_from_tool[keep], world_from_tool[keep][-1:]]), phases)
 
 
-def _contacts(run: FloatingRun, watched: str, target: SceneObject, held: bool, checked: tuple[str, ...]) -> tuple[list[_Stretch], float]:
-    """The stretches in which tool and target press on each other in the watched phase, and the share of it in which they do.
+def _contacts(
+    run: FloatingRun, watched: str, target: SceneObject, held: bool, checked: tuple[str, ...]
+) -> tuple[list[_Stretch], float, float]:
+    """The stretches in which tool and target press on each other in the watched phase, the share of it in which they do, and when in it the target
+    begins to tip over.
 
     target: as it stood; held: it is put back there after each step; checked: the bodies whose state has to be sound.
     """
@@ -161,9 +168,12 @@ def _contacts(run: FloatingRun, watched: str, target: SceneObject, held: bool, c
     world_from_still = target.world_from_object.copy()
     target_from_start = transforms.inverse(target.world_from_object)
     stretches: list[_Stretch] = []
-    touched, looked = 0, 0
+    touched, looked, tips = 0, 0, np.inf
+    up, middle = target.world_from_object[2, :3], run.setup.target.centre
+    height = float(transforms.apply(target.world_from_object, middle)[2])
     while run.time < run.duration:
         run.advance()
+        run.free_touched()
         if held:
             run.world.place(TARGET, target.world_from_object)
         run.world.check(checked)
@@ -175,6 +185,9 @@ def _contacts(run: FloatingRun, watched: str, target: SceneObject, held: bool, c
         world_from_still[:3, 3] = run.world.position(TARGET)
         tool_from_world, target_from_world = transforms.inverse(run.world.pose(TOOL)), transforms.inverse(world_from_still)
         moved = target_from_start[:3, :3] @ world_from_still[:3, 3] + target_from_start[:3, 3]
+        pose = run.world.pose(TARGET)
+        if np.isinf(tips) and pose[2, :3] @ up < np.cos(TILTED) and abs(float(transforms.apply(pose, middle)[2]) - height) > RAISED:
+            tips = run.time
         if touches and (not stretches or run.time - stretches[-1].last > APART):
             stretches.append(_Stretch(run.time))
         for touch in touches:
@@ -182,7 +195,7 @@ def _contacts(run: FloatingRun, watched: str, target: SceneObject, held: bool, c
             points = (tool_from_world @ [*touch.position, 1.0])[:3], (target_from_world @ [*touch.position, 1.0])[:3]
             normals = -tool_from_world[:3, :3] @ touch.normal, target_from_world[:3, :3] @ touch.normal
             stretches[-1].add(run.time, float(np.linalg.norm(touch.impulse)), points, normals, moved)
-    return stretches, touched / max(looked, 1)
+    return stretches, touched / max(looked, 1), tips
 
 
 @dataclass

@@ -209,6 +209,8 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         # The reason of a failure is that of the best-scored candidate.
         answer["reason"] = "NO_MATCH" if not tried else "OK" if answer["success"] else tried[0]["code"]
     except MagicError as error:
+        if error.code == Code.BAD_REQUEST and problem is None:
+            raise  # a name by which nothing can be made: no failure of the method
         answer["reason"] = error.code.name
         tried.append({"code": error.code.name, "message": error.message})
     if options.source == "images":
@@ -468,10 +470,12 @@ def _stored(path: Path) -> dict[str, Any] | None:
 
 
 def attempt(options: Options, case: Case, film: Path | None) -> dict[str, Any]:
-    """:func:`run_case` with its wall time; an error that nothing foresaw is a failure of this case alone."""
+    """:func:`run_case` with its wall time; an error that nothing foresaw is a failure of this case alone.  Raises BAD_REQUEST for names of nothing."""
     started = time.perf_counter()
     try:
         result = run_case(options, case, film)
+    except MagicError:
+        raise
     except Exception as error:  # the others are worth the same whatever became of this one
         print("".join(traceback.format_exception(error)), file=sys.stderr, flush=True)
         message = {"code": Code.INTERNAL.name, "message": f"{type(error).__name__}: {error}"}

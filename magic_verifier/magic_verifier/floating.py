@@ -279,6 +279,7 @@ class FloatingRun:
         self.world = fill_world(replace(setup, tool=replace(setup.tool, world_from_object=poses[0])), KINEMATIC)
         self._targets = to_poses(poses[1:])
         self._released = False
+        self._resting = [obstacle.id for obstacle in setup.obstacles if obstacle.loose]
 
     def _contact_time(self) -> float:
         start = phase_start(self.phases, CONTACT_PHASES)
@@ -312,6 +313,13 @@ class FloatingRun:
             else:
                 self.world.move_to(TOOL, self._targets[min(self.world.steps, len(self._targets) - 1)])
         self.world.step()
+
+    def free_touched(self) -> None:
+        """Let go of the loose obstacles that something that moves touches; without it they stand fast."""
+        touched = [name for name in self._resting if self.world.touched_by(name)]
+        for name in touched:
+            self.world.let_go(name)
+        self._resting = [name for name in self._resting if name not in touched]
 
     def _throw(self) -> None:
         """Make the tool free with the speed that its motion has now."""

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from magic_core import goal as goals
@@ -399,7 +400,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--goal",
         default="",
-        help=f"name of a goal that ships ({', '.join(goals.names())}), or 'none': simulation cannot judge it; by default found from what the "
+        help=f"name of a goal that ships ({', '.join(goals.names())}), a .yaml file with a tree (magic_core/goal.py), "
+        "or 'none': simulation cannot judge it; by default found from what the "
         "demonstration changes",
     )
     parser.add_argument("--value", nargs="*", default=[], metavar="NAME=NUMBER", help="numbers of the goal")
@@ -443,8 +445,10 @@ def goal_of(given: argparse.Namespace) -> tuple[Goal | None, dict[str, float]]:
         if values:
             raise MagicError(Code.BAD_REQUEST, "--value", ", ".join(values), "no numbers with --goal none: nothing is judged")
         return Goal("none"), {}
+    if given.goal and Path(given.goal).suffix in (".yaml", ".yml"):
+        return _read_goal(Path(given.goal), values), values
     if given.goal and given.goal not in goals.names():
-        raise MagicError(Code.UNKNOWN_GOAL, "goal test", given.goal, [*goals.names(), "none"])
+        raise MagicError(Code.UNKNOWN_GOAL, "goal test", given.goal, [*goals.names(), "none", "a .yaml file with a tree"])
     known = goals.named(given.goal).values if given.goal else {}
     for name, value in values.items():
         if known and name not in known:
@@ -456,6 +460,21 @@ def goal_of(given: argparse.Namespace) -> tuple[Goal | None, dict[str, float]]:
     if not given.goal:
         return None, values
     return goals.shipped(given.goal, **({"noise": 0.0, **values} if "noise" in known else values)), values
+
+
+def _read_goal(path: Path, values: dict[str, float]) -> Goal:
+    """The goal that a file holds as ``goal`` of a ``strategy.yaml`` does, with numbers of it that are given; raises BAD_STRATEGY, BAD_REQUEST."""
+    try:
+        data = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MagicError(Code.BAD_REQUEST, "--goal", f"{path}: {str(error).splitlines()[0]}", "a file with a goal in YAML") from None
+    goal = goals.from_data(data["goal"] if isinstance(data, dict) and set(data) == {"goal"} else data)
+    unknown = sorted(set(values) - set(goal.numbers))
+    if unknown:
+        raise MagicError(Code.BAD_REQUEST, f"--value of the goal in {path}", ", ".join(unknown), list(goal.numbers))
+    goal = goal.with_values(values)
+    goal.resolved()
+    return goal
 
 
 def check_given(given: argparse.Namespace) -> None:

@@ -48,7 +48,7 @@ TICK, WINDOW = 0.02, 0.6
 SPACING = (0.002, np.deg2rad(1.0), 0.25)
 #: The motion is kept from where the contact is so far from where it will be made, and the approach ends so far from there, metres.
 APPROACH, NEAR = 0.12, 0.02
-#: Rolling moves a contact: it is read until the tool has turned by so much since it was made (rad), for so long (s) at least.
+#: Rolling moves a contact: it is read until the tool has turned by so much since it was made (rad), or the target tips over, for so long (s) at least.
 TURNED, READ = np.deg2rad(10.0), 0.2
 #: Tool and target meet in another place than before where the tool's normal is turned by so much (rad), or its point is so far (share of its
 #: size) from there; a touch that moves the target by less (m) is none.
@@ -166,7 +166,7 @@ def learn(demonstration: Demonstration, task: Task) -> Learned:
         shown = _shown(demonstration, strategy, motion, made, parted)
         return Learned(strategy, tool_gap, target_gap, _tried(demonstration, strategy), shown, askew=askew)
     found_goals = []
-    for goal in proposals(seen):
+    for goal in proposals(seen, strategy.target_normal):
         strategy = replace(strategy, goal=_with_numbers(goal, task.values))
         verdict, shown = _tried(demonstration, strategy), _shown(demonstration, strategy, motion, made, parted)
         found_goals.append(Learned(strategy, tool_gap, target_gap, verdict, shown, seen, askew=askew))
@@ -438,7 +438,8 @@ def _contacts(demonstration: Demonstration, task: Task, motion: _Motion) -> tupl
     first, last = (meetings[-1].first, meetings[-1].last) if len(meetings) > 1 else (whole.first, whole.last)
     made = motion.index(first)
     turned = [k for k in range(made, len(motion.times)) if _apart(motion.target_from_tool[k], motion.target_from_tool[made])[1] > TURNED]
-    until = min(last, float(motion.times[turned[0]]) if turned else end)
+    # Of a target that tips over the place goes round with it, and its side is no longer where it was met.
+    until = min(last, whole.tips, float(motion.times[turned[0]]) if turned else end)
     until = min(max(until, first + READ), end)
     phases = (Phase("approach", 0.0, first), Phase("contact", first, until), Phase("goal", until, end + 1e-3))
     found = replay(motion, *scene, phases=phases, watched="contact")
@@ -717,13 +718,16 @@ def advice(learned: Learned) -> list[str]:
 
 def doubts(learned: Learned) -> list[str]:
     """What the trial with the demonstrated objects, passed or not, does not tell of other tools and targets: sentences, none where nothing is to be said."""
+    changed = learned.changed
+    notes = [f"the goal does not ask {line}" for line in changed.unasked()] if changed is not None else []
     if not learned.askew:
-        return []
+        return notes
     return [
+        *notes,
         f"the tool met the target {np.degrees(learned.askew):.0f} degrees off the way that it led it, and has no place near there that is square to "
         "that way: the tool's shape or its track is off where they met, or the tool was held askew. With tools and targets of other shapes this "
         "strategy will fail more often; to change: record again, the place of the tool that meets the target in the cameras' sight, nearer or "
-        "from more sides"
+        "from more sides",
     ]
 
 
@@ -741,10 +745,9 @@ def _remedy(shown: Verdict, strategy: Strategy) -> str:
     if shown.code == Code.DRIFT and metrics.get("holds") == 0.0:
         return "--value hold=0 where the target is only to be pushed; or a tool whose contact encloses the target"
     if shown.code == Code.DRIFT:
-        return (
-            "record again, the tool led straight along its normal; or --value drift=NUMBER (allowed share of the target's radius, "
-            f"{metrics.get('sideways_drift', 0.0) / max(metrics.get('target_radius', 1.0), 1e-6):.2f} was measured)"
-        )
+        drifted, radius = metrics.get("sideways_drift", 0.0), metrics.get("target_radius")
+        unit, measured = ("m", f"{drifted:.3f}") if radius is None else ("a share of the target's radius", f"{drifted / radius:.2f}")
+        return f"record again, the tool led straight along its normal; or --value drift=NUMBER ({unit}; {measured} was measured)"
     if shown.code == Code.LOST_CONTACT:
         return (
             f"--friction (now {physics.friction:g}) and --target-density (now {physics.target_density:g} kg/m^3) as they really are; or record "
@@ -754,6 +757,8 @@ def _remedy(shown: Verdict, strategy: Strategy) -> str:
         return f"record again: slower towards the end, and still for a second before the recording ends; or --friction (now {physics.friction:g})"
     if shown.code == Code.PRE_CONTACT_COLLISION:
         return "record again: the tool led to its contact without touching anything before"
+    if shown.code == Code.OBSTACLE_PUSHED:
+        return "record again, nothing else in the way of tool and target: what is pushed beside the target has no part in any strategy"
     if shown.code == Code.LIMIT_EXCEEDED:
         return "record again: the tool held a few millimetres off the table and fixtures"
     return "record again: slower, and without pressing"

@@ -27,7 +27,7 @@ from magic_verifier import evaluate as ev
 from magic_verifier import posing
 from magic_verifier.cases import METHODS, Options, all_cases, strategy_for, tool_names
 from magic_verifier.simulation import sphere_of, usable_pieces
-from magic_verifier.subjects import load_object, tool_object
+from magic_verifier.subjects import Case, load_object, tool_object
 from magic_verifier.toolsets import evaluation_of
 
 STRATEGIES = str(Path(__file__).resolve().parents[2] / "ros2_ws/src/magic_bringup/strategies")
@@ -402,6 +402,13 @@ def test_meshes_that_are_no_bodies_have_their_code_and_the_others_go_on(tmp_path
         "sheet_ring": "BAD_MESH",
     }
     assert (summary["cases"], summary["successes"]) == (4, 1)
+
+
+def test_a_tool_that_no_generator_makes_ends_the_evaluation(tmp_path):
+    """As a failure of the method it would lower the rate."""
+    case = Case("a name", ("l_hok:52000",), "cylinder:0.02")
+    with pytest.raises(MagicError, match="'l_hok'"):
+        ev.attempt(Options("hooking", variant="fg_no_selection", strategies=STRATEGIES), case, None)
 
 
 def test_a_case_that_breaks_does_not_end_the_others(tmp_path, monkeypatch):

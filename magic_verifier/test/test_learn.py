@@ -22,6 +22,7 @@ from tf2_msgs.msg import TFMessage
 from magic_core import conversions, transforms
 from magic_core.camera import Intrinsics
 from magic_core.errors import Code, MagicError
+from magic_core.goal import words
 from magic_core.motion import MotionPlan
 from magic_core.scene import Scene
 from magic_core.sensor import capture, looking_at, scene_raycaster
@@ -33,7 +34,21 @@ from magic_perception import following
 from magic_perception.following import Followed
 from magic_perception.pipeline import perceive
 from magic_planner.object_motion import plan_tool_motion
-from magic_verifier.learn import COLOR, DEPTH, MOMENTS, Pictures, Recorded, all_shown, choose, followed, left_first, main, track_of, write
+from magic_verifier.learn import (
+    COLOR,
+    DEPTH,
+    MOMENTS,
+    Pictures,
+    Recorded,
+    all_shown,
+    choose,
+    followed,
+    goal_of,
+    left_first,
+    main,
+    track_of,
+    write,
+)
 from magic_verifier.learning import Demonstration, Task, learn
 from magic_verifier.verification import Proposal, verify_proposal
 
@@ -48,8 +63,8 @@ def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("strategies") / "new" / "pulling"
     with contextlib.redirect_stdout(io.StringIO()) as said:
         assert main(["--bag", str(BAGS / "hooking_demonstration"), "--out", str(folder)]) == 0
-    for words in ("the target moved 2", "the tool encloses it", "the goal, as it was found:", "200 mm along the pull or more"):
-        assert words in said.getvalue()
+    for line in ("the target moved 2", "the tool encloses it", "the goal, as it was found:", "200 mm along the pull or more"):
+        assert line in said.getvalue()
     assert [p.name for p in folder.parent.iterdir()] == ["pulling"], "nothing is left beside it"
     return folder
 
@@ -82,6 +97,7 @@ def test_what_was_learned_serves_a_tool_that_was_never_seen(learned, family, see
     ("change", "said"),
     [
         ({"--goal": "juggle"}, "UNKNOWN_GOAL"),
+        ({"--goal": "nowhere/mine.yaml"}, "nowhere/mine.yaml: [Errno 2]"),
         ({"--bag": "nowhere"}, "BAD_BAG"),
         ({"--goal": "hang"}, "--releases"),
         ({"--goal": "none", "--value": "distance=0.1"}, "no numbers"),
@@ -110,6 +126,16 @@ def test_what_cannot_be_learned_is_said_in_one_line(change, said, tmp_path, caps
     error = capsys.readouterr().err
     assert said in error and error.startswith("learn: ") and error.count("\n") == 1
     assert not any(tmp_path.iterdir())
+
+
+def test_a_goal_of_ones_own_is_read_from_a_file(tmp_path):
+    tree = "values: {far: 0.1}\ntest: {moved: {what: target, along: pull, by: far}, after: {phase: goal}}\n"
+    for text in (tree, "goal:\n" + "".join(f"  {line}\n" for line in tree.splitlines())):
+        (tmp_path / "mine.yaml").write_text(text)
+        goal, _ = goal_of(SimpleNamespace(goal=str(tmp_path / "mine.yaml"), value=["far=0.2"]))
+        assert words(goal) == ["at the end of the phase goal, the target has moved 200 mm along the pull or more"]
+    with pytest.raises(MagicError, match="'distance'"):
+        goal_of(SimpleNamespace(goal=str(tmp_path / "mine.yaml"), value=["distance=0.2"]))
 
 
 def test_a_target_that_is_held_cannot_be_pulled(tmp_path, capsys):

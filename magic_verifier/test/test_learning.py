@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from demonstrations import demonstration, pressing, pushing, ring_pulling, shunting
+from demonstrations import LYING, demonstration, pressing, pushing, ring_pulling, shunting
+from demonstrations import shown as led
 
 pytest.importorskip("magic_planner.object_motion")
 
 from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_core.goal import shipped as shipped_goal
+from magic_core.goal import words
+from magic_core.motion import MotionPlan, Phase, ToolMotion
 from magic_core.shapes import make
 from magic_core.strategy import Goal, Physics, load, save
 from magic_matcher.matching import target_contact, target_view
@@ -19,6 +22,7 @@ from magic_verifier import learning
 from magic_verifier.demonstration import Meeting
 from magic_verifier.inference import Changed, asked, proposals
 from magic_verifier.learning import APPROACH, NEAR, STRAIGHT, Demonstration, Task, _corners, advice, doubts, learn, levelled, smoothed
+from magic_verifier.verification import Proposal, verify_proposal
 
 #: A spoon whose bowl is hardly wider than the ball that it is to take up (35 mm).
 NARROW = {
@@ -341,8 +345,11 @@ def test_a_push_is_told_from_a_hook_by_what_is_drawn_around_it():
 
 
 def changed_by(**facts):
-    nothing = Changed(np.zeros(3), 0.025, 0.0, 0.0, ("table",), True, False, (), float("nan"))
+    nothing = Changed(np.zeros(3), 0.025, 0.0, 0.0, ("table",), True, False, (), float("nan"), ("table",), fixtures=("shelf",))
     return replace(nothing, **facts)
+
+
+AWAY = np.array([0.1, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -350,10 +357,10 @@ def changed_by(**facts):
     [
         ({"tool_on": ("target",), "tool_height": 0.31, "on": ()}, ["hang"]),
         ({"tool_on": ("shelf",), "tool_height": 0.31}, ["reach"]),
-        ({"on": ("tool",), "height": 0.29, "rise": 0.25}, ["scoop"]),
+        ({"on": ("tool",), "height": 0.29, "rise": 0.25}, ["scoop", "carry"]),
         ({"on": ("table", "tool"), "height": 0.29, "rise": 0.25}, ["reach"]),
-        ({"tilt": 90.0, "rise": -0.03, "way": np.array([0.1, 0, 0])}, ["tip"]),
-        ({"tilt": 90.0, "rise": 0.0, "way": np.array([0.1, 0, 0])}, ["push"]),
+        ({"tilt": 90.0, "rise": -0.03}, ["tip"]),
+        ({"tilt": 90.0, "rise": 0.0, "way": AWAY}, ["push"]),
         ({"way": np.array([0.28, 0, 0]), "encloses": True}, ["hook", "push"]),
         ({"way": np.array([0.28, 0, 0])}, ["push"]),
         ({}, ["reach"]),
@@ -363,6 +370,151 @@ def test_what_was_changed_suggests_goals_the_strictest_first(facts, titles):
     seen = changed_by(**facts)
     assert [goal.title for goal in proposals(seen)] == [shipped_goal(name).title for name in titles]
     assert seen.words()
+
+
+@pytest.mark.parametrize(
+    ("facts", "asked_for", "goals"),
+    [
+        # Pushed up on a shelf: without that a block that is pushed past it would do.
+        (
+            {"way": AWAY, "on": ("shelf",), "rise": 0.04, "lifted": 0.041},
+            ["the target touches the shelf", "the target touches the table", "the target has moved 30 mm along up or more"],
+            1,
+        ),
+        (
+            {"way": AWAY, "stood_on": ("shelf",), "rise": -0.06},
+            ["the target touches the shelf", "the target has moved 40 mm along down or more"],
+            1,
+        ),
+        # Pushed against a wall, and as it may be meant, only as far.
+        ({"way": AWAY, "on": ("shelf", "table")}, ["the target touches the shelf"], 2),
+        # What was carried over something, and set down; and as it may be meant, moved.
+        ({"way": AWAY, "lifted": 0.15}, ["some time in the phase goal, the target has moved 100 mm along up or more"], 2),
+        # It fell to the side to which it was tipped, and not to another.
+        ({"way": AWAY, "tilt": 90.0, "rise": -0.03}, ["the target has moved 5 mm along the pull or more"], 1),
+        # Turned over it stands as high as it did; a ball rolls by half a turn as well, and is not lifted.
+        ({"way": AWAY, "tilt": 180.0, "lifted": 0.02}, ["the target has turned by 140 degrees or more about a level axis"], 1),
+        ({"way": AWAY, "tilt": 180.0}, ["what was up of the target is up, within 180 degrees"], 1),
+        # It has rolled though by chance what was up is up again.
+        ({"way": AWAY, "tilt": 2.0, "tumbled": 170.0}, ["what was up of the target is up, within 180 degrees"], 1),
+    ],
+)
+def test_what_else_was_changed_is_asked_for_as_well(facts, asked_for, goals):
+    found = proposals(changed_by(**facts))
+    said = "\n".join(words(found[0]))
+    assert all(line in said for line in asked_for) and len(found) == goals, said
+
+
+def test_a_target_met_from_above_is_moved_the_way_that_it_went():
+    (goal,) = proposals(changed_by(way=np.array([0.0, 0.1, 0.0])), np.array([0.0, 0.0, 1.0]))
+    assert "moved 80 mm along (0, 1, 0)" in "\n".join(words(goal))
+
+
+@pytest.mark.parametrize("facts", [{"farthest": 0.06}, {"turned": 80.0}])
+def test_what_was_led_back_or_turned_on_the_spot_is_no_touch(facts):
+    with pytest.raises(MagicError, match="meanwhile it was up to 60 mm from where it stood|turned by 80 degrees") as error:
+        proposals(changed_by(**facts))
+    assert error.value.code == Code.GOAL_NOT_REACHED
+
+
+def test_what_no_goal_asks_for_is_said():
+    seen = changed_by(way=AWAY, on=("object_3", "table"), turned=40.0, farthest=0.2)
+    assert [line.split()[:4] for line in seen.unasked()] == [
+        ["that", "the", "target", "touches"],
+        ["that", "the", "target", "turns"],
+        ["for", "the", "way", "on"],
+    ]
+    assert changed_by(way=AWAY, on=("shelf", "table"), farthest=0.1).unasked() == []
+
+
+def knocked(aside, towards=1.0):
+    """A peg is knocked over sideways by a bar that meets it above its middle."""
+    bar = scenes.item("tool", [scenes.block((-0.25, 0.0), (-0.01, 0.01), (0.0, 0.02))], LYING)
+    peg = make("cylinder", 0, radius=0.018, half_height=0.06).as_object("target", transforms.make(translation=[0.55, 0.0, 0.06]))
+
+    def at(y, z):
+        return transforms.make(translation=[0.67 + aside, towards * y, z])
+
+    way = [(LYING, 0.0), (LYING, 0.5), (at(-0.1, 0.2), 1.5), (at(-0.1, 0.085), 1.0), (at(-0.03, 0.085), 1.0), (at(0.05, 0.085), 1.0)]
+    return led(bar, peg, [*way, (at(0.0, 0.085), 0.8), (at(0.0, 0.2), 1.0)])
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.02])
+def test_what_tips_over_was_met_where_it_stood(aside):
+    """Read until the tool leaves it, the place is millimetres inside the peg, which leans away by then."""
+    learned = learn(knocked(aside), Task("knocking", None, Physics(0.3)))
+    assert learned.target_gap < 0.004 and learned.verdict.success, learned.verdict.message
+
+
+def test_a_peg_knocked_over_the_other_way_is_not_what_was_shown():
+    learned = learn(knocked(0.0), Task("knocking", None, Physics(0.3)))
+    other = knocked(0.0, towards=-1.0)
+    phases = (Phase("approach", 0.0, 3.9), Phase("goal", 3.9, float(other.times[-1])))
+    motion = MotionPlan("fg", ToolMotion(other.times, other.world_from_tool, phases))
+    verdict = verify_proposal(Proposal(learned.strategy, other.tool, other.target, (), scenes.TABLE, motion), repetitions=1)
+    assert verdict.code == Code.GOAL_NOT_REACHED and "it fell to another side" in verdict.message
+
+
+def test_a_ball_that_is_pushed_rolls():
+    ball = make("sphere", 0, radius=0.025).as_object("target", transforms.make(translation=[0.5, 0.0, 0.025]))
+    learned = learn(replace(pushing(far=0.2), target=ball), Task("rolling", None, Physics(0.3)))
+    assert learned.verdict.success and learned.strategy.goal.values["upright"] == 180.0, learned.verdict.message
+
+
+def test_what_is_pushed_by_the_target_goes_along_and_is_said_to_have_no_part():
+    other = scenes.item(
+        "object_9", [scenes.block((-0.03, 0.03), (-0.04, 0.04), (-0.025, 0.025))], transforms.make(translation=[0.68, 0, 0.025])
+    )
+    learned = learn(replace(pushing(far=0.15), obstacles=(replace(other, source="camera"),)), Task("together", None, Physics(0.3)))
+    assert learned.changed.level == pytest.approx(0.146, abs=0.005) and "object_9" in learned.changed.on
+    assert learned.verdict.code == Code.OBSTACLE_PUSHED and "no part in any strategy" in "\n".join(advice(learned))
+    assert any("object_9" in line for line in doubts(learned))
+
+
+def bucket():
+    """A bucket with a bail that stands upright, about (0.58, 0), and where the bail is held from beneath."""
+    walls = [
+        scenes.hull([[r * np.cos(a), r * np.sin(a), z] for a in part for r in (0.031, 0.035) for z in (0.0, 0.07)]) for part in SECTORS
+    ]
+    floor = scenes.hull([[0.035 * np.cos(a), 0.035 * np.sin(a), z] for a in SECTORS[:, 0] for z in (0.0, 0.004)])
+    angles = np.linspace(0.0, np.pi, 13)
+    wire = [
+        scenes.hull(
+            [[x, r * np.cos(a), 0.065 + r * 2.2 * np.sin(a)] for a in angles[k : k + 2] for r in (0.028, 0.034) for x in (-0.003, 0.003)]
+        )
+        for k in range(12)
+    ]
+    return scenes.item("target", [floor, *walls, *wire], transforms.make(translation=[0.58, 0.0, 0.0005])), 0.0655 + 0.028 * 2.2
+
+
+SECTORS = np.column_stack([np.arange(16), np.arange(1, 17)]) * 2 * np.pi / 16
+
+
+def lifting(high=0.25):
+    """A bucket is lifted by its bail, with a hook led in beneath it."""
+    target, under = bucket()
+    parts = [scenes.block((-0.03, -0.015), (-0.006, 0.006), (0.0, 0.22)), scenes.block((-0.03, 0.035), (-0.006, 0.006), (-0.012, 0.0))]
+    lying = transforms.from_rpy(np.pi / 2, 0, 0, [0.42, -0.3, 0.008])
+    hook = scenes.item("tool", [*parts, scenes.block((0.025, 0.035), (-0.006, 0.006), (-0.012, 0.02))], lying)
+
+    def at(x, z):
+        return transforms.make(translation=[x, 0.0, under + z])
+
+    way = [(lying, 0.0), (lying, 0.5), (at(0.48, 0.1), 1.5), (at(0.48, -0.035), 1.0), (at(0.575, -0.035), 1.2), (at(0.575, -0.001), 1.0)]
+    return led(hook, target, [*way, (at(0.575, high), 3.0), (at(0.575, high), 1.0)])
+
+
+def test_a_bucket_is_carried_by_its_bail():
+    learned = learn(lifting(), Task("carrying", shipped_goal("carry"), Physics(0.3)))
+    assert learned.verdict.success, learned.verdict.message
+    # Lifted by less than the goal asks for, and with nothing beneath the bail.
+    low, missed = lifting(0.1), lifting()
+    for shown, aside, said in ((low, 0.0, "was not lifted"), (missed, 0.1, "was not lifted")):
+        poses = transforms.make(translation=[0.0, aside, 0.0]) @ shown.world_from_tool
+        phases = (Phase("approach", 0.0, 5.2), Phase("goal", 5.2, float(shown.times[-1])))
+        motion = MotionPlan("fg", ToolMotion(shown.times, poses, phases))
+        proposal = Proposal(learned.strategy, replace(shown.tool, world_from_object=poses[0]), shown.target, (), scenes.TABLE, motion)
+        assert said in verify_proposal(proposal, repetitions=1).message
 
 
 def test_what_changes_nothing_suggests_nothing():
