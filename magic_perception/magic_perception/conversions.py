@@ -2,19 +2,45 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Vector3
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magic_core import conversions as cv
 from magic_core import transforms
+from magic_core.camera import Intrinsics
 from magic_core.errors import Code
 from magic_core.scene import Scene
 
 #: Distinct colours for objects, RGB 0..1.
 PALETTE = ((0.90, 0.35, 0.25), (0.25, 0.60, 0.90), (0.30, 0.75, 0.35), (0.95, 0.75, 0.20), (0.65, 0.40, 0.85), (0.25, 0.80, 0.80))
+
+
+#: OpenCV takes so many coefficients of a lens.
+COEFFICIENTS = (4, 5, 8, 12, 14)
+
+
+def distortion(info: CameraInfo, intrinsics: Intrinsics) -> float:
+    """By how many pixels the lens moves what is at the edge of the picture, at most; 0 without coefficients, infinite where they are of no known model."""
+    given = np.array(info.d, float)
+    if not given.any():
+        return 0.0
+    if not np.isfinite(given).all() or len(given) not in COEFFICIENTS:
+        return np.inf
+    edge = np.linspace(0.0, 1.0, 9)
+    u, v = (np.concatenate(sides) for sides in ((edge, edge, 0 * edge, 0 * edge + 1), (0 * edge, 0 * edge + 1, edge, edge)))
+    straight = np.stack([u * (intrinsics.width - 1), v * (intrinsics.height - 1)], axis=-1)
+    rays = np.concatenate([(straight - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy), np.ones((len(u), 1))], axis=1)
+    still, k = np.zeros(3), intrinsics.matrix
+    if info.distortion_model == "equidistant":
+        bent, _ = cv2.fisheye.projectPoints(rays[:, None], still, still, k, given[:4])
+    else:
+        bent, _ = cv2.projectPoints(rays, still, still, k, given)
+    return float(np.linalg.norm(bent.reshape(-1, 2) - straight, axis=1).max())
 
 
 def markers(scene: Scene) -> MarkerArray:

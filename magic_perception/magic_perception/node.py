@@ -52,6 +52,8 @@ DECODERS = {
 }
 #: What a user can do about a unit.
 REMEDY = "set the driver's depth unit, or this node's parameter depth_unit"
+#: Pixels by which a lens may bend its picture without a word: that is not taken out.
+BENT = 2.0
 #: After so long without a new pair of images, s, none of those that were taken together is still on its way.
 SETTLED = 0.5
 
@@ -265,7 +267,7 @@ class Perception(Node):
             try:
                 intrinsics = cv.intrinsics_from_msg(msg)
                 _check_matrix(msg, intrinsics)
-                self.distortion[camera] = max((abs(x) for x in msg.d), default=0.0)
+                self.distortion[camera] = pc.distortion(msg, intrinsics)
                 if of_depth:
                     stream.depth_intrinsics = intrinsics
                     stream.last[what] = now
@@ -682,8 +684,6 @@ class Perception(Node):
         if stream.pairs:
             values["frame"] = stream.pairs[-1].frame_id
             values["stamp"] = f"{stream.pairs[-1].stamp:.3f}"
-        if self.distortion.get(camera, 0.0) > 1e-3:
-            values["distortion"] = f"up to {self.distortion[camera]:.3f}, left out: publish rectified images"
         name = f"{label(self)}: camera {camera}"
         for what in ("camera_info", "depth_camera_info", "color", "depth", "stamps", "pairing", "frames"):
             if what in stream.problems:
@@ -713,6 +713,10 @@ class Perception(Node):
                 return pc.status(
                     name, DiagnosticStatus.WARN, f"[{int(code)} {code.name}] {self.resolve_topic_name(topic)}: {why}", code, values
                 )
+        bent = self.distortion.get(camera, 0.0)
+        if bent > BENT:
+            message = f"the lens' distortion in camera_info, up to {bent:.0f} pixels (allowed: {BENT:g}), is left out: publish rectified images, and their camera_info"
+            return pc.status(name, DiagnosticStatus.WARN, message, Code.BAD_INTRINSICS, values)
         return pc.status(name, DiagnosticStatus.OK, "OK", Code.OK, values)
 
 

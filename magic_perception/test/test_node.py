@@ -26,6 +26,7 @@ from magic_core.domain import free_domain
 from magic_core.qos import LATCHED, RELIABLE, SENSOR, STATIC_TF
 from magic_core.scene import Scene
 from magic_interfaces.msg import SceneObjectArray
+from magic_perception import conversions as pc
 from magic_perception import node
 from magic_perception.meanwhile import LOOKS
 from magic_perception.node import Perception
@@ -334,6 +335,38 @@ def test_more_bad_input_is_answered_by_diagnostics(frames):
             bench.until(lambda code=code: bench.diagnostics and code in bench.codes(), f"{code} for {what}", tick=act)
             assert all(o.objects for o in bench.objects[count:]), what
         bench.until(lambda: bench.objects and bench.objects[-1].objects, "objects after bad input", tick=send())
+
+
+@pytest.mark.parametrize(
+    "model, coefficients, pixels",
+    [
+        ("plumb_bob", [0.0] * 5, 0.0),
+        (
+            "plumb_bob",
+            [0.1, 0.0, 0.0, 0.0, 0.0],
+            0.1 * np.hypot(319.5, 239.5) ** 3 / 600**2,
+        ),  # the corner's r, of k1 r^3 times the focal length
+        ("equidistant", [0.0] * 4, 0.0),  # as drivers fill in what is rectified
+        ("plumb_bob", [0.1, 0.2], np.inf),
+        ("plumb_bob", [np.nan] * 5, np.inf),
+    ],
+)
+def test_what_a_lens_bends_is_told_in_pixels(model, coefficients, pixels):
+    k = Intrinsics(640, 480, 600.0, 600.0, 319.5, 239.5)
+    assert pc.distortion(CameraInfo(distortion_model=model, d=coefficients), k) == pytest.approx(pixels, rel=1e-6)
+
+
+def test_a_lens_that_bends_its_picture_is_named(frames):
+    info = cv.intrinsics_to_msg(frames[0].intrinsics)
+    info.d = [-0.055, 0.065, 0.0, 0.0, -0.02]  # of a D455
+    clock = iter(range(10, 1000))
+    with Bench(cameras=["left"]) as bench:
+        bench.transforms()
+        bench.until(
+            lambda: bench.objects and any("distortion" in m and "pixels" in m for m in bench.messages()),
+            "objects, and what the lens does",
+            tick=lambda: bench.send(later(frames[0], float(next(clock))), info_msg=info),
+        )
 
 
 def test_sprinkled_bad_pixels_do_no_harm(frames):
