@@ -129,15 +129,15 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
 
 
 def _begin_ros(arguments: Sequence[str]) -> None:
-    """Initialise rclpy; raises BAD_REQUEST for arguments that ROS would ignore, as those of who forgot ``--ros-args``, and for such as it cannot read."""
-    own, ros = split(arguments)
+    """Initialise rclpy; raises BAD_REQUEST for arguments that ROS would ignore, as those of who forgot ``--ros-args``, and for arguments and an environment that it cannot read."""
+    own, _ = split(arguments)
     if any(":=" not in word for word in own):  # ROS 1's remappings ROS still heeds
         allowed = "--ros-args -p PARAMETER:=VALUE, --ros-args --params-file FILE, --ros-args -r NAME:=NAME, --version"
         raise MagicError(Code.BAD_REQUEST, "arguments", " ".join(own), allowed)
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # of rcl, whose message has lines of where in its sources
-        raise MagicError(Code.BAD_REQUEST, "arguments of ROS", " ".join(ros), str(error).splitlines()[0]) from error
+        raise MagicError(Code.BAD_REQUEST, str(error).splitlines()[0]) from error
 
 
 def _wind_down(node: Node, executor: ThreadedExecutor) -> None:

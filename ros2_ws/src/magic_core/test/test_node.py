@@ -218,6 +218,13 @@ def test_arguments_that_ros_ignores_or_cannot_read_are_refused_in_a_line(start, 
     assert len(process.lines) <= 2 and "Spun cannot start: [506 BAD_REQUEST]" in line and said in line, process.lines
 
 
+def test_a_domain_that_is_no_number_is_named(start, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "lab")
+    process = start("")
+    assert process.wait() == 1
+    assert "Spun cannot start: [506 BAD_REQUEST]" in process.lines[-1] and "ROS_DOMAIN_ID" in process.lines[-1], process.lines
+
+
 def test_a_name_that_is_none_of_ros_is_refused_without_a_traceback(start):
     process = start('self.create_subscription(__import__("std_msgs.msg").msg.Empty, "camera/a b", print, 1)')
     assert process.wait() == 1
