@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -113,43 +113,27 @@ def perceive(
     seeing = _seeing(frames, report.notes)
     now = sum(seeing)
     used = [*(frame for frame, sees in zip(frames, seeing, strict=True) if sees), *(frame.free for frame in earlier)]
-
-    def looked(notes: list[str]) -> tuple[list[Plane], NDArray[np.float64], list[Looked]]:
-        table, own = find_table(used, parameters, notes)
-        world_from_table = _table_frame(table, parameters)
-        pairs = list(zip(used, own, strict=True))
-        return own, world_from_table, [look(*pair, world_from_table, parameters) for pair in pairs]
+    fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
 
     with report.stage("table"):
-        own, world_from_table, looks = looked(about_table := [])
-        shift, about_arm = _to_the_arm(_off_the_arm(looks[:now], used[:now]), parameters.arm_offset)
-        if shift.any():
-            used = [_shifted(frame, shift) for frame in used]
-            own, world_from_table, looks = looked(about_table := [])
-        report.notes += [*about_table, *about_arm]
+        ground = _on_the_arm(used, now, parameters, report.notes)
+
+    def labelled(looks: list[Looked]) -> _Views:
+        labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
+        return _Views(looks, labels, now, ground.world_from_table, fixtures)
 
     with report.stage("masks"):
-        fixtures = tuple(item.mesh.transformed(item.world_from_object) for item in known if len(item.mesh.faces))
-
-        def labelled(looks: list[Looked]) -> _Views:
-            labels = parted(looks, veil(looks, segmenter.segment(looks, fixtures, parameters)))
-            return _Views(looks, labels, now, world_from_table, fixtures)
-
-        views = labelled(looks)
+        views = labelled(ground.looks)
         if earlier:
-            stale = keyframes.contradicted(looks, views.labels, now, world_from_table)
-            for i, pixels in enumerate(stale, now):
-                if pixels.any():
-                    used[i] = used[i].blinded(pixels)
-                    looks[i] = look(used[i], own[i], world_from_table, parameters)
-            if any(pixels.any() for pixels in stale):
-                views = labelled(looks)
-            report.earlier = list(zip(earlier, used[now:], strict=True))
+            blotted = _blotted(ground, views, parameters)
+            if blotted is not ground:
+                ground, views = blotted, labelled(blotted.looks)
+            report.earlier = list(zip(earlier, ground.frames[now:], strict=True))
 
     with ExitStack() as stack:
         with report.stage("cameras"):
             building = stack.enter_context(_building(views, parameters, workers))
-            report.cameras = _disagreements(views, used, parameters.seed)
+            report.cameras = _disagreements(views, ground.frames, parameters.seed)
             worst = _worst(report.cameras)
             report.notes += _about_poses(report.cameras, views)
             apart = _apart(worst, views)
@@ -162,33 +146,21 @@ def perceive(
         with report.stage("meshes"):
             solids, refused = _solids(building, views, apart)
             report.notes += [_about_refused(label, error, views) for label, error in refused.items()]
-            ids = {built.label: f"object_{number}" for number, built in enumerate(solids, 1)}
-            report.numbers = {name: label for label, name in ids.items()}
-            told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[:now])
-            report.labels = [
-                next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)
-            ]
+            report.numbers = {f"object_{number}": built.label for number, built in enumerate(solids, 1)}
+            report.labels = _of_all_frames(views, refused, frames, seeing)
             sizes = [len(built.points) for built in solids]
             hidden = shared_out(_hidden, (solids, views), range(len(solids)), sizes, workers)
             pairs = attached.doubtful(views.labels, views.looks)
             off = shared_out(_off_at_most, (solids, views, pairs), range(len(solids)), sizes, workers)
 
     with report.stage("views"):
-        objects = []
-        for built, by, at_most in zip(solids, hidden, off, strict=True):
-            item = _as_object(built, world_from_table)
-            # What hides a thing and was left out itself is as nameless as a fixture.
-            names = dict.fromkeys(name if isinstance(name, str) else ids.get(name, FIXTURE) for name in by)
-            objects.append(
-                replace(
-                    item, id=ids[built.label], cut_off=tuple(names), surface_error=min(float(np.hypot(item.surface_error, at_most)), MOST)
-                )
-            )
-            _tell(report, built, objects[-1])
-    plane = np.append(world_from_table[:3, 2], -world_from_table[:3, 2] @ world_from_table[:3, 3])
-    stamp = max(frame.stamp for frame in used)
+        objects = _objects(solids, hidden, off, ground.world_from_table, report)
+    up, origin = ground.world_from_table[:3, 2], ground.world_from_table[:3, 3]
+    stamp = max(frame.stamp for frame in ground.frames)
     offset, angle = (worst.offset, worst.angle) if worst is not None else (np.nan, np.nan)
-    return Scene((*objects, *known), plane, stamp, camera_offset=offset, camera_angle=angle, notes=tuple(report.notes))
+    return Scene(
+        (*objects, *known), np.append(up, -up @ origin), stamp, camera_offset=offset, camera_angle=angle, notes=tuple(report.notes)
+    )
 
 
 # ---------------------------------------------------------------- frames, table, cameras
@@ -203,6 +175,47 @@ def _seeing(frames: list[RgbdFrame], notes: list[str]) -> list[bool]:
         found = {frame.camera: count for frame, count in zip(frames, counts, strict=True)}
         raise MagicError(Code.NO_DEPTH, "pixels with depth", found, f"at least {LEAST} in one camera")
     return seeing
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """The frames that are used, those of now first, and the table in them: its plane in each camera, world_from_table (4, 4), and how each frame looks on it."""
+
+    frames: list[RgbdFrame]
+    planes: list[Plane]
+    world_from_table: NDArray[np.float64]
+    looks: list[Looked]
+
+
+def _ground(frames: list[RgbdFrame], parameters: Parameters, notes: list[str]) -> _Ground:
+    """The table in all frames.  What there is to say of it goes to the notes."""
+    table, planes = find_table(frames, parameters, notes)
+    world_from_table = _table_frame(table, parameters)
+    looks = [look(frame, plane, world_from_table, parameters) for frame, plane in zip(frames, planes, strict=True)]
+    return _Ground(frames, planes, world_from_table, looks)
+
+
+def _on_the_arm(frames: list[RgbdFrame], now: int, parameters: Parameters, notes: list[str]) -> _Ground:
+    """The table in all frames, all of them moved as far as the first ``now`` are told to see the arm elsewhere than it is."""
+    ground = _ground(frames, parameters, about_table := [])
+    shift, about_arm = _to_the_arm(_off_the_arm(ground.looks[:now], frames[:now]), parameters.arm_offset)
+    if shift.any():
+        ground = _ground([_shifted(frame, shift) for frame in frames], parameters, about_table := [])
+    notes += [*about_table, *about_arm]
+    return ground
+
+
+def _blotted(ground: _Ground, views: _Views, parameters: Parameters) -> _Ground:
+    """With what newer frames contradict blotted out of the earlier ones; the same ground where nothing is."""
+    stale = keyframes.contradicted(views.looks, views.labels, views.now, ground.world_from_table)
+    if not any(pixels.any() for pixels in stale):
+        return ground
+    frames, looks = list(ground.frames), list(ground.looks)
+    for i, pixels in enumerate(stale, views.now):
+        if pixels.any():
+            frames[i] = frames[i].blinded(pixels)
+            looks[i] = look(frames[i], ground.planes[i], ground.world_from_table, parameters)
+    return replace(ground, frames=frames, looks=looks)
 
 
 def _table_frame(table: Plane, parameters: Parameters) -> NDArray[np.float64]:
@@ -631,6 +644,34 @@ def _places(sights: list[Sight]) -> int:
 
 
 # ---------------------------------------------------------------- objects
+
+
+def _of_all_frames(
+    views: _Views, refused: Mapping[int, MagicError], frames: list[RgbdFrame], seeing: list[bool]
+) -> list[NDArray[np.int32]]:
+    """Labels (H, W) of each of the frames, without those of what was refused; of a frame that shows nothing, none."""
+    told = (np.where(np.isin(image, list(refused)), 0, image) for image in views.labels[: views.now])
+    return [next(told) if sees else np.zeros(frame.depth.shape, np.int32) for frame, sees in zip(frames, seeing, strict=True)]
+
+
+def _objects(
+    solids: Sequence[_Built], hidden: Sequence[list[int | str]], off: Sequence[float], world_from_table: NDArray[np.float64], report: Report
+) -> list[SceneObject]:
+    """The objects of the scene, by the names that the report gives them.
+
+    hidden: by labels and names, what keeps a part of each out of sight; off: how far (m) its surface is off if what may be a part of it is one.
+    """
+    ids = {label: name for name, label in report.numbers.items()}
+    objects = []
+    for built, by, at_most in zip(solids, hidden, off, strict=True):
+        item = _as_object(built, world_from_table)
+        # What hides a thing and was left out itself is as nameless as a fixture.
+        names = dict.fromkeys(name if isinstance(name, str) else ids.get(name, FIXTURE) for name in by)
+        surface_error = min(float(np.hypot(item.surface_error, at_most)), MOST)
+        item = replace(item, id=ids[built.label], cut_off=tuple(names), surface_error=surface_error)
+        _tell(report, built, item)
+        objects.append(item)
+    return objects
 
 
 def _tell(report: Report, built: _Built, item: SceneObject) -> None:

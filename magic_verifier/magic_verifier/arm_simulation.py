@@ -11,7 +11,7 @@ by a joint that stands for soft pads or, where the options say so, by the engine
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -77,6 +77,26 @@ class Held:
     patch: Patch
 
 
+@dataclass
+class _Closing:
+    """How the fingers close: ``press``, the force of each (N); seconds since they began, and for which they have stood still; metres between
+    them, step by step; the solver iterations of the tool before."""
+
+    press: float
+    seconds: float = 0.0
+    quiet: float = 0.0
+    widths: list[float] = field(default_factory=list)
+    iterations: int = 0
+
+
+def _sampled(motion: ArmMotion, frequency: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint positions and velocities (N, J) of a trajectory, step by step."""
+    times, positions = np.asarray(motion.times, dtype=float), np.asarray(motion.positions, dtype=float)
+    clock = times[0] + np.arange(int(np.ceil((times[-1] - times[0]) * frequency)) + 1) / frequency
+    q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
+    return q, np.gradient(q, 1.0 / frequency, axis=0) if len(q) > 1 else np.zeros_like(q)
+
+
 class ArmRun:
     """One run of an arm plan; :meth:`advance` steps it once.
 
@@ -119,8 +139,7 @@ class ArmRun:
         self._coupled = self.options.past is None  # hand and tool, by a joint
         self.limits = limits
         self.phases = motion.phases or plan.tool_motion.phases
-        times = np.asarray(motion.times, dtype=float)
-        self.duration = float(times[-1] - times[0])
+        self.duration = float(motion.times[-1]) - float(motion.times[0])
         self.grasp_time = float(motion.grasp_time)
         self.release_time = None if motion.release_time is None else float(motion.release_time)
         start = phase_start(self.phases, CONTACT_PHASES)
@@ -138,12 +157,9 @@ class ArmRun:
         self._loose = frozenset(o.id for o in setup.obstacles if o.loose)
         frequency = setup.settings.frequency
         self._lag = round(lag * frequency)
-        self._q, self._qd = self._sampled(motion)
+        self._q, self._qd = _sampled(motion, frequency)
         self._index = self._first = 0
-        self._hold = 0.0
-        self._widths: list[float] = []  # between the closing fingers, step by step
-        self._quiet = 0.0
-        self._press = self.options.closing_force
+        self._closing = _Closing(self.options.closing_force)
         self._closed = self._open_again = self._asleep = self.stands_still = False
         self._after = round(ASLEEP * frequency)
         self._every = max(1, round(WATCH_EVERY * frequency))
@@ -175,14 +191,6 @@ class ArmRun:
         """The tool that rested where it was seen is touched, and moves as it would from now on."""
         self._rests = False
         self.world.let_go(TOOL)
-
-    def _sampled(self, motion: ArmMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Joint positions and velocities (N, J) of the trajectory, step by step."""
-        times, positions = np.asarray(motion.times, dtype=float), np.asarray(motion.positions, dtype=float)
-        frequency = self.setup.settings.frequency
-        clock = times[0] + np.arange(int(np.ceil(self.duration * frequency)) + 1) / frequency
-        q = np.column_stack([np.interp(clock, times, positions[:, j]) for j in range(positions.shape[1])])
-        return q, np.gradient(q, 1.0 / frequency, axis=0) if len(q) > 1 else np.zeros_like(q)
 
     def _commands(self) -> NDArray[np.float64]:
         """What the drives are told (N, J), step by step: ahead of the trajectory by what they lead by, and kept for the command's period."""
@@ -294,40 +302,44 @@ class ArmRun:
             self._arm.open_fingers()
         if self._closed or self._open_again or self.time < self.grasp_time:
             return False
-        dt = self.world.timestep
-        if self._hold == 0 and self._coupled:
+        self._close()
+        return self._coupled and not self._closed
+
+    def _close(self) -> None:
+        """One step of the closing fingers, until they hold the tool.  Raises ``GRASP_SLIPPED`` where they come to a stop on nothing."""
+        closing, dt = self._closing, self.world.timestep
+        if closing.seconds == 0 and self._coupled:
             tool = self.world.component(TOOL)
             self.world.doze(TOOL, 0.0)
-            self._iterations = tool.solver_position_iterations
-            self._iterate(round(min(max(LIGHTER / tool.mass, 1.0), MOST_CLOSING) * self._iterations))
-        self._hold += dt
-        self._widths.append(self._arm.width())
-        before = self._widths[max(0, len(self._widths) - 1 - round(LOOK_BACK / dt))]
-        slow = self._hold > LOOK_BACK and abs(self._widths[-1] - before) < STOPPED
-        self._quiet = self._quiet + dt if slow else 0.0
+            closing.iterations = tool.solver_position_iterations
+            self._iterate(round(min(max(LIGHTER / tool.mass, 1.0), MOST_CLOSING) * closing.iterations))
+        closing.seconds += dt
+        closing.widths.append(self._arm.width())
+        before = closing.widths[max(0, len(closing.widths) - 1 - round(LOOK_BACK / dt))]
+        slow = closing.seconds > LOOK_BACK and abs(closing.widths[-1] - before) < STOPPED
+        closing.quiet = closing.quiet + dt if slow else 0.0
         if slow:
             patch = self._touched()
             if patch is not None:
                 self._take(patch)
                 if self._coupled:
                     self._arm.rest_fingers()
-            elif self._coupled and self._press < self.options.grip_force:
-                self._press = min(self._press + HARDER * dt, self.options.grip_force)
-                self._quiet = 0.0
-        if self._patch is not None or self._quiet >= self.options.quiet or self._hold >= self.options.closing_time:
-            self._closed = True
-            if self._coupled:
-                self._iterate(self._iterations)
-            if self._patch is None:
-                raise MagicError(
-                    Code.GRASP_SLIPPED,
-                    f"the gripper closed on nothing at {self.time:.2f} s",
-                    f"width {self._arm.width() * 1000:.1f} mm",
-                    f"both fingers on the tool, {self._motion.grasp_width * 1000:.1f} mm apart",
-                )
-            return False
-        self._arm.close_fingers(self._press)
-        return self._coupled
+            elif self._coupled and closing.press < self.options.grip_force:
+                closing.press = min(closing.press + HARDER * dt, self.options.grip_force)
+                closing.quiet = 0.0
+        if self._patch is None and closing.quiet < self.options.quiet and closing.seconds < self.options.closing_time:
+            self._arm.close_fingers(closing.press)
+            return
+        self._closed = True
+        if self._coupled:
+            self._iterate(closing.iterations)
+        if self._patch is None:
+            raise MagicError(
+                Code.GRASP_SLIPPED,
+                f"the gripper closed on nothing at {self.time:.2f} s",
+                f"width {self._arm.width() * 1000:.1f} mm",
+                f"both fingers on the tool, {self._motion.grasp_width * 1000:.1f} mm apart",
+            )
 
     def _touched(self) -> Patch | None:
         """Where both pads touch the tool; ``None`` where they do not hold it between them."""
