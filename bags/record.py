@@ -325,7 +325,8 @@ def made(entry: Mapping[str, Any]) -> Shape:
 
 @dataclass(frozen=True)
 class Cast:
-    """What takes part in a demonstration: tool and target, where the target stands (4, 4) in the world, and the fixtures with the shapes that they are, by id."""
+    """What takes part in a demonstration: tool and target, where the target stands (4, 4) in the world, and the fixtures with the shapes
+    that they are, by id."""
 
     tool: Shape
     target: Shape
@@ -464,9 +465,9 @@ def _write_truth(path: Path, seed: int, things: list[Thing], moments: Sequence[M
     (path / "truth.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
 
 
-#: Things, cameras and what their depth is like.  Without smear are the ladle of ``scooping`` (as a D435 smears it, the arm's motion passes in 12 of 15
-#: rollouts, which is refused) and the demonstrations (at their resolution smear puts hooking's contacts off by 2 and 3 mm, and what is learned from
-#: them passes in 6 of 9 rollouts).
+#: Things, cameras and what their depth is like.  Without smear are the ladle of ``scooping`` (as a D435 smears it, the arm's motion passes
+#: in 12 of 15 rollouts, which is refused) and the demonstrations (at their resolution smear puts hooking's contacts off by 2 and 3 mm, and
+#: what is learned from them passes in 6 of 9 rollouts).
 SCENES = {
     "hooking": (hooking_scene, CAMERAS, SMEARED),
     "hanging": (hanging_scene, HIGH_CAMERAS, SMEARED),

@@ -19,7 +19,8 @@ flat below: the median of the slopes between any two cases, which single outlier
 in the middle.
 
 What is done is kept in ``--out`` after every case; the same command goes on where it was interrupted.  It ends with a table of what is
-done so far, also where it is interrupted (SIGINT, SIGTERM; status 130), and with status 1 where something did not hold.  ``--quick``: a twentieth of each part.
+done so far, also where it is interrupted (SIGINT, SIGTERM; status 130), and with status 1 where something did not hold.  ``--quick``: a
+twentieth of each part.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ DEADLINE = 60.0
 RUN_LIMIT = 120.0
 #: From a kill to the answer, s.
 KILL_LIMIT = 5.0
-#: Flat is a slope below this, MB a case; and from which case on it is taken: of the goals from the middle on, as one in ten alone is with the arm and its
-#: pictures, which take most and reach their most late.
+#: Flat is a slope below this, MB a case; and from which case on it is taken: of the goals from the middle on, as one in ten alone is with
+#: the arm and its pictures, which take most and reach their most late.
 FLAT = {"requests": 0.002, "messages": 0.05, "goals": 0.05}
 WARM_UP = {"requests": 1000, "messages": 50, "goals": 150}
 #: Between two measurements of memory, cases; with fewer of them than this nothing is said about growth.

@@ -1,7 +1,8 @@
-"""Every command in the READMEs and the folders docs/ is one that works: quick ones are run, the others go through their own argument parser.
+"""Every command in the READMEs and the folders docs/ is one that works: quick ones are run, the others go through their own argument
+parser.
 
-What a command names has to be there: scripts, packages, executables, launch files and their arguments, parameters, fields of goals, files of
-this repository.  Words in capitals stand for the reader's own files.
+What a command names has to be there: scripts, packages, executables, launch files and their arguments, parameters, fields of goals, files
+of this repository.  Words in capitals stand for the reader's own files.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""A mug is asked to be hung: where its handle stands out to the side of the cameras a contact is found, where it is behind the body the answer says so."""
+"""A mug is asked to be hung: where its handle stands out to the side of the cameras a contact is found, where it is behind the body the
+answer says so."""
 
 import numpy as np
 import pytest

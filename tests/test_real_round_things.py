@@ -17,8 +17,8 @@ CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data" / "rgbd"
 
 pytestmark = pytest.mark.skipif(not CAPTURES.is_dir(), reason="the shared captures are not here")
 
-#: Of each capture pixels (column, row) of things: what solid each is to become, whether a hole shows in it from the side, and its width in mm
-#: (read from depth; of the white mug of ``cluttered_0`` from its 81 pixels at 0.84 m, its handle turned away by some 10 degrees).
+#: Of each capture pixels (column, row) of things: what solid each is to become, whether a hole shows in it from the side, and its width in
+#: mm (read from depth; of the white mug of ``cluttered_0`` from its 81 pixels at 0.84 m, its handle turned away by some 10 degrees).
 SEEN = {
     "realsense_single/red_mug": {(343, 264): ("round with handle", True, 123)},
     "realsense_single/cylinder": {(326, 139): ("cylinder", False, 66)},

@@ -123,7 +123,8 @@ ALIGNERS: dict[str, Callable[[Mesh, Mesh, int], Alignments]] = {"pca": pca, "fpf
 
 
 def by_shape(name: str, strategy: Strategy, tools: Sequence[SceneObject], target: Target, top_k: int, seed: int) -> list[ContactCandidate]:
-    """The demonstrated contact carried over to each tool by one of :data:`ALIGNERS`, best first; raises ``NO_MATCH`` where there is none."""
+    """The demonstrated contact carried over to each tool by one of :data:`ALIGNERS`, best first; raises ``NO_MATCH`` where there is
+    none."""
     candidates = []
     for tool in tools:
         view = as_it_stands(tool, strategy.view)

@@ -1,7 +1,8 @@
-"""Which way a target is led among other things: as the strategy has it, or turned about the vertical where something stands in the way of that.
+"""Which way a target is led among other things: as the strategy has it, or turned about the vertical where something stands in the way of
+that.
 
-Seen from above: what tool and target cover of the table on their way, as unions of convex polygons, against what the other things cover.  Of
-strategies whose target may be led another way (:attr:`magic_core.strategy.Strategy.turned_by`).
+Seen from above: what tool and target cover of the table on their way, as unions of convex polygons, against what the other things cover.
+Of strategies whose target may be led another way (:attr:`magic_core.strategy.Strategy.turned_by`).
 """
 
 from __future__ import annotations

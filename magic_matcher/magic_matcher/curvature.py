@@ -529,7 +529,8 @@ def explained(
     contour: Contour, index: int, normal: NDArray[np.float64], scales: NDArray[np.float64], concave: bool = False
 ) -> tuple[float, float] | None:
     """Signed curvature (1/px, positive: convex) at the largest of ``scales`` at which a circle, a conic or an arc between
-    straight arms explains the edge, and that scale; ``None`` where there is none.  ``normal`` (2,) is the contact's, outward, concave its sign.
+    straight arms explains the edge, and that scale; ``None`` where there is none.  ``normal`` (2,) is the contact's, outward, concave its
+    sign.
     """
     scales = np.sort(scales[scales >= EXPLAINED_FLOOR])[::-1]
     if not len(scales):

@@ -38,8 +38,8 @@ SHARE = 0.5
 class UNet:
     """Feature maps of a U-Net's up blocks.
 
-    size: side of the pictures in pixels, a multiple of 64; step, blocks, draws: as of :data:`DIFT_STEP` and its neighbours; seed: of the noise.  Raises
-    ``FEATURE_WEIGHTS`` where diffusers or the weights are missing.
+    size: side of the pictures in pixels, a multiple of 64; step, blocks, draws: as of :data:`DIFT_STEP` and its neighbours; seed: of the
+    noise.  Raises ``FEATURE_WEIGHTS`` where diffusers or the weights are missing.
     """
 
     def __init__(

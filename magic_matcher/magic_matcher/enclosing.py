@@ -23,7 +23,8 @@ REACH = 1.5
 DIRECTIONS, PLACES = 36, 120
 #: The middle of a loop is as far from the outline as these shares of the tool's size, at least and at most.
 NEAREST, FARTHEST, DISTANCES = 0.03, 0.45, 8
-#: So much of a thing's surface must have stayed unseen for a handle to be there: one takes a quarter of what is seen of a round body from its side.
+#: So much of a thing's surface must have stayed unseen for a handle to be there: one takes a quarter of what is seen of a round body from
+#: its side.
 UNSEEN = 0.2
 #: Points of a surface that tell which way what was seen of it faces.
 SURFACE = 2000
@@ -69,8 +70,8 @@ def most(contour: Contour) -> float:
 
 
 def unseen_side(item: SceneObject) -> NDArray[np.float64] | None:
-    """The level direction (2,), in the world, away from the one that the seen part of a thing's surface faces; ``None`` where that faces none
-    more than another, or no cloud is known."""
+    """The level direction (2,), in the world, away from the one that the seen part of a thing's surface faces; ``None`` where that faces
+    none more than another, or no cloud is known."""
     import trimesh
     from scipy.spatial import cKDTree
 

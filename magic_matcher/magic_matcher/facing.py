@@ -27,8 +27,8 @@ from magic_matcher.contour import Contour
 
 #: A side faces a direction within this angle, rad; a circle stands for all that does so, seen from the outline's middle, within the other.
 FACING, AROUND = np.deg2rad(30.0), np.deg2rad(60.0)
-#: A model explains what it leaves no more of (root mean square): so many pixels, or this share of the size; on a rough outline so many times
-#: the roughness, the least that explains it, up to the last share.
+#: A model explains what it leaves no more of (root mean square): so many pixels, or this share of the size; on a rough outline so many
+#: times the roughness, the least that explains it, up to the last share.
 RASTER, EVEN, ROUGH, ROUGHEST = 0.45, 0.005, (1.0, 1.5, 2.25, 3.5), 0.04
 #: A flat side is as long as this share of the outline's width along it, and surely one from the next on; its bow is no more than this share
 #: of its length.
@@ -45,8 +45,8 @@ ARM, APEX = 0.3, 0.12
 WITHIN = 0.7
 #: What leaves less than this share of what a circle leaves is a corner.
 CLEARLY = 0.7
-#: A place belongs to a straight side no farther from it than this share of the size, whose normal is within this angle (rad) of its own and which
-#: is as long as the last share.
+#: A place belongs to a straight side no farther from it than this share of the size, whose normal is within this angle (rad) of its own and
+#: which is as long as the last share.
 BESIDE, SKEW, SHORTEST = 0.05, np.deg2rad(45.0), 0.1
 #: A side is no longer than so many times what it is where half as much is allowed to be left.
 CORNERED = 1.25
@@ -64,7 +64,8 @@ class Side:
 
 
 def side(contour: Contour, direction: NDArray[np.float64]) -> Side | None:
-    """The side of the outermost loop that a tool meets which is led against a picture direction (2,); ``None`` where it is none of these."""
+    """The side of the outermost loop that a tool meets which is led against a picture direction (2,); ``None`` where it is none of
+    these."""
     outline = _Outline(contour)
     even = max(RASTER, EVEN * outline.size)
     roughness, most = outline.roughness(direction), ROUGHEST * outline.size
@@ -106,7 +107,8 @@ def straight_at(contour: Contour, point: NDArray[np.float64], normal: NDArray[np
 
 @dataclass(frozen=True)
 class Ends:
-    """A place (2,) px on a straight side: how much of the side, px, is behind and ahead of it along the unit way (2,), its normal turned by +90 degrees."""
+    """A place (2,) px on a straight side: how much of the side, px, is behind and ahead of it along the unit way (2,), its normal turned by
+    +90 degrees."""
 
     place: NDArray[np.float64]
     along: NDArray[np.float64]
@@ -123,7 +125,8 @@ class Ends:
 
 
 def ends(contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float64]) -> Ends | None:
-    """Where on the straight side of the outermost loop that it belongs to a place (2,) with an outward normal (2,) is; ``None`` where it is on none."""
+    """Where on the straight side of the outermost loop that it belongs to a place (2,) with an outward normal (2,) is; ``None`` where it is
+    on none."""
     outline = _Outline(contour)
     even = max(RASTER, EVEN * outline.size)
     found: list[Ends] = []
@@ -146,7 +149,8 @@ def ends(contour: Contour, point: NDArray[np.float64], normal: NDArray[np.float6
 
 @dataclass(frozen=True)
 class _Stretch:
-    """B straight stretches: middle (B, 2), outward normal (B, 2), length (B,) px; first (B,) and count (B,) of the points of their lines."""
+    """B straight stretches: middle (B, 2), outward normal (B, 2), length (B,) px; first (B,) and count (B,) of the points of their
+    lines."""
 
     middle: NDArray[np.float64]
     normal: NDArray[np.float64]
@@ -172,7 +176,8 @@ class _Outline:
         return out @ direction > np.cos(AROUND) * np.linalg.norm(out, axis=1)
 
     def roughness(self, direction: NDArray[np.float64]) -> float:
-        """How far what lies towards a direction (2,) and faces it stays behind the convex hull: three quarters of it, so that a notch is none."""
+        """How far what lies towards a direction (2,) and faces it stays behind the convex hull: three quarters of it, so that a notch is
+        none."""
         hull = cv2.convexHull(self.points.astype(np.float32))
         which = self.facing(direction) & (self.normals @ direction > np.cos(AROUND))
         behind = [cv2.pointPolygonTest(hull, (float(u), float(v)), True) for u, v in self.points[which]]

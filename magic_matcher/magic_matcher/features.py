@@ -1,7 +1,8 @@
 """The feature backends there are, by name; what one is says :class:`magic_matcher.global_stage.Features`.
 
-``embedded`` ships with the package; ``dinov2`` needs weights, ``dift`` and ``sd_dino`` (:mod:`magic_matcher.diffusion`) diffusers as well.  ``auto`` takes ``dinov2`` where weights are named and the
-embedded one everywhere else.  Another backend is added by an entry of :data:`MAKERS`.
+``embedded`` ships with the package; ``dinov2`` needs weights, ``dift`` and ``sd_dino`` (:mod:`magic_matcher.diffusion`) diffusers as well.
+``auto`` takes ``dinov2`` where weights are named and the embedded one everywhere else.  Another backend is added by an entry of
+:data:`MAKERS`.
 """
 
 from __future__ import annotations

@@ -345,7 +345,8 @@ def _literal(
 
 
 class NetworkFeatures:
-    """What backends on feature maps of a network share; each brings ``size``, ``aggregation``, ``components``, ``_views`` and :meth:`extract`."""
+    """What backends on feature maps of a network share; each brings ``size``, ``aggregation``, ``components``, ``_views`` and
+    :meth:`extract`."""
 
     # Cosines after a joint PCA have no common scale; none was fitted, as no trained weights could be reached.
     floor = 0.0

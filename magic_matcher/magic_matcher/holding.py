@@ -29,8 +29,8 @@ DIRECTIONS = 72
 #: By so much (rad) a pull may be off to either side and still has to find the disc held, in steps in which a better pull is looked for, and
 #: the farthest that one is from the contact's own normal.
 ASTRAY, TURN_STEP, TURN_MOST = np.deg2rad(15.0), np.deg2rad(5.0), np.deg2rad(45.0)
-#: A disc that has moved aside by so many radii has left its place: what a side of a shallow hollow rises by farther off holds it at another one.
-#: A disc's centres are looked at so many times as closely for that.
+#: A disc that has moved aside by so many radii has left its place: what a side of a shallow hollow rises by farther off holds it at another
+#: one. A disc's centres are looked at so many times as closely for that.
 STAYS, FINER = 0.75, 4
 
 
@@ -104,7 +104,8 @@ def centres(around: Room, radius: float) -> Curves:
 
 
 def _walks(heights: NDArray[np.float32], start: NDArray[np.int64], sign: int) -> NDArray[np.float32]:
-    """Heights (B, K) met on walks once around a curve from ``start`` (B,), forwards or backwards; ``heights`` (B, K), or (1, K) for all alike."""
+    """Heights (B, K) met on walks once around a curve from ``start`` (B,), forwards or backwards; ``heights`` (B, K), or (1, K) for all
+    alike."""
     count = heights.shape[1]
     if sign < 0:
         # Backwards from k is forwards from K - 1 - k on the reversed curve.
@@ -224,8 +225,8 @@ class Pocket:
 def pockets(contour: Contour, radius: float, curves: Curves, enough: float, hangs: bool = False) -> list[Pocket]:
     """Where a disc of ``radius`` px is held ``enough`` radii deep, the deepest first, no two within a radius of each other.
 
-    Pressed into the tool along some direction, and :data:`ASTRAY` to either side of it, as :func:`steadied` asks; with ``hangs`` by a tool that
-    hangs from it, its centroid as far below as it gets.  curves: those of the disc's :func:`centres`.
+    Pressed into the tool along some direction, and :data:`ASTRAY` to either side of it, as :func:`steadied` asks; with ``hangs`` by a tool
+    that hangs from it, its centroid as far below as it gets.  curves: those of the disc's :func:`centres`.
     """
     found: list[Pocket] = []
     tolerance = max(TOLERANCE * radius, 0.6)
@@ -283,8 +284,8 @@ def _finer(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     radius: float, curve: NDArray[np.float64], free: NDArray[np.float64], at: int, out: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """A disc pressed against directions ``out`` (T, 2) from one of its centres: how deep (T,) it is held, radii, how high (T,) the lower side of where
-    it comes to rest is within :data:`STAYS`, and the index (T,) of that centre."""
+    """A disc pressed against directions ``out`` (T, 2) from one of its centres: how deep (T,) it is held, radii, how high (T,) the lower
+    side of where it comes to rest is within :data:`STAYS`, and the index (T,) of that centre."""
     tolerance = max(TOLERANCE * radius, 0.6)
     height = (out @ (curve - curve[at]).T).astype(np.float32)
     rest, depth, _ = _settle(curve, free, out, np.full(len(out), at), height, tolerance, False)
@@ -311,10 +312,10 @@ def steadied(
 
     A large disc in a small corner touches both of its arms, the shorter one at its end: pulled along the bisector of the corner it rolls
     over that end.  Of normals turned about the disc's centre the one that is turned least counts for which the hollow is ``enough``
-    radii deep, pulled along it and :data:`ASTRAY` to either side.  Where none is so deep and the tool is led ``straight`` on, it is the one along
-    which the lower side is highest (:data:`STAYS`), of those along which the hollow is ``enough`` deep if it is so along the contact's own.  Of a scoop,
-    that is led along and then up, it is the deepest, and where none bears such pulls the one that bears the most to either side.  The contact is then
-    where the line through the disc's centre meets the outline.
+    radii deep, pulled along it and :data:`ASTRAY` to either side.  Where none is so deep and the tool is led ``straight`` on, it is the one
+    along which the lower side is highest (:data:`STAYS`), of those along which the hollow is ``enough`` deep if it is so along the
+    contact's own.  Of a scoop, that is led along and then up, it is the deepest, and where none bears such pulls the one that bears the
+    most to either side.  The contact is then where the line through the disc's centre meets the outline.
     """
     if not curves:
         return None

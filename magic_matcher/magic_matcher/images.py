@@ -33,7 +33,8 @@ CANNY = (100, 200)
 
 
 def decode(path: str | Path, name: str) -> NDArray[np.uint8]:
-    """A picture file as it is shown (:mod:`magic_core.images`), (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8; ``name`` says in errors what it is."""
+    """A picture file as it is shown (:mod:`magic_core.images`), (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8; ``name`` says in errors what
+    it is."""
     data = files.read(path, name, Code.BAD_REQUEST_IMAGE)
     if min(data.shape[:2]) < SMALLEST:
         raise MagicError(

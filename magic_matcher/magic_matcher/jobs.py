@@ -112,7 +112,8 @@ class Example:
         return self.shape.contact(name, self.view)
 
     def near(self, points: NDArray[np.float64], normals: NDArray[np.float64], tolerance: float, share: float = 1.0) -> NDArray[np.bool_]:
-        """Which picture points (N, 2) with normals lie within ``tolerance`` px of a region, or of the middle ``share`` of it, with normals within 60 degrees."""
+        """Which picture points (N, 2) with normals lie within ``tolerance`` px of a region, or of the middle ``share`` of it, with normals
+        within 60 degrees."""
         result = np.zeros(len(points), bool)
         for name in self.names():
             region = self.shape.region(name)

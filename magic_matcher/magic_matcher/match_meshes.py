@@ -6,7 +6,8 @@ A strategy's contact on other tools::
 
 A contact shown on one mesh (pixels of its canonical view, which is written as ``reference.png`` too)::
 
-    ros2 run magic_matcher match_meshes --reference hanger.obj --kind side --reference-point 192 123 --radius 0.006 --tools mug.obj --out out
+    ros2 run magic_matcher match_meshes --reference hanger.obj --kind side --reference-point 192 123 --radius 0.006 --tools mug.obj --out
+    out
 
 All meshes of a folder, and shapes of the project's own generator (``FAMILY:SEED``), in rows of six::
 

@@ -84,7 +84,8 @@ class MatchResult:
 
 @dataclass(frozen=True)
 class Further:
-    """A further contact of a reference: its name, the place in the reference's view, its contact, and the radius (m) that the target has there."""
+    """A further contact of a reference: its name, the place in the reference's view, its contact, and the radius (m) that the target has
+    there."""
 
     name: str
     reference: Reference
@@ -245,7 +246,8 @@ class Matcher:
         return _Task(reference, contact, prepared, asked, ratio, target, disc, use_target, top_k, heatmap, side=side)
 
     def feature_of(self, strategy: Strategy, view: CanonicalView, direction: NDArray[np.float64]) -> Contact:
-        """p_O' by analogy: the place on a target that looks most as the demonstrated one does at p_O, of those that face a picture direction (2,).
+        """p_O' by analogy: the place on a target that looks most as the demonstrated one does at p_O, of those that face a picture
+        direction (2,).
 
         Raises ``NO_MATCH`` where none faces it.
         """
@@ -265,7 +267,8 @@ class Matcher:
         return max(looking, key=lambda c: c.score).tool
 
     def target_view(self, item: SceneObject, strategy: Strategy) -> CanonicalView:
-        """As the function of that name; what was drawn lately is not drawn again: it is looked at to choose the target, and when it is chosen."""
+        """As the function of that name; what was drawn lately is not drawn again: it is looked at to choose the target, and when it is
+        chosen."""
         key = digest((item.mesh, item.world_from_object, strategy.target_view_direction, strategy.target_outline, strategy.view))
         with self._drawing:
             view = self._drawn.get(key)
@@ -296,8 +299,8 @@ class Matcher:
 
         The view as the tool stands is taken where the match in it is clear, or where no other is better by enough to turn the tool;
         if it is askew, only where no other shows a contact.  What other views show comes after all that the best one shows, as what
-        has to be turned for the one may be in no hand's reach.  Where these are few, and a simulation can judge what is tried, places that show
-        less (:func:`magic_matcher.plausible.lesser`) come after them.  Raises NO_MATCH with what the best place of all views lacks,
+        has to be turned for the one may be in no hand's reach.  Where these are few, and a simulation can judge what is tried, places that
+        show less (:func:`magic_matcher.plausible.lesser`) come after them.  Raises NO_MATCH with what the best place of all views lacks,
         HANDLE_NOT_SEEN where a loop is asked for, none shows, and a part of the tool large enough for one was not seen.
         """
         failures: list[tuple[float, MagicError]] = []
@@ -370,8 +373,8 @@ class Matcher:
     def _between(self, task: _Task, tool: Tool, view: CanonicalView) -> _Seen:
         """The pockets of a view in which the target is held deep enough (:func:`magic_matcher.holding.pockets`).
 
-        The contact is on the disc, towards the tool: between the arms of a V there is nothing of the tool at that point.  Likeness is not asked, so
-        that they come after all places that have it.
+        The contact is on the disc, towards the tool: between the arms of a V there is nothing of the tool at that point.  Likeness is not
+        asked, so that they come after all places that have it.
         """
         hollow = lesser(task.asked).hollow
         if task.disc is None or hollow is None:
@@ -404,7 +407,8 @@ class Matcher:
     def _joined(
         self, task: _Task, tool: Tool, view: CanonicalView, contour: Contour, candidates: list[ContactCandidate]
     ) -> tuple[list[ContactCandidate], list[Refusal]]:
-        """Each candidate with the further contacts that suit it best as one rigid tool, its score that of all together; and why there are none.
+        """Each candidate with the further contacts that suit it best as one rigid tool, its score that of all together; and why there are
+        none.
 
         The score is the mean of all contacts' times how well they agree (:mod:`magic_core.placement`).  Where the demonstrated contact is
         straight, what was found is the straight side that is there.
@@ -504,7 +508,8 @@ class Matcher:
 
 @dataclass(frozen=True)
 class _Task:
-    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); disc: radius (m) of the disc that stands for the target, if one does;
+    """What is looked for in every view of every tool; ratio: r(p_T) / r(p_O); disc: radius (m) of the disc that stands for the target, if
+    one does;
     further: the same for further contacts, by name; side: where the reference is on its straight side, if it is on one."""
 
     reference: Reference
@@ -546,8 +551,8 @@ def _in_proportion(task: _Task, view: CanonicalView, contour: Contour, proposal:
 def _steadied(
     asked: Demands, floor: float, contour: Contour, proposal: Proposal, found: curvature.Estimate, radius: float, curves: holding.Curves
 ) -> curvature.Estimate:
-    """An estimate whose place and normal are those by which the target is held surely, where a hollow is asked for (:func:`holding.steadied`) and
-    the place is similar enough (``floor``)."""
+    """An estimate whose place and normal are those by which the target is held surely, where a hollow is asked for
+    (:func:`holding.steadied`) and the place is similar enough (``floor``)."""
     if asked.hollow is None or found.concave != asked.concave or not proposal.similarity >= floor:
         return found
     held = holding.steadied(contour, found.point, found.normal, radius, curves, asked.hollow, asked.straight)
@@ -577,8 +582,9 @@ def _further(best: _Seen, others: Sequence[tuple[_Seen, bool]], near: float, cou
 def _told(task: _Task, tool: Tool, seen: _Seen) -> _Seen:
     """What was found in one view of a tool, on the surface of its mesh, and told in the view in which it is wanted.
 
-    That is, where the tool says nothing else, the view itself, of one and its opposite that which looks down, of level ones along -y, then -x: a view
-    of the tool's own shape is looked at from the side that turns with it, while how it is to be held follows from which face is up.
+    That is, where the tool says nothing else, the view itself, of one and its opposite that which looks down, of level ones along -y, then
+    -x: a view of the tool's own shape is looked at from the side that turns with it, while how it is to be held follows from which face is
+    up.
     """
     if tool.mesh is None:
         return seen
@@ -628,7 +634,8 @@ def _not_seen(task: _Task, tool: Tool, looked: Sequence[CanonicalView], error: M
 def target_contact(
     strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64], matcher: Matcher | None = None
 ) -> Contact:
-    """p_O' (:func:`magic_matcher.targets.contact_on`); where a strategy meets its target at a feature, with the matcher's features, by default those that ship."""
+    """p_O' (:func:`magic_matcher.targets.contact_on`); where a strategy meets its target at a feature, with the matcher's features, by
+    default those that ship."""
     return contact_on(strategy, view, world_from_object, (matcher or Matcher(EmbeddedFeatures())).feature_of)
 
 

@@ -28,16 +28,18 @@ from magic_matcher.global_stage import Reference
 GAP, GAP_SHARE = 1.0, 1.5
 #: Depth of a hollow that counts, in radii, and as a share of the reference's.  Fitted together with the floor (docs/features.md).
 HOLLOW, HOLLOW_SHARE = 0.2, 0.5
-#: What will do, as shares of the hollow and of the likeness that are asked for, where a tool has few places that show all of them and a simulation
-#: judges what is tried.  Dragged over a table at a friction of 0.3 a disc climbs a millimetre by a speed of 0.08 m/s: most corners that are half as
-#: deep hold it, but not surely all.  Likeness is there to choose among places; whether one can do the job its room and hollow say better.
+#: What will do, as shares of the hollow and of the likeness that are asked for, where a tool has few places that show all of them and a
+#: simulation judges what is tried.  Dragged over a table at a friction of 0.3 a disc climbs a millimetre by a speed of 0.08 m/s: most
+#: corners that are half as deep hold it, but not surely all.  Likeness is there to choose among places; whether one can do the job its room
+#: and hollow say better.
 SHALLOW, UNLIKE = 0.5, 0.8
 
 
 @dataclass(frozen=True)
 class Demands:
     """What a place must show.  concave: its sign, ``None``: either; floor: of s_dino; gap (at most) and hollow (at least) in radii of the
-    target, ``None`` where they are not asked; loop: the reference lies in a loop (:mod:`magic_matcher.enclosing`); hangs: the tool is let go there;
+    target, ``None`` where they are not asked; loop: the reference lies in a loop (:mod:`magic_matcher.enclosing`); hangs: the tool is let
+    go there;
     straight: it is led along the contact's normal."""
 
     concave: bool | None
@@ -93,8 +95,8 @@ def refusals(
     metres_per_pixel: float,
     around: holding.Room | None = None,
 ) -> list[Refusal | None]:
-    """For each of the places (N, 2) with outward normals why it is refused, ``None`` where it is not; radius of the target, px; around: what
-    :func:`room_for` gives, where that is known."""
+    """For each of the places (N, 2) with outward normals why it is refused, ``None`` where it is not; radius of the target, px; around:
+    what :func:`room_for` gives, where that is known."""
     held = None
     around = room_for(asked, contour, radius) if around is None else around
     if radius is not None and around is not None and len(points):

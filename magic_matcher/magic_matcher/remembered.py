@@ -19,7 +19,8 @@ MOST = 48 * 2**20
 
 
 class Remembered:
-    """Answers as :meth:`magic_matcher.matching.Matcher.match` does, at once where it was asked the same of the same objects a short while ago."""
+    """Answers as :meth:`magic_matcher.matching.Matcher.match` does, at once where it was asked the same of the same objects a short while
+    ago."""
 
     def __init__(self, matcher: Matcher) -> None:
         self._matcher = matcher

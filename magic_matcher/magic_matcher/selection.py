@@ -72,14 +72,16 @@ def select(
 def choose_target(
     strategy: Strategy, objects: Sequence[SceneObject], seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view
 ) -> SceneObject:
-    """The object that looks most like the demonstration's target, seen as the target is, in shape and size; seen: what draws it (:func:`target_view`)."""
+    """The object that looks most like the demonstration's target, seen as the target is, in shape and size; seen: what draws it
+    (:func:`target_view`)."""
     return alike(strategy, objects, seen)[0]
 
 
 def alike(
     strategy: Strategy, objects: Sequence[SceneObject], seen: Callable[[SceneObject, Strategy], CanonicalView] = target_view
 ) -> list[SceneObject]:
-    """The objects of which each may as well be the target (:data:`ALIKE`), the one most like the demonstration's first; raises UNKNOWN_OBJECT for none."""
+    """The objects of which each may as well be the target (:data:`ALIKE`), the one most like the demonstration's first; raises
+    UNKNOWN_OBJECT for none."""
     if not objects:
         raise MagicError(Code.UNKNOWN_OBJECT, "objects to choose the target from", 0, "at least one")
 

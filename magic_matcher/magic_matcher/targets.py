@@ -23,13 +23,15 @@ from magic_matcher.contour import Contour
 #: Narrower ways across (share of the object's size) are the raster's.
 LEAST_ACROSS = 0.03
 
-#: Finds the place on a target, in its view, that is like the strategy's contact on the demonstrated one, of those that face a picture direction (2,).
+#: Finds the place on a target, in its view, that is like the strategy's contact on the demonstrated one, of those that face a picture
+#: direction (2,).
 FeatureOf = Callable[[Strategy, CanonicalView, NDArray[np.float64]], Contact]
 
 
 @dataclass(frozen=True)
 class Target:
-    """The object to act on: its id, the view along the strategy's direction and p_O on it; further: where the strategy's further contacts meet it."""
+    """The object to act on: its id, the view along the strategy's direction and p_O on it; further: where the strategy's further contacts
+    meet it."""
 
     id: str
     view: CanonicalView
@@ -52,8 +54,8 @@ def target_view(item: SceneObject, strategy: Strategy) -> CanonicalView:
 
 
 def contact_on(strategy: Strategy, view: CanonicalView, world_from_object: NDArray[np.float64], feature_of: FeatureOf) -> Contact:
-    """p_O': what of the target's silhouette a tool meets that is led against the strategy's target normal (:mod:`magic_matcher.facing`), with its
-    curvature; where that is neither flat, round nor a corner, the place that reaches farthest.
+    """p_O': what of the target's silhouette a tool meets that is led against the strategy's target normal (:mod:`magic_matcher.facing`),
+    with its curvature; where that is neither flat, round nor a corner, the place that reaches farthest.
 
     For a strategy that meets its target inside, the place inside that faces that normal (:func:`inner_point`); for one that meets
     it at a feature, what ``feature_of`` finds (:meth:`magic_matcher.matching.Matcher.feature_of`).

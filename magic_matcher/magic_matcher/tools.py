@@ -46,7 +46,8 @@ class Tool:
     up: NDArray[np.float64] | None = None
 
     def hides(self, view: CanonicalView, normal: NDArray[np.float64]) -> bool:
-        """Whether a place of a cut, with that outward normal (2,) in the picture, faces what the tool lies on: its shape there is a guess."""
+        """Whether a place of a cut, with that outward normal (2,) in the picture, faces what the tool lies on: its shape there is a
+        guess."""
         return self.up is not None and view.kind == "section" and float(view.directions(normal) @ self.up) < -np.sin(DOWN)
 
 

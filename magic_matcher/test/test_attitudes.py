@@ -67,7 +67,8 @@ def test_what_most_agree_on():
 
 
 def test_the_side_that_a_seen_tool_lies_on_is_no_place():
-    """No camera has seen the hollow of a spoon that lies on its face, nor the underside of a handle: what is reconstructed there is a guess."""
+    """No camera has seen the hollow of a spoon that lies on its face, nor the underside of a handle: what is reconstructed there is a
+    guess."""
     found = strategies.find("scooping", STRATEGIES)
     backend = features.load("embedded")
 

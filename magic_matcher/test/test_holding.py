@@ -243,7 +243,8 @@ def test_shapes_and_folders_of_meshes(tmp_path, capsys):
 @pytest.mark.parametrize("straight", [True, False])
 @pytest.mark.parametrize("off", [0.2, 0.4, 0.6])
 def test_in_a_wide_bowl_of_few_pixels_the_pull_stays(off, straight):
-    # A wide flat bowl, a little askew, and a disc of 17 pixels that it holds when pulled straight: 5 degrees more or less are a matter of its pixels.
+    # A wide flat bowl, a little askew, and a disc of 17 pixels that it holds when pulled straight: 5 degrees more or less are a matter of
+    # its pixels.
     column = np.arange(200)
     floor = 70 - 0.0024 * (column - 100 - off) ** 2 + 0.06 * (column - 100)
     floor[(column <= 20) | (column >= 180)] = 40

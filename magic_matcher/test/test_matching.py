@@ -189,8 +189,8 @@ def test_the_sign_is_the_references(matcher):
 
 
 def test_a_shallow_hollow_will_do_where_a_simulation_judges(matcher):
-    # A disc of 40 px on a bar lies against a step of 10 px: their normals are 41 degrees apart, and led along one 30 degrees from the step's
-    # the disc climbs over it by 1 - cos 30 = 0.134 radii.
+    # A disc of 40 px on a bar lies against a step of 10 px: their normals are 41 degrees apart, and led along one 30 degrees from the
+    # step's the disc climbs over it by 1 - cos 30 = 0.134 radii.
     v, u = np.mgrid[0:200, 0:400]
     mask = ((v >= 100) & (v < 140) & (u >= 20) & (u < 360)) | ((v >= 90) & (v < 100) & (u >= 300) & (u < 360))
     radius, c = 40.0, contour.extract(mask)
@@ -210,8 +210,8 @@ def test_a_shallow_hollow_will_do_where_a_simulation_judges(matcher):
 
 
 def test_a_place_that_shows_less_is_held_as_surely(matcher):
-    """A bar with a wide head, and a disc twice as large as the step between them: however like the demonstrated one it is said to be, it is pulled towards
-    the step's end."""
+    """A bar with a wide head, and a disc twice as large as the step between them: however like the demonstrated one it is said to be, it is
+    pulled towards the step's end."""
     mask = np.zeros((500, 500), bool)
     mask[200:230, 60:300] = mask[178:230, 300:400] = True
     view = CanonicalView(np.zeros((500, 500, 3), np.uint8), mask, 0.001, np.eye(4), "top")
@@ -281,7 +281,8 @@ def test_the_contact_follows_the_tool_in_any_attitude(matcher, demonstration, fa
 
 
 def trough(bump: float, fillet: int = 0) -> CanonicalView:
-    """A U of one thickness, 260 px wide, with a round bump of 12 px under its floor at a share of the width, its right inner corner rounded."""
+    """A U of one thickness, 260 px wide, with a round bump of 12 px under its floor at a share of the width, its right inner corner
+    rounded."""
     mask = np.zeros((384, 384), bool)
     mask[120:260, 62:322] = True
     mask[120:230, 92:292] = False

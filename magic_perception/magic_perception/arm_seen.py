@@ -1,9 +1,9 @@
 """How far a camera sees the arm from where its joints put it: the calibration of camera and arm, measured in a picture of the arm itself.
 
-Two cameras that agree with each other may both be off the arm, by a hand-eye calibration that is wrong, and then every motion is.  The arm's
-visual shapes are drawn where its joints put them, and what is seen about them is carried onto them by a shift: the distances along the
-surfaces' normals are made small (point-to-plane ICP), and what fits badly counts less (Cauchy's weights).  A turn of the camera shows as the
-shift that it makes at the arm.
+Two cameras that agree with each other may both be off the arm, by a hand-eye calibration that is wrong, and then every motion is.  The
+arm's visual shapes are drawn where its joints put them, and what is seen about them is carried onto them by a shift: the distances along
+the surfaces' normals are made small (point-to-plane ICP), and what fits badly counts less (Cauchy's weights).  A turn of the camera shows
+as the shift that it makes at the arm.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ REACHES = (0.1, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.02, 0.015, 0.012)
 JUMP, BESIDE = 0.06, 9
 #: Distances from the surface that count half, m: smear, and what an arm wears.
 MISFIT = 0.006
-#: So many points have to be drawn, and such a share of them has to be fitted: of arms in free sight it was 0.48 at least, of one behind a box
-#: that its hand stuck in 0.38, and the box was taken for the hand.
+#: So many points have to be drawn, and such a share of them has to be fitted: of arms in free sight it was 0.48 at least, of one behind a
+#: box that its hand stuck in 0.38, and the box was taken for the hand.
 DRAWN, SHARE = 100, 0.43
 #: Errors of neighbouring points are alike: so many tell as much as one.  No shape and no depth is better than FLOOR, m.
 ALIKE, FLOOR = 12.0, 0.001
@@ -49,7 +49,8 @@ class ArmInPicture:
         self._posed: tuple[bytes, Any] | None = None
 
     def measure(self, frame: RgbdFrame, state: Mapping[str, float], world_from_base: Array | None = None) -> ArmSeen | None:
-        """How a frame, from which the arm has not been cut, sees it at joint positions (rad, m, by name); ``None`` where that does not tell.
+        """How a frame, from which the arm has not been cut, sees it at joint positions (rad, m, by name); ``None`` where that does not
+        tell.
 
         world_from_base: the pose of the URDF's root in the frame's world.
         """

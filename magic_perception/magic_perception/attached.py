@@ -1,7 +1,8 @@
 """Parts of one thing that depth or a seam has parted, told by how they lie on it in the pictures: a handle, the rim of a mouth.
 
-Where a mug lies on its side its handle meets it at two ends that depth loses, or lies on the table beside it; its mouth, seen aslant, is a strip a few pixels
-wide whose depth is torn from the outside's; a bent wire has the table's depth between a plate and a hook that keep their own.
+Where a mug lies on its side its handle meets it at two ends that depth loses, or lies on the table beside it; its mouth, seen aslant, is a
+strip a few pixels wide whose depth is torn from the outside's; a bent wire has the table's depth between a plate and a hook that keep their
+own.
 """
 
 from __future__ import annotations
@@ -25,20 +26,24 @@ COLOR = 0.06
 BESIDE = 7
 #: The largest share of the other's pixels that a part has which hangs beside it or is a strip along it, and which closes a loop with it.
 PART, LOOP = 0.2, 0.5
-#: A hole of so many pixels, of whose rim either has such a share, closes a loop; a strip is so wide at most, as a mean, at a focal length of 615.
+#: A hole of so many pixels, of whose rim either has such a share, closes a loop; a strip is so wide at most, as a mean, at a focal length
+#: of 615.
 HOLE, RIM, STRIP = 10, 0.2, 4.0
-#: Of the pixels at which two parts meet in a bar such a share has no depth of its own; so long, m, a bar may be that has none, where several pictures show it.
+#: Of the pixels at which two parts meet in a bar such a share has no depth of its own; so long, m, a bar may be that has none, where
+#: several pictures show it.
 LOST, LOST_BAR = 0.5, 0.040
-#: A place is seen to be empty where a picture shows neither there and depth goes on behind it by so many metres; between two things most places are.
+#: A place is seen to be empty where a picture shows neither there and depth goes on behind it by so many metres; between two things most
+#: places are.
 EMPTY, FREE = 0.004, 0.3
 
 
 def owners(labels: list[NDArray[np.int32]], looks: list[Looked]) -> NDArray[np.int64]:
-    """For each label (top + 1,) the one it belongs to, itself mostly: a smaller one of the same colour that touches a larger one in every picture which shows it.
+    """For each label (top + 1,) the one it belongs to, itself mostly: a smaller one of the same colour that touches a larger one in every
+    picture which shows it.
 
-    It belongs to the other where it hangs in the air, carried by nothing; where they meet in a thin bar that has lost its depth; or where both enclose a hole,
-    as a handle does with its mug, or it is a strip along the other's edge, and no camera sees between them; or where one would hang over
-    the other, and something that no camera sees may carry it, as the stem does a goblet's cup.
+    It belongs to the other where it hangs in the air, carried by nothing; where they meet in a thin bar that has lost its depth; or where
+    both enclose a hole, as a handle does with its mug, or it is a strip along the other's edge, and no camera sees between them; or where
+    one would hang over the other, and something that no camera sees may carry it, as the stem does a goblet's cup.
     """
     top = max((int(image.max()) for image in labels), default=0)
     owner = np.arange(top + 1)
@@ -216,8 +221,9 @@ def _strip(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, oth
 
 
 def _bar(labels: list[NDArray[np.int32]], looks: list[Looked], label: int, other: int) -> bool:
-    """Whether two labels meet in a picture in a thin bar that has lost its depth there, and what of them has its own is near each other, less near where
-    all of several pictures show them meet so: there each pixel has the label of the nearest that has depth, and nothing in space parts them."""
+    """Whether two labels meet in a picture in a thin bar that has lost its depth there, and what of them has its own is near each other,
+    less near where all of several pictures show them meet so: there each pixel has the label of the nearest that has depth, and nothing in
+    space parts them."""
     from scipy.spatial import cKDTree
 
     met, shown = 0, 0

@@ -36,10 +36,9 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
 
     A pixel needs depth in half of the frames that count there.  Where the values spread by more than ``spread`` metres (edges flicker
     between two surfaces) the median is taken instead of the mean, so that no surface is made up between two.
-    What moves, and what the robot hid before, is taken from the frames alone that show it as the last one does: the mean of a thing's places is
-    a thing that is nowhere.  Blind is what is blind in the last frame.
-    So is what is held.
-    Raises ``BAD_IMAGE`` for frames of different sizes, ``NO_FRAMES`` for none.
+    What moves, and what the robot hid before, is taken from the frames alone that show it as the last one does: the mean of a thing's
+    places is a thing that is nowhere.  Blind is what is blind in the last frame. So is what is held. Raises ``BAD_IMAGE`` for frames of
+    different sizes, ``NO_FRAMES`` for none.
     """
     if not frames:
         raise MagicError(Code.NO_FRAMES, "frames to average", 0, "at least one")
@@ -76,7 +75,8 @@ def _summed(stack: NDArray) -> NDArray[np.float32]:
 
 
 def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
-    """Whether a mean of frames shows what an earlier one of the same camera, from the same place, did: no blob of it differs by more than noise."""
+    """Whether a mean of frames shows what an earlier one of the same camera, from the same place, did: no blob of it differs by more than
+    noise."""
     if not _comparable(frame, before):
         return False
     (blind, veiled), (held, was_held) = _blind(frame, before), _held(frame, before)
@@ -90,8 +90,8 @@ def unchanged(frame: RgbdFrame, before: RgbdFrame) -> bool:
 
 
 def unchanged_beside_robot(frame: RgbdFrame, before: RgbdFrame) -> bool:
-    """The same but for where one of both shows the robot, or what that holds, and for depth that there is in one of both only: beside an arm is its shadow,
-    which the second imager does not see."""
+    """The same but for where one of both shows the robot, or what that holds, and for depth that there is in one of both only: beside an
+    arm is its shadow, which the second imager does not see."""
     if not _comparable(frame, before):
         return False
     robot = np.logical_or.reduce([*_blind(frame, before), *_held(frame, before)])

@@ -13,14 +13,15 @@ from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pixels import where, window
 
-#: Two parts on both sides of what hides the middle of one thing: how much nearer that is, and how far the tops may differ in height, m; least
-#: common share of their histograms of colour; and so many pixels are between what is compared across an edge, of which there are so many at least.
+#: Two parts on both sides of what hides the middle of one thing: how much nearer that is, and how far the tops may differ in height, m;
+#: least common share of their histograms of colour; and so many pixels are between what is compared across an edge, of which there are so
+#: many at least.
 NEARER, LEVEL, COMMON, ACROSS, EDGES = 0.012, 0.015, 0.5, (8, 20), 8
 
 
 def behind_one(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
-    """Labels with the parts of one thing that another hides in its middle joined: of one colour or with an upright face in one plane, equally high,
-    and nothing but that other between."""
+    """Labels with the parts of one thing that another hides in its middle joined: of one colour or with an upright face in one plane,
+    equally high, and nothing but that other between."""
     from scipy.spatial import cKDTree
 
     top = max((int(image.max()) for image in labels), default=0)
@@ -54,8 +55,8 @@ def behind_one(labels: list[NDArray[np.int32]], looks: list[Looked], parameters:
     return sizeable([owner[image] for image in labels], looks, parameters)
 
 
-#: Two upright faces are in one plane where their directions differ by less, degrees, and 80 % of both lie so near to it, m; so many pixels each,
-#: and such a share of a part's, make a face.
+#: Two upright faces are in one plane where their directions differ by less, degrees, and 80 % of both lie so near to it, m; so many pixels
+#: each, and such a share of a part's, make a face.
 PARALLEL, FLAT, FACE, FACE_SHARE = 8.0, 0.004, 60, 0.15
 
 
@@ -93,7 +94,8 @@ def one_face(look: Looked, image: NDArray[np.int32], a: int, b: int) -> bool:
 
 
 def _hides(image: NDArray[np.int32], depth: NDArray[np.float32]) -> list[tuple[int, int]]:
-    """Pairs of labels (behind, before) that meet in a picture along an edge where the second is nearer; what is behind may have lost its depth there."""
+    """Pairs of labels (behind, before) that meet in a picture along an edge where the second is nearer; what is behind may have lost its
+    depth there."""
     found: dict[tuple[int, int], int] = {}
     cut = window(image > 0)
     image, depth = image[cut], depth[cut]

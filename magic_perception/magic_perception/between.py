@@ -1,8 +1,8 @@
 """Things of different colours so near each other that their points hang together, told by the table that a camera sees between them.
 
-A gap of some millimetres is narrower than the radius in which points are one cluster, and low things have no seam that tells.  Where one picture shows the table
-between two parts of a cluster, and they differ in colour, they are two things, also where the other camera looks along the gap's side and sees none.  What is of one
-colour stays one: a thin thing's mask may be torn.
+A gap of some millimetres is narrower than the radius in which points are one cluster, and low things have no seam that tells.  Where one
+picture shows the table between two parts of a cluster, and they differ in colour, they are two things, also where the other camera looks
+along the gap's side and sees none.  What is of one colour stays one: a thin thing's mask may be torn.
 """
 
 from __future__ import annotations
@@ -14,21 +14,23 @@ from numpy.typing import NDArray
 from magic_perception.clustered import Clusters
 from magic_perception.looks import Looked
 
-#: Least difference of two things' middle colours, in the two colour axes or in lightness (OpenCV's Lab of 8 bits): sides in the shade differ in lightness.
+#: Least difference of two things' middle colours, in the two colour axes or in lightness (OpenCV's Lab of 8 bits): sides in the shade
+#: differ in lightness.
 HUE, LIGHTNESS = 12.0, 60.0
 #: What is darker than this, of 255, has noise for a colour.
 DARK = 40.0
 #: So many of the shortest ways between two parts are looked at in a picture, and such a share of the pixels on them is of neither thing.
 WAYS, CLEAR = 12, 0.9
-#: What has the table's colour within a mask may be a gap where it is so many pixels wide, and not so near (of 255, R, G, B) to a mixture of the
-#: colours on its sides: where two meet a pixel has both.
+#: What has the table's colour within a mask may be a gap where it is so many pixels wide, and not so near (of 255, R, G, B) to a mixture of
+#: the colours on its sides: where two meet a pixel has both.
 WIDE, MIXED = 2, 24.0
 #: By what points of one picture are matched with those of another: m, and steps of colour, that count alike.
 NEAR, ALIKE = 0.006, 12.0
 
 
 def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], least: int) -> NDArray[np.int64]:
-    """The instances (N,) of the cloud's points with those parted between whose parts, of at least ``least`` pixels each, the table shows."""
+    """The instances (N,) of the cloud's points with those parted between whose parts, of at least ``least`` pixels each, the table
+    shows."""
     instance = instance.copy()
     regions = [_regions(mask, table) for mask, table in zip(found.masks, found.table, strict=True)]
     region = np.concatenate([r[where] for r, where in zip(regions, found.spots, strict=True)])
@@ -58,7 +60,8 @@ def parted(looks: list[Looked], found: Clusters, instance: NDArray[np.int64], le
 
 
 def _regions(mask: NDArray[np.bool_], table: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """The connected regions (H, W) of a mask, from 1, without what has the table's colour: over a gap stereo carries the depth of its sides."""
+    """The connected regions (H, W) of a mask, from 1, without what has the table's colour: over a gap stereo carries the depth of its
+    sides."""
     gap = cv2.morphologyEx((mask & table).view(np.uint8), cv2.MORPH_OPEN, np.ones((WIDE, WIDE), np.uint8))
     return cv2.connectedComponents((mask & (gap == 0)).view(np.uint8), connectivity=4)[1]
 
@@ -88,8 +91,8 @@ def _differ(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
 def _table_between(
     look: Looked, mask: NDArray[np.bool_], fixed: NDArray[np.bool_], regions: NDArray[np.int32], pair: tuple[int, int]
 ) -> bool:
-    """Whether the shortest ways between two regions of a picture cross what is no thing, nothing known (``fixed``, behind which a thing may go on), not blind,
-    and within the mask no mixture of their colours."""
+    """Whether the shortest ways between two regions of a picture cross what is no thing, nothing known (``fixed``, behind which a thing may
+    go on), not blind, and within the mask no mixture of their colours."""
     one, other = (regions == number for number in pair)
     x, y, w, h = cv2.boundingRect((one | other).view(np.uint8))
     cut = (slice(y, y + h), slice(x, x + w))

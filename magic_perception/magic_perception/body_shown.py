@@ -1,8 +1,9 @@
 """Where a round body shows through its handle: pixels that look as the body would there.
 
-Before its body depth fills the hole of a handle, and the mask says nothing of it; the picture shows it.  What diffuse light makes of a surface depends on
-the direction of that, through a few numbers alone (Ramamoorthi and Hanrahan 2001, "An efficient representation for irradiance environment maps").  How a
-body of revolution would look behind its handle is therefore known from how it looks beside it.  A bar, which is turned another way, looks otherwise.
+Before its body depth fills the hole of a handle, and the mask says nothing of it; the picture shows it.  What diffuse light makes of a
+surface depends on the direction of that, through a few numbers alone (Ramamoorthi and Hanrahan 2001, "An efficient representation for
+irradiance environment maps").  How a body of revolution would look behind its handle is therefore known from how it looks beside it.  A
+bar, which is turned another way, looks otherwise.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from magic_perception.smear import REACH
 DEVIATIONS, LEAST = 3.5, 4.0
 #: From fewer pixels of its own, or of a body as uneven as this, of 255 (one that is printed on), it is not known how it looks.
 ENOUGH, UNEVEN = 150, 8.0
-#: The look is a sum, in the logarithm of the colour above so much of 255, of so many waves around the body and of its levels, about so far apart, m: what a
-#: level is painted or tilted in takes its share of the light all around.
+#: The look is a sum, in the logarithm of the colour above so much of 255, of so many waves around the body and of its levels, about so far
+#: apart, m: what a level is painted or tilted in takes its share of the light all around.
 DARK, WAVES, LEVEL = 8.0, 3, 0.012
 #: How stiff it is against waves, by the square of their number, and against bends from level to level.
 CALM, EVEN = 1e-4, 1e-3
@@ -32,15 +33,16 @@ CALM, EVEN = 1e-4, 1e-3
 ON, TIMES = 2, 12
 #: So many pixels of a patch tell something of it, and of the bar beside it.
 TELLING, BESIDE = 12, 4
-#: A bar beside a patch is off by so many times what a pixel may be in this share of its pixels: there is an edge, where a face that has the body's look by
-#: chance goes over into it.
+#: A bar beside a patch is off by so many times what a pixel may be in this share of its pixels: there is an edge, where a face that has the
+#: body's look by chance goes over into it.
 EDGE, ALONG = 2.0, 0.7
 
 
 @dataclass(frozen=True)
 class _Alone:
-    """A body alone in the window of a picture that holds its thing's mask: rays (h, w, 3) of depth 1; depth (h, w) at which they meet the body, m, infinite
-    where they do not; outside (h, w): where that is its outside; turn and level (h, w): where on it, radians around and 0..1 up."""
+    """A body alone in the window of a picture that holds its thing's mask: rays (h, w, 3) of depth 1; depth (h, w) at which they meet the
+    body, m, infinite where they do not; outside (h, w): where that is its outside; turn and level (h, w): where on it, radians around and
+    0..1 up."""
 
     window: tuple[slice, slice]
     rays: NDArray[np.float64]
@@ -72,7 +74,8 @@ def _unlike(
 ) -> NDArray[np.float64] | None:
     """(h, w): how far pixels are from the body's look, as a share of what they may be; ``None`` where that is not known.
 
-    color (h, w, 3); own (h, w): pixels that are the body's; may_be: those that may be, through which what is known of it goes on; height of the body, m.
+    color (h, w, 3); own (h, w): pixels that are the body's; may_be: those that may be, through which what is known of it goes on; height of
+    the body, m.
     """
     levels = max(3, round(height / LEVEL))
     waves = [wave(n * alone.turn) for n in range(1, WAVES + 1) for wave in (np.cos, np.sin)]
@@ -127,7 +130,8 @@ def _off(
 def body_shown(
     sight: Sight, body: Body, place: NDArray[np.float64], across: NDArray[np.float64], handle: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """Pixels (H, W) at which a body shows through its handle, and those of which it is known whether it does; ``None`` where it is not known how it looks.
+    """Pixels (H, W) at which a body shows through its handle, and those of which it is known whether it does; ``None`` where it is not
+    known how it looks.
 
     place, across (3,): a point of the handle's plane, and its normal; handle (H, W): where the handle may be.
     """
@@ -163,8 +167,8 @@ def _doubtful(
     told: NDArray[np.bool_],
     unlike: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Patches (h, w) of what looks as the body that may be a fin's: small ones, those without an edge to the bar beside them, and those where depth, farther from all
-    else than it is carried, lies at the handle."""
+    """Patches (h, w) of what looks as the body that may be a fin's: small ones, those without an edge to the bar beside them, and those
+    where depth, farther from all else than it is carried, lies at the handle."""
     reach = max(3, round(REACH * sight.intrinsics.fx / 615))
     bars = told & ~shown
     deep = shown & (cv2.dilate(bars.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) == 0) & np.isfinite(sight.depth[alone.window])

@@ -1,7 +1,7 @@
 """Upright boxes with sharp or rounded edges and cylinders, where two faces at least are seen: cartons, bricks, tins of meat or fish, cans.
 
-All three are fitted to the same measurements in the same way, so that their errors can be compared: what is as wide as long is a box only where a box
-explains it better than a cylinder does.
+All three are fitted to the same measurements in the same way, so that their errors can be compared: what is as wide as long is a box only
+where a box explains it better than a cylinder does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from magic_perception.solids import Reconstruction, hull_of
 
 #: Least size, m, and least share of the points on each of two faces.
 LEAST, FACE = 0.02, 0.08
-#: The 90th percentile of the points' distances to the surface, m, and the median distance of the masks' edges to its outline, pixels, may be so large.
+#: The 90th percentile of the points' distances to the surface, m, and the median distance of the masks' edges to its outline, pixels, may
+#: be so large.
 RESIDUAL, EDGE = 0.004, 2.0
 #: A share of the points larger than this that lies farther than AWAY, m, from the surface is a part of its own (a handle), and no noise.
 PART, AWAY = 0.02, 0.010
@@ -26,9 +27,9 @@ PART, AWAY = 0.02, 0.010
 ROBUST = 0.003
 #: Over so much of 0.1 m (0.3 mm) and of a radian differences are taken.
 STEP = 3e-3
-#: A footprint longer than wide by this factor is no circle.  What has more to fit by explains better only with an error smaller by this factor, as
-#: rounded edges beside sharp ones and a box beside a cylinder: of 43 procedural boxes rounded edges had 0.99 to 1.02 of the error of sharp ones, of 20
-#: tins 0.16 to 0.79.
+#: A footprint longer than wide by this factor is no circle.  What has more to fit by explains better only with an error smaller by this
+#: factor, as rounded edges beside sharp ones and a box beside a cylinder: of 43 procedural boxes rounded edges had 0.99 to 1.02 of the
+#: error of sharp ones, of 20 tins 0.16 to 0.79.
 OBLONG, ROUNDER = 1.5, 0.85
 #: Of half its box's width a cylinder's side lies so deep in that at most, 1 - cos 45 degrees.
 HOLLOW = 0.3
@@ -40,8 +41,8 @@ QUARTERS = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box on the table z = 0: middle (2,), sizes (3,) along its own x and y and up, m; ``yaw`` of its x, radians; ``corner``: radius of its
-    upright edges, m, at most half of its shorter side."""
+    """An upright box on the table z = 0: middle (2,), sizes (3,) along its own x and y and up, m; ``yaw`` of its x, radians; ``corner``:
+    radius of its upright edges, m, at most half of its shorter side."""
 
     middle: NDArray[np.float64]
     size: NDArray[np.float64]
@@ -81,10 +82,11 @@ class Box:
 
 
 def recognise_box(sights: list[Sight], height: float, noise: float) -> Reconstruction | None:
-    """The box or upright cylinder on whose faces lies what was measured and whose outline the masks have; ``None`` where they tell of something else, or
-    of one face only.
+    """The box or upright cylinder on whose faces lies what was measured and whose outline the masks have; ``None`` where they tell of
+    something else, or of one face only.
 
-    A box with sharp edges where that will do, else one whose upright edges are rounded; a cylinder instead of either where that has smaller errors.
+    A box with sharp edges where that will do, else one whose upright edges are rounded; a cylinder instead of either where that has smaller
+    errors.
     height: of the points above the table; noise: standard deviation of the heights; metres.
     """
     if not LEAST < height < 0.4:
@@ -125,7 +127,8 @@ def recognise_box(sights: list[Sight], height: float, noise: float) -> Reconstru
 
 
 def _sound(box: Box, points: NDArray[np.float64], sights: list[Sight], edges: list[NDArray[np.float64]], limit: float) -> bool:
-    """Whether points (N, 3) lie on the faces of a box, on two at least, and the masks' outlines (M, 2), pixels, are its own; limit: of the distance, m."""
+    """Whether points (N, 3) lie on the faces of a box, on two at least, and the masks' outlines (M, 2), pixels, are its own; limit: of the
+    distance, m."""
     if box.size.min() < LEAST or box.size.max() > 0.5:
         return False
     distance = np.abs(box.distance(points))

@@ -1,13 +1,14 @@
 """Where cameras stand, from pictures of a ChArUco board.
 
-The board lies at a place that is known in the world (the robot's base frame), or it is fixed to the hand and carried before the cameras; then
-where the hand was is known of each picture, and where the board sits on the hand is found along with the cameras.  All cameras are found
-together, by least squares over the corners' pixels:
+The board lies at a place that is known in the world (the robot's base frame), or it is fixed to the hand and carried before the cameras;
+then where the hand was is known of each picture, and where the board sits on the hand is found along with the cameras.  All cameras are
+found together, by least squares over the corners' pixels:
 
-    min  sum |project(K_c, D_c, camera_c_from_world  world_from_board_s  X_i) - u_csi|^2,      world_from_board_s = world_from_hand_s  hand_from_board
+    min  sum |project(K_c, D_c, camera_c_from_world  world_from_board_s  X_i) - u_csi|^2,      world_from_board_s = world_from_hand_s
+    hand_from_board
 
-with a loss that grows linearly beyond a pixel.  From the same equations follows how far off a point of the workspace may be; what is not sure
-enough, fits too badly or contradicts the measured depth is refused.
+with a loss that grows linearly beyond a pixel.  From the same equations follows how far off a point of the workspace may be; what is not
+sure enough, fits too badly or contradicts the measured depth is refused.
 """
 
 from __future__ import annotations
@@ -174,7 +175,8 @@ def calibrate(
 ) -> Calibration:
     """Find the cameras.  world_from_board (4, 4): the board lies there; None: it is on the hand.
 
-    Raises BAD_REQUEST where the views do not suffice, do not agree, or leave a point of the workspace more uncertain than ``allowed`` metres.
+    Raises BAD_REQUEST where the views do not suffice, do not agree, or leave a point of the workspace more uncertain than ``allowed``
+    metres.
     """
     points = board.corners
     told = [_Seen(view, points[view.ids], lenses[view.camera].board(points[view.ids], view.pixels)) for view in views]

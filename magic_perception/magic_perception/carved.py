@@ -214,7 +214,8 @@ def _thinned(mesh: Mesh, faces: int) -> Mesh:
 
 
 def _pieces(field: NDArray[np.float32], axes: list[NDArray[np.float64]], block: float = 0.012, most: int = 100) -> list[Mesh]:
-    """Convex pieces: hulls of the cells in blocks of ``block`` metres, larger where there were more than ``most``, joined where that fills little."""
+    """Convex pieces: hulls of the cells in blocks of ``block`` metres, larger where there were more than ``most``, joined where that fills
+    little."""
     steps = np.array([float(a[1] - a[0]) for a in axes])
     start = np.array([a[0] for a in axes]) - steps
     spots = np.argwhere(field > 0.5)

@@ -39,8 +39,9 @@ class Bridges:
 class Clusters:
     """What is above the table, by what hangs together in space.
 
-    masks (H, W) for each look, without what is known; fixed (H, W): what is; table (H, W): what has the table's colour.  spots: rows and columns of the mask's pixels with depth in
-    each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1 for noise; bridges: between points of the cloud.
+    masks (H, W) for each look, without what is known; fixed (H, W): what is; table (H, W): what has the table's colour.  spots: rows and
+    columns of the mask's pixels with depth in each look; cloud (N, 3): their world points, look by look; instance (N,): their cluster, -1
+    for noise; bridges: between points of the cloud.
     """
 
     masks: list[NDArray[np.bool_]]
@@ -69,7 +70,8 @@ def clustered(looks: list[Looked], known: tuple[Mesh, ...], parameters: Paramete
 def _in_look(
     given: tuple[list[Looked], tuple[Mesh, ...], Parameters], number: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], tuple[NDArray, NDArray], NDArray[np.float32], Bridges]:
-    """What one look tells: mask, fixed, table and spots as :class:`Clusters` has them, the points (N, 3) at the spots, and bridges between pixels."""
+    """What one look tells: mask, fixed, table and spots as :class:`Clusters` has them, the points (N, 3) at the spots, and bridges between
+    pixels."""
     looks, known, parameters = given
     looked = looks[number]
     mask, table = foreground(looked, parameters)
@@ -79,12 +81,14 @@ def _in_look(
     return mask, fixed, table, spots, looked.points(*spots), _bridges(looked, mask)
 
 
-#: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise, m.
+#: A gap in depth is bridged where the surfaces on its sides are no farther apart in depth than so many times its width, beside the noise,
+#: m.
 STEEP, NOISE = 1.0, 0.004
 
 
 def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> Bridges:
-    """Across the gaps in a mask's depth, between pixels of the flattened picture: what colour shows to be one thing is not two for want of depth.
+    """Across the gaps in a mask's depth, between pixels of the flattened picture: what colour shows to be one thing is not two for want of
+    depth.
 
     Each pixel without depth goes to the nearest that has it; where two of these regions meet, straight lines join the pixels they go to.
     """
@@ -138,7 +142,8 @@ def _of_cloud(made: list[Bridges], spots: list[tuple[NDArray, NDArray]], masks: 
 
 
 def _bridged(instance: NDArray[np.int64], bridges: Bridges) -> NDArray[np.int64]:
-    """The clusters (N,), numbered anew, of which those are one that a bridge joins: over a thin bar bridges are too few to be a cluster's core."""
+    """The clusters (N,), numbered anew, of which those are one that a bridge joins: over a thin bar bridges are too few to be a cluster's
+    core."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -153,7 +158,8 @@ def _bridged(instance: NDArray[np.int64], bridges: Bridges) -> NDArray[np.int64]
     return instance
 
 
-#: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts belong together.
+#: A cluster is looked at for seams from so many points on, and where it is so high above the table, m: tools lie flat, and their parts
+#: belong together.
 POINTS, TALL = 1500, 0.05
 
 #: From this height on, m, a cluster may be the inside or the outside of another.
@@ -162,8 +168,8 @@ RAISED = 0.02
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The points of all clusters (N,): unit normals (N, 3), NaN outside of the raised clusters and where there is none; heights (N,) above the table, m;
-    colours (N, 3), 0..255.  tall: the indices of the points of each cluster that may be more than one thing."""
+    """The points of all clusters (N,): unit normals (N, 3), NaN outside of the raised clusters and where there is none; heights (N,) above
+    the table, m; colours (N, 3), 0..255.  tall: the indices of the points of each cluster that may be more than one thing."""
 
     normal: NDArray[np.float32]
     heights: NDArray[np.float32]

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-#: So far (pixels) from an edge colours are unmixed, if the thing goes on so far; colours of a line are read at so many places, those of its ends at ENDS.
+#: So far (pixels) from an edge colours are unmixed, if the thing goes on so far; colours of a line are read at so many places, those of its
+#: ends at ENDS.
 UNMIXED, READ, ENDS = 2.0, 17, 3
 #: Colours of two sides that differ by less (of 255) do not tell where the edge is.
 CONTRAST = 8.0

@@ -21,7 +21,8 @@ from magic_perception import logistic
 from magic_perception.seen import Witnessed
 from magic_perception.sight import Agreement
 
-#: Shapes that have a few numbers, all of which are fitted; those with a body of revolution; what ends a thing out of sight at nobody knows what length.
+#: Shapes that have a few numbers, all of which are fitted; those with a body of revolution; what ends a thing out of sight at nobody knows
+#: what length.
 TURNED, ROUND, ENDED = ("sphere", "cylinder", "rounded box"), ("round", "round with handle"), (PICTURE, REGION, UNSEEN)
 #: The numbers that speak for or against a solid: what they are, and their :data:`SIGNS`.
 NUMBERS = {

@@ -44,7 +44,8 @@ def distortion(info: CameraInfo, intrinsics: Intrinsics) -> float:
 
 
 def markers(scene: Scene) -> MarkerArray:
-    """A scene for RViz: DELETEALL, then for each object its mesh (``meshes``), its box (``boxes``) and its id (``names``); the table's height as a thin square (``table``)."""
+    """A scene for RViz: DELETEALL, then for each object its mesh (``meshes``), its box (``boxes``) and its id (``names``); the table's
+    height as a thin square (``table``)."""
     head = cv.header(scene.frame_id, scene.stamp)
     result = [Marker(header=head, action=Marker.DELETEALL)]
 

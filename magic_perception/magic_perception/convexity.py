@@ -49,7 +49,8 @@ def voxels_of(
     rgb: NDArray[np.floating],
     across: NDArray[np.floating] | None = None,
 ) -> tuple[seams.Voxels, NDArray[np.int64]] | None:
-    """The voxels of a cluster and the voxel of each point (N,); ``None`` where no two are neighbours.  points, normal, rgb (N, 3), heights (N,), all finite;
+    """The voxels of a cluster and the voxel of each point (N,); ``None`` where no two are neighbours.  points, normal, rgb (N, 3), heights
+    (N,), all finite;
     across (L, 2, 3): places on the two sides of gaps in depth: voxels there are neighbours."""
     from scipy.spatial import cKDTree
 
@@ -85,16 +86,17 @@ def _angle(normal: NDArray[np.float64], a: NDArray[np.int64], b: NDArray[np.int6
     return np.degrees(np.arccos(np.clip(np.sum(normal[a] * normal[b], axis=1), -1, 1)))
 
 
-#: How far the next voxel is from the edge of a gap at most, as normals end some pixels before it, m; by so much, m and as a share of the distance, what lies on
-#: one surface may lie before its tangent plane across the gap.
+#: How far the next voxel is from the edge of a gap at most, as normals end some pixels before it, m; by so much, m and as a share of the
+#: distance, what lies on one surface may lie before its tangent plane across the gap.
 EDGE, BEFORE, RISE = 0.016, 0.003, 0.1
 
 
 def _over_gaps(
     centre: NDArray[np.float64], normal: NDArray[np.float64], across: NDArray[np.floating]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Pairs of voxels (a, b) on the two sides of gaps; for each 1 where neither lies before the other's tangent plane, so that the surface may go on from one to
-    the other without bending inward, else -1; and whether that tells anything: where one lies before and the other behind there is a step.
+    """Pairs of voxels (a, b) on the two sides of gaps; for each 1 where neither lies before the other's tangent plane, so that the surface
+    may go on from one to the other without bending inward, else -1; and whether that tells anything: where one lies before and the other
+    behind there is a step.
 
     centre, normal (V, 3); across (L, 2, 3): places on the two sides.
     """
@@ -114,8 +116,9 @@ def _over_gaps(
 def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArray[np.int64]:
     """Parts (V,) from 0 of the voxels, cut at every concave seam.
 
-    Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, over a gap by as much on each :data:`REACH` of
-    it, and where at least half of the voxels next to both agree.  A part of fewer than ``least`` voxels goes to the nearest other.
+    Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, over a gap by as much on
+    each :data:`REACH` of it, and where at least half of the voxels next to both agree.  A part of fewer than ``least`` voxels goes to the
+    nearest other.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -157,8 +160,8 @@ ASIDE, PAINT = 0.010, 0.08
 
 
 def on_tops(voxels: seams.Voxels, least: int = 50) -> NDArray[np.int64]:
-    """Parts (V,) from 0 of the voxels, cut where something stands on a level face: it hangs together with what bears it where their sides lie in one plane, or where
-    its own side is seen before the other's back edge, and no seam bends inward all around."""
+    """Parts (V,) from 0 of the voxels, cut where something stands on a level face: it hangs together with what bears it where their sides
+    lie in one plane, or where its own side is seen before the other's back edge, and no seam bends inward all around."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -215,8 +218,9 @@ def parts(
     cut: Callable[[seams.Voxels], NDArray[np.int64]] = pieces,
     across: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
-    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table, colours (N, 3), 0..255; ``cut``
-    makes the parts of its voxels of which the judge tells whether they are things; across (L, 2): points on the two sides of gaps in depth."""
+    """Labels (N,) from 0 of the things in one cluster: points (N, 3), normals (N, 3), NaN allowed, heights (N,) above the table, colours
+    (N, 3), 0..255; ``cut`` makes the parts of its voxels of which the judge tells whether they are things; across (L, 2): points on the two
+    sides of gaps in depth."""
     from scipy.spatial import cKDTree
 
     labels = np.zeros(len(points), np.int64)
@@ -304,8 +308,8 @@ def _walls(normal: NDArray[np.floating], labels: NDArray[np.int64]) -> list[NDAr
 def _outsides(
     points: NDArray[np.floating], normal: NDArray[np.floating], labels: NDArray[np.int64], heights: NDArray[np.floating]
 ) -> NDArray[np.int64]:
-    """Labels (N,) with the outside of open round things joined to an inside that shows more of their form: of a bowl seen from above little but the
-    near wall's lower half is seen from without.
+    """Labels (N,) with the outside of open round things joined to an inside that shows more of their form: of a bowl seen from above little
+    but the near wall's lower half is seen from without.
 
     The inside's upright surfaces look to its own axis; the outside's look away from that, lie within its rim, as high, and end beside it.
     """
@@ -362,8 +366,9 @@ def with_handles(
 ) -> NDArray[np.int64]:
     """Labels (N,) with the parts of a bowl joined of which one hangs together with a long handle, as those of ladles and pans do.
 
-    A round inside that shows no outside, or a round outside that shows no inside, goes on in a part of the same colour (``rgb``, (N, 3)) that touches it: in what of that lies
-    beside its rim and faces the other way, or is more of the inside.  :func:`insides` asks it of parts that are one side of a bowl alone.
+    A round inside that shows no outside, or a round outside that shows no inside, goes on in a part of the same colour (``rgb``, (N, 3))
+    that touches it: in what of that lies beside its rim and faces the other way, or is more of the inside.  :func:`insides` asks it of
+    parts that are one side of a bowl alone.
     """
     from scipy.spatial import cKDTree
 

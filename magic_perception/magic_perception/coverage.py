@@ -1,4 +1,5 @@
-"""What more views bring: surfaces of procedural things with one, two and five views, and what has moved between them: ``evaluate --views N``.
+"""What more views bring: surfaces of procedural things with one, two and five views, and what has moved between them:
+``evaluate --views N``.
 
 Every scene holds four things; the model of a D435 with smear (:data:`magic_core.sensor.SMEARED`) sees it from one fixed camera, from two,
 and from two and three earlier places of a camera at the wrist.  Then one thing is moved by some millimetres, and the two fixed
@@ -73,7 +74,8 @@ def _at(scene: Scene, mesh: Mesh) -> SceneObject | None:
 
 
 def measure(count: int, seed: int, moves: tuple[float, ...] = MOVES, said: Callable[[str], None] = lambda _: None) -> dict[str, object]:
-    """Over ``count`` scenes: by the number of views what of the surfaces is there, and by how far a thing was moved what became of its earlier views.
+    """Over ``count`` scenes: by the number of views what of the surfaces is there, and by how far a thing was moved what became of its
+    earlier views.
 
     moves: by how much one thing is moved, m; said: is told of each scene that is done.
     """

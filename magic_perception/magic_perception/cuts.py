@@ -1,11 +1,12 @@
 """Things of different colours that stand beside each other in one cluster, parted by the upright plane between them.
 
-Two convex things on a table are on the two sides of some upright plane.  Where stereo fills the gap between them, or they touch with faces that go on in one
-plane, no seam bends inward, and low things have none that tells; but colour changes all along that plane, and either side alone is nearer to a convex body
-than both are together: a camera sees past them where one convex body would be.  What no camera sees is no evidence, as a body may go on behind itself, behind
-other things and where its depth is lost.  The colour of one printed thing changes as well, and so do those of a head and its handle: the chance of two things
-is a logistic function of what is measured at the plane (:data:`CRITERIA`), and what may be one convex body stays one thing, whatever its colours.  ``cuts.json`` holds
-the weights, made by ``python -m magic_perception.learn_cuts`` from procedural scenes.
+Two convex things on a table are on the two sides of some upright plane.  Where stereo fills the gap between them, or they touch with faces
+that go on in one plane, no seam bends inward, and low things have none that tells; but colour changes all along that plane, and either side
+alone is nearer to a convex body than both are together: a camera sees past them where one convex body would be.  What no camera sees is no
+evidence, as a body may go on behind itself, behind other things and where its depth is lost.  The colour of one printed thing changes as
+well, and so do those of a head and its handle: the chance of two things is a logistic function of what is measured at the plane
+(:data:`CRITERIA`), and what may be one convex body stays one thing, whatever its colours.  ``cuts.json`` holds the weights, made by
+``python -m magic_perception.learn_cuts`` from procedural scenes.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ CRITERIA = {
 DIRECTIONS, STEP, BESIDE = 24, 0.004, 0.016
 #: Spread of colour (lightness, two colour axes; OpenCV's Lab of 8 bits), which light and noise make, and of height, m, that a surface has.
 SPREAD, ROUGH = np.array([12.0, 5.0, 5.0]), 0.004
-#: Least change of colour across a plane that is looked at, in squared standard deviations; least share of the points on a side, and number of those near the
-#: plane; what a change of height counts beside one of colour.
+#: Least change of colour across a plane that is looked at, in squared standard deviations; least share of the points on a side, and number
+#: of those near the plane; what a change of height counts beside one of colour.
 LITTLE, SMALL, FEW, STEPPED = 0.3, 0.03, 20, 0.5
 #: So many planes of a cluster are judged, by so many of its points; two differ by so many degrees, or by so much beside each other, m.
 PLANES, POINTS, TURNED, MOVED = 4, 3000, 20.0, 0.010
@@ -55,8 +56,8 @@ CELL, UNSURE = 0.004, 0.004
 #: What lies so near to the plane, m, is the side's whose colour is nearer by this factor.
 NEAR, CLEAR = 0.008, 0.6
 
-#: Whether a camera sees that nothing is there is asked at these shares of the height of the cluster; depth so much farther than a place, m, shows it.  What is
-#: empty up to such a share of a side's height is hollow.
+#: Whether a camera sees that nothing is there is asked at these shares of the height of the cluster; depth so much farther than a place, m,
+#: shows it.  What is empty up to such a share of a side's height is hollow.
 LEVELS, EMPTY, HOLLOW = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 0.008, 0.8
 #: The share of the hull that has to be seen empty for what lies in it to be thought two things; the least and most that are told apart.
 SEEN, LEAST_SEEN, MOST_SEEN = 0.02, 0.004, 0.05
@@ -80,8 +81,8 @@ class Points:
 
 @dataclass(frozen=True)
 class Seen:
-    """A cluster: some :data:`POINTS` of its points, and what cameras see in its convex hull in plan: empty (L, G), whether one sees that nothing is at heights
-    level (L,) above the table, m, in cells whose middles are at place (G, 2)."""
+    """A cluster: some :data:`POINTS` of its points, and what cameras see in its convex hull in plan: empty (L, G), whether one sees that
+    nothing is at heights level (L,) above the table, m, in cells whose middles are at place (G, 2)."""
 
     points: Points
     place: NDArray[np.float64]
@@ -106,7 +107,8 @@ class Seen:
 
 
 class Plane(NamedTuple):
-    """An upright plane: the angle of its normal in plan, its offset along that, m, and the change of colour across it, in squared standard deviations."""
+    """An upright plane: the angle of its normal in plan, its offset along that, m, and the change of colour across it, in squared standard
+    deviations."""
 
     angle: float
     offset: float

@@ -100,7 +100,8 @@ def looked_at(frame: RgbdFrame, parameters: Parameters) -> Looked:
 
 
 def osd(folder: Path, segmenter: Segmenter, split: bool = True, pictures: Path | None = None) -> dict[str, object]:
-    """Best IoU of each labelled object, and the field's measures; ``with_depth``: the same at pixels with depth alone, since only those have labels."""
+    """Best IoU of each labelled object, and the field's measures; ``with_depth``: the same at pixels with depth alone, since only those
+    have labels."""
     scenes: dict[str, object] = {}
     everything: list[float] = []
     measured: list[measures.Measures] = []
@@ -239,7 +240,8 @@ def shared_volume(a: Mesh, b: Mesh, count: int = 60000) -> float | None:
 
 
 def open_holes(view: CanonicalView, found: Mesh, least: float = 6e-5) -> tuple[int, int]:
-    """Holes of at least ``least`` square metres in the true object's view, and how many of them are at least half open and enclosed in ``found``."""
+    """Holes of at least ``least`` square metres in the true object's view, and how many of them are at least half open and enclosed in
+    ``found``."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(holes_of(view.mask).astype(np.uint8), connectivity=4)
     shown = Raycaster([found]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0].ids >= 0
     holes = holes_of(shown)

@@ -45,8 +45,9 @@ from magic_perception.tool_colors import Said, ToolColors, lab
 Array = NDArray[np.float64]
 #: No hand moves a tool by so many standard deviations of what is expected of it from one moment to the next.
 JUMP = 3.0
-#: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).  Its place is what the mesh was made in: what
-#: pictures of the tool on the table say otherwise is what they are wrong in there.  What they say of its turn they say later as well.
+#: What is known when the tool lies: standard deviations of pose (m, rad) and velocity (m/s, rad/s).  Its place is what the mesh was made
+#: in: what pictures of the tool on the table say otherwise is what they are wrong in there.  What they say of its turn they say later as
+#: well.
 START = (0.001, 0.03, 0.01, 0.05)
 #: Standard deviation (m) of a measured point from the reconstructed surface, and of an outline; errors hold together over a patch, so
 #: that the points of a frame count as so many at most.
@@ -62,8 +63,8 @@ STRIDE = (0.02, np.deg2rad(12.0))
 FAR = 0.06
 #: So often (s) two cameras are asked each by itself, and how little is known of the tool then beside what they see: as START.
 ALONE, LOOSE = 0.5, (0.015, 0.3, 0.1, 0.5)
-#: The tool has not moved yet while it is nearer than this (m, rad) to where it lay; so well (m, rad) is it known where it is until then; and
-#: every so many seconds afterwards a moment is asked what the tool's surface is like.
+#: The tool has not moved yet while it is nearer than this (m, rad) to where it lay; so well (m, rad) is it known where it is until then;
+#: and every so many seconds afterwards a moment is asked what the tool's surface is like.
 STILL, LIES, RESHAPED = (0.005, 0.05), (0.0005, 0.003), 0.4
 #: Pictures whose stamps differ by no more (s) are of one moment.
 AT_ONCE = 0.01
@@ -73,8 +74,8 @@ USED, SURFACE = 700, 900
 BEHIND, HIDES = 0.012, 0.005
 #: What is nearer to the table than this is taken for it (m).
 TABLE = 0.004
-#: How far from the outline a point that is looked through may be (pixels), and from how far on it tells of the pose: nearer, depth is rounded,
-#: lost and smeared, nothing weighs against that where a hand hides the other end, and colours tell where the outline is.
+#: How far from the outline a point that is looked through may be (pixels), and from how far on it tells of the pose: nearer, depth is
+#: rounded, lost and smeared, nothing weighs against that where a hand hides the other end, and colours tell where the outline is.
 ASTRAY, SLACK = 25, 2.5
 #: What is about the tool in a picture, from half of BESIDE to AROUND pixels from its outline, is background.
 BESIDE, AROUND = 7, 20
@@ -221,7 +222,8 @@ class Follower:
         return _View(slice(int(v0), int(v1)), slice(int(u0), int(u1)), np.isfinite(depth), depth)
 
     def _near(self, points: Array, pose: Array, reach: float) -> tuple[Array, Array, Array]:
-        """Those of world points (M, 3) that are nearer than ``reach`` to the surface, their signed distance (M,) and its gradient (M, 3) in the world."""
+        """Those of world points (M, 3) that are nearer than ``reach`` to the surface, their signed distance (M,) and its gradient (M, 3) in
+        the world."""
         local = transforms.apply(transforms.inverse(pose), points)
         # What is farther from the mesh's box is farther from the mesh.
         boxed = ((local > self._bounds[0] - reach) & (local < self._bounds[1] + reach)).all(axis=1)
@@ -274,8 +276,8 @@ class Follower:
         return points[about], pixels[about]
 
     def _model(self, frame: RgbdFrame, pose: Array) -> tuple[Array, Array, NDArray[np.int64], Array]:
-        """Points of the surface that face the camera and that the tool itself does not hide, in the picture: world (N, 3), depth (N,), pixels (N, 2), pixels
-        as numbers (N, 2)."""
+        """Points of the surface that face the camera and that the tool itself does not hide, in the picture: world (N, 3), depth (N,),
+        pixels (N, 2), pixels as numbers (N, 2)."""
         points = transforms.apply(pose, self._points)
         eye = frame.world_from_camera[:3, 3]
         facing = ((eye - points) * (self._normals @ pose[:3, :3].T)).sum(axis=1) > 0
@@ -475,7 +477,8 @@ class Follower:
     def _compared(
         self, frames: Sequence[RgbdFrame], measured: list[tuple[Array, NDArray[np.bool_]]], colors: list[Said], pose: Array
     ) -> float:
-        """How far apart the first two frames, each by itself, say the tool to be about a pose: a chi-squared over its degrees of freedom."""
+        """How far apart the first two frames, each by itself, say the tool to be about a pose: a chi-squared over its degrees of
+        freedom."""
         loose = State(pose, np.zeros(6), np.diag(np.repeat(LOOSE, 3)) ** 2)
         one, other = (self._fitted([frames[k]], [measured[k]], [colors[k]], loose, pose, EXPECTED) for k in range(2))
         off = changed(one.pose, other.pose, self.middle)
@@ -522,8 +525,8 @@ class Follower:
 
 
 def _drawn_edges(profile: Array) -> tuple[Array, Array]:
-    """Where on lines (K, 2n + 1) from inside a drawn thing (1) out of it (-1) its edge is, (K,) pixels from their middles, which are its outermost pixels;
-    and half of what there is of it to the inner side and of nothing to the outer, (K, 2) pixels."""
+    """Where on lines (K, 2n + 1) from inside a drawn thing (1) out of it (-1) its edge is, (K,) pixels from their middles, which are its
+    outermost pixels; and half of what there is of it to the inner side and of nothing to the outer, (K, 2) pixels."""
     middle = profile.shape[1] // 2
     outside = profile[:, middle + 1 :] <= 0
     first = np.where(outside.any(axis=1), outside.argmax(axis=1), 0)
@@ -642,10 +645,11 @@ def _found(follower: Follower, start: State, frames: Iterable[RgbdFrame]) -> tup
 def reshaped_along(
     mesh: Mesh, world_from_tool: Array, table: Array, frames: Iterable[RgbdFrame], times: Array, poses: Array, others: Sequence[Mesh] = ()
 ) -> tuple[Reshaping, int]:
-    """How the pictures mend the surface of a tool whose path something else tells, poses (T, 4, 4) at times (T,) of which the first is where it lies,
-    and in how many moments of its use they show it; mesh, world_from_tool, table and others: as :func:`follow`.
+    """How the pictures mend the surface of a tool whose path something else tells, poses (T, 4, 4) at times (T,) of which the first is
+    where it lies, and in how many moments of its use they show it; mesh, world_from_tool, table and others: as :func:`follow`.
 
-    Another clock and a marker's calibration are not those of the pictures: where the tool is in a moment is sought about what the path says.
+    Another clock and a marker's calibration are not those of the pictures: where the tool is in a moment is sought about what the path
+    says.
     """
     follower = Follower(mesh, world_from_tool, table, others)
 
@@ -674,10 +678,11 @@ def _mended(
     pose_at: Callable[[float], Array | None],
     sought: Callable[[list[RgbdFrame], Array], Array | None] = lambda _, pose: pose,
 ) -> tuple[Reshaping, int]:
-    """What is said of the surface, with what all pictures show of it, most of all those in which it has not moved yet, and how many later moments
-    there were.
+    """What is said of the surface, with what all pictures show of it, most of all those in which it has not moved yet, and how many later
+    moments there were.
 
-    pose_at: the pose (4, 4) at a time, None from the end of what is known on; sought: where exactly it is in the frames of a moment, if that is seen.
+    pose_at: the pose (4, 4) at a time, None from the end of what is known on; sought: where exactly it is in the frames of a moment, if
+    that is seen.
     """
     lying, moves, told, shown = None, False, -math.inf, 0
     for moment in moments:
@@ -708,7 +713,8 @@ def _again(follower: Follower, told: Sequence[Seen | None], path: Sequence[State
 
 
 def _known(times: Array, shift: Array, turn: Array) -> int:
-    """How many of the moments (T,) there are without those at the end, BLIND seconds at most, that are not sure: no later picture tells of them."""
+    """How many of the moments (T,) there are without those at the end, BLIND seconds at most, that are not sure: no later picture tells of
+    them."""
     sure = np.flatnonzero((shift <= UNSURE[0]) & (turn <= UNSURE[1]))
     return int(sure[-1]) + 1 if len(sure) and times[-1] - times[sure[-1]] <= BLIND else len(times)
 

@@ -93,21 +93,22 @@ def notice(distance: NDArray[np.float32], sample: NDArray[np.int64]) -> float:
 
 
 def lifted(other: NDArray[np.bool_], looked: Looked, zero: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(H, W): pixels of another colour (``other``) around which those of another colour are a little above the table on the average of a window: a
-    thin thing.  A shadow or a print lies at 0.  ``zero``: heights, m, 0 without depth."""
+    """(H, W): pixels of another colour (``other``) around which those of another colour are a little above the table on the average of a
+    window: a thin thing.  A shadow or a print lies at 0.  ``zero``: heights, m, 0 without depth."""
     near = other & np.isfinite(looked.heights) & (zero < 0.03)
     total = cv2.blur(np.where(near, looked.raw, np.float32(0)), (9, 9), borderType=cv2.BORDER_CONSTANT)
     share = cv2.blur(near.astype(np.float32), (9, 9), borderType=cv2.BORDER_CONSTANT)
     return other & (share * np.float32(81) > 8) & (total > share * np.maximum(np.float32(0.0015), looked.sigma * np.float32(1.2)))
 
 
-#: What is of a faintly other colour is so many metres above the table as a whole, so many times the noise of one pixel, and so many times that of the mean;
-#: noise is alike in so many pixels.
+#: What is of a faintly other colour is so many metres above the table as a whole, so many times the noise of one pixel, and so many times
+#: that of the mean; noise is alike in so many pixels.
 PLATE, ABOVE, SURE, GRAIN = 0.002, 1.2, 5.0, 25.0
 
 
 def _plates(faint: NDArray[np.bool_], core: NDArray[np.bool_], looked: Looked) -> NDArray[np.bool_]:
-    """(H, W): what is of a colour not far from the table's (``faint``) but above it as a whole: a flat thing whose own pixels are as low as the noise.
+    """(H, W): what is of a colour not far from the table's (``faint``) but above it as a whole: a flat thing whose own pixels are as low as
+    the noise.
 
     It is broader than the strip in which a thing of the ``core`` (H, W) is mirrored at its foot, to which depth is carried.
     """
@@ -272,10 +273,11 @@ GAP, SLIVER = 5, 7
 
 
 def _closed(high: NDArray[np.bool_], missing: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What is high (H, W), and the gaps in its depth (``missing``), of things that have mostly the table's colour (are not of another one, ``other``).
+    """What is high (H, W), and the gaps in its depth (``missing``), of things that have mostly the table's colour (are not of another one,
+    ``other``).
 
-    At edges every other pixel loses its depth, and there colour does not tell that it is the thing's.  Beside a sliver, as stereo leaves at the far edge of
-    a board, nothing is closed.
+    At edges every other pixel loses its depth, and there colour does not tell that it is the thing's.  Beside a sliver, as stereo leaves at
+    the far edge of a board, nothing is closed.
     """
     closing = cv2.morphologyEx(high.view(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP, GAP), np.uint8)).view(bool)
     closed = cv2.morphologyEx((high | (missing & closing)).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))

@@ -21,13 +21,13 @@ from magic_perception.sight import Sight, carve
 CELL, SQUARELY = 0.001, 0.25
 #: Pixels around a round body within which a mask may be the body's own.
 EDGE = 3
-#: The largest width of a handle's bar, or of bar and hole where no camera sees through that, m: what is wider is a part of another form. (Handles of made
-#: mugs stand off by 28 to 48 mm.)
+#: The largest width of a handle's bar, or of bar and hole where no camera sees through that, m: what is wider is a part of another form.
+#: (Handles of made mugs stand off by 28 to 48 mm.)
 BAR = 0.05
 #: The least hole between a handle and its body, m^2.
 HOLE = 6e-5
-#: A handle's bow is what stands off from the body farther than this share of how far it stands off at most; of nine made mugs the surface is as near with 0.4,
-#: without it up to 5 mm farther off.
+#: A handle's bow is what stands off from the body farther than this share of how far it stands off at most; of nine made mugs the surface
+#: is as near with 0.4, without it up to 5 mm farther off.
 BOW = 0.2
 #: A handle is no thicker than this, m; points lie about its plane with a deviation of so much.
 THICKEST, ABOUT = 0.03, 0.006
@@ -46,8 +46,8 @@ class Handle:
 class _Plane:
     """The upright plane of a handle, which holds the body's axis, in cells of :data:`CELL`.
 
-    base (3,): where the axis meets the table; out, up, across (3,): unit vectors away from the axis, upwards, and along the normal; start: distance of the
-    first column of cells from the axis, m; s, z (Z, S): distances of the cells from the axis, and their heights, m.
+    base (3,): where the axis meets the table; out, up, across (3,): unit vectors away from the axis, upwards, and along the normal; start:
+    distance of the first column of cells from the axis, m; s, z (Z, S): distances of the cells from the axis, and their heights, m.
     """
 
     base: NDArray[np.float64]
@@ -98,7 +98,8 @@ class _Plane:
 
 
 def handle_of(sights: list[Sight], out: NDArray[np.float64], body: Body) -> Handle | None:
-    """A handle as bars in the upright plane through the body's axis, from points (N, 3) beyond the body; ``None`` if nothing is left after carving."""
+    """A handle as bars in the upright plane through the body's axis, from points (N, 3) beyond the body; ``None`` if nothing is left after
+    carving."""
     local = out[:, :2] - body.axis
     along, thickness = _handle_plane(local, np.linalg.norm(local, axis=1) - body.radius(out[:, 2]))
     plane = _Plane.through(out, along, body)
@@ -180,7 +181,8 @@ def _carved(plane: _Plane, told: list[Sight], thickness: float) -> NDArray[np.fl
 def _covered(
     plane: _Plane, sights: list[Sight], drawn: list[NDArray[np.bool_]], body: Body, field: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """(Z, S): the cells that are behind the body for all cameras; drawn (H, W) of each camera: where it sees the body; field: as :func:`_carved` has it."""
+    """(Z, S): the cells that are behind the body for all cameras; drawn (H, W) of each camera: where it sees the body; field: as
+    :func:`_carved` has it."""
     # Before the body depth sees the handle, behind it nothing does; at the body's edge a mask may be the body's.
     behind = [bool((sight.eye[:2] - body.axis) @ plane.out[:2] < 0) for sight in sights]
 
@@ -212,7 +214,8 @@ def _largest_hole(plane: _Plane, solid: NDArray[np.uint8], body: Body) -> float:
 
 
 def standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:
-    """Of the points (N, 3) beyond the body the largest cluster, and the others in its direction, to ``apart`` radians: a handle that depth tore."""
+    """Of the points (N, 3) beyond the body the largest cluster, and the others in its direction, to ``apart`` radians: a handle that depth
+    tore."""
     labels = clusters.cluster(out, 0.012, 4, 0.003)
     if labels.max(initial=-1) < 0:
         return out
@@ -246,7 +249,8 @@ def _wider(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
 
 
 def _widest(sight: Sight, mask: NDArray[np.bool_], place: NDArray[np.float64]) -> float:
-    """How wide a handle's bar is at its widest in a mask, metres at the handle's place (3,), and no less than 5 mm; a bar is about as thick."""
+    """How wide a handle's bar is at its widest in a mask, metres at the handle's place (3,), and no less than 5 mm; a bar is about as
+    thick."""
     if not mask.any():
         return float("inf")
     distance = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, 5)
@@ -255,8 +259,8 @@ def _widest(sight: Sight, mask: NDArray[np.bool_], place: NDArray[np.float64]) -
 
 
 def _handle_plane(local: NDArray[np.float64], beyond: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Direction (2,) from the axis in which a handle's points (N, 2) stand off, seen from above, and its thickness in metres; beyond (N,): how far they are
-    outside of the body.
+    """Direction (2,) from the axis in which a handle's points (N, 2) stand off, seen from above, and its thickness in metres; beyond (N,):
+    how far they are outside of the body.
 
     What stands off farthest tells it: near the body there is smear as well, and what of the body is not quite round.
     """
@@ -282,8 +286,8 @@ def _bars(
 ) -> NDArray[np.uint8]:
     """The handle's cells in its plane: what was ``seen`` solid ``near`` its points, joined to the body.
 
-    All (Z, S); covered: behind the body for all cameras; to_the_body: what ends close to the body goes on to it also unseen, as where the body's look tells,
-    pixels of its outline are of both.
+    All (Z, S); covered: behind the body for all cameras; to_the_body: what ends close to the body goes on to it also unseen, as where the
+    body's look tells, pixels of its outline are of both.
     """
     radius = body.radius(plane.z)
     within = plane.s < radius

@@ -21,16 +21,18 @@ GAP, LEVEL = 0.20, 0.02
 COLOR = 40.0
 #: Depth farther than this behind a place, metres, shows that the place is empty.
 EMPTY = 0.02
-#: What hangs: its lowest seen part is so high above the table, metres, and for most of it, and under its middle, the space below is seen to be empty.
+#: What hangs: its lowest seen part is so high above the table, metres, and for most of it, and under its middle, the space below is seen to
+#: be empty.
 CLEAR, MOST = 0.03, 0.5
 #: What is held is where what is held may be, by more than this share of its pixels.
 HELD = 0.6
-#: What is so narrow, pixels, may be the edge of something else; a part of what is held that is so wide, and where that cannot be, is something else.
+#: What is so narrow, pixels, may be the edge of something else; a part of what is held that is so wide, and where that cannot be, is
+#: something else.
 EDGE, APART = 5, 11
 #: Pieces of no more than this share of what is surely held belong to it.
 LOOSE = 0.25
-#: What carries a thing out of sight is under its middle, within this, m, and is a part of it: no more than this share of its height, as a ball's or an egg's
-#: underside and a vase's foot are.
+#: What carries a thing out of sight is under its middle, within this, m, and is a part of it: no more than this share of its height, as a
+#: ball's or an egg's underside and a vase's foot are.
 FOOT, UNDERSIDE = 0.01, 0.4
 
 
@@ -189,8 +191,8 @@ def _at(look: Looked, labels: NDArray[np.int32], points: NDArray[np.float64]) ->
 def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixtures: tuple[Mesh, ...] = ()) -> bool:
     """Whether a thing is above the table with nothing below that could carry it: a hand, an arm, a cable.
 
-    What touches a fixture (world) may hang on it.  Where no camera sees what is below, a thing is taken to stand: so does a large ball, which
-    goes on down out of sight from the lowest that is seen of it, to where it touches the table under its own middle.
+    What touches a fixture (world) may hang on it.  Where no camera sees what is below, a thing is taken to stand: so does a large ball,
+    which goes on down out of sight from the lowest that is seen of it, to where it touches the table under its own middle.
     """
     clouds, heights = [], []
     for look, image in zip(looks, labels, strict=True):
@@ -222,7 +224,8 @@ def hangs(looks: list[Looked], labels: list[NDArray[np.int32]], label: int, fixt
 def seen_through(
     looks: list[Looked], labels: list[NDArray[np.int32]], feet: NDArray[np.float64], height: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
-    """(N,): whether a camera sees an empty place in the columns that rise from the table at ``feet`` (N, 3) to just below ``height`` (N,), m."""
+    """(N,): whether a camera sees an empty place in the columns that rise from the table at ``feet`` (N, 3) to just below ``height`` (N,),
+    m."""
     at = 0.005 + np.linspace(0.1, 0.9, 9)[:, None] * (height.astype(float) - 0.015 - 0.005)
     ways = feet + at[..., None] * looks[0].normal
     empty = np.zeros(ways.shape[:2], bool)

@@ -1,9 +1,9 @@
 """Earlier views that still hold: what a camera saw from another place, or before something came between.
 
 A camera that moves leaves frames behind (keyframes) that show sides of things which it no longer sees; one that stands still is
-remembered where the robot now stands before it.  They are looked at together with the newest frames, as if more cameras stood there, as long as
-nothing newer contradicts them: a thing that a newer frame looks through, sees where there was nothing, or sees displaced is blotted out
-of the older ones (:func:`contradicted`), so that what moved is not smeared over where it was.
+remembered where the robot now stands before it.  They are looked at together with the newest frames, as if more cameras stood there, as
+long as nothing newer contradicts them: a thing that a newer frame looks through, sees where there was nothing, or sees displaced is blotted
+out of the older ones (:func:`contradicted`), so that what moved is not smeared over where it was.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class Keyframes:
         carried: Collection[int] = (),
     ) -> None:
         """Keep the frames of a scene; labels (H, W): where things are in them; earlier: what :meth:`useful` gave and what has become of
-        it since; still: the cameras that did not move while these frames were taken; carried: labels of what will not stay where it is, which is
-        blotted out: a thing in the robot's hand is hidden by it as soon as it has left."""
+        it since; still: the cameras that did not move while these frames were taken; carried: labels of what will not stay where it is,
+        which is blotted out: a thing in the robot's hand is hidden by it as soon as it has left."""
         after = {id(old): new for old, new in earlier}
         kept = []
         for item in self._kept:
@@ -178,7 +178,8 @@ def _projected(
 
 
 def _refuted(look: Looked, labels: NDArray[np.int32], other: Looked, there: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(H, W): pixels of things in one look whose places another look sees to be empty, or to be of something else that does not hide them."""
+    """(H, W): pixels of things in one look whose places another look sees to be empty, or to be of something else that does not hide
+    them."""
     result = np.zeros(labels.shape, bool)
     small = labels.astype(np.int16)
     kernel = np.ones((2 * INNER + 1,) * 2, np.uint8)

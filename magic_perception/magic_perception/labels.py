@@ -32,7 +32,8 @@ def with_depth(labels: list[NDArray[np.int32]], looks: list[Looked], parameters:
 
 
 def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0) -> NDArray[np.int32]:
-    """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels, if both are of one connected region."""
+    """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels, if both are of one
+    connected region."""
     margin = int(np.ceil(reach))
     cut = window(mask, margin)
     part = labels[cut]
@@ -57,8 +58,8 @@ def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0
 
 
 def beside(fixed: NDArray[np.bool_], blank: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What of ``blank`` (H, W), which colour alone tells from the table, hangs together with a fixture: beside it stereo has a shadow, and what is seen there
-    is of something behind, nobody knows of what.  It is no more the end of that than the fixture is."""
+    """What of ``blank`` (H, W), which colour alone tells from the table, hangs together with a fixture: beside it stereo has a shadow, and
+    what is seen there is of something behind, nobody knows of what.  It is no more the end of that than the fixture is."""
     if not (fixed.any() and blank.any()):
         return np.zeros_like(blank)
     regions = cv2.connectedComponents(blank.view(np.uint8), connectivity=8)[1]

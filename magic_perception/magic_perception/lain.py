@@ -1,8 +1,8 @@
 """Round things that lie on their side: mugs, cans, cups.
 
 In a frame whose z is the thing's own axis a lying body of revolution is a standing one, so that it is built as those are
-(:mod:`magic_perception.turned`), handle and opening included.  What is looked for is the axis: level, or inclined by as much as a tapered body
-that rests on its side or a handle under it makes it.
+(:mod:`magic_perception.turned`), handle and opening included.  What is looked for is the axis: level, or inclined by as much as a tapered
+body that rests on its side or a handle under it makes it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ SET = 0.01
 
 @dataclass(frozen=True)
 class _Try:
-    """An axis tried: its direction (rad, from above) and inclination (rad), the frame along it, and how much lies on the body found there, 0 to 1."""
+    """An axis tried: its direction (rad, from above) and inclination (rad), the frame along it, and how much lies on the body found there,
+    0 to 1."""
 
     yaw: float
     tilt: float

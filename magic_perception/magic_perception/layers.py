@@ -102,7 +102,8 @@ _SIDES = 40
 
 
 def _ring(points: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The convex hull of points (N, 2) as a ring (len(turns), 2), its corners in fixed directions from the centroid; without the outermost 1 %."""
+    """The convex hull of points (N, 2) as a ring (len(turns), 2), its corners in fixed directions from the centroid; without the outermost
+    1 %."""
     centre = np.median(points, axis=0)
     reach = np.linalg.norm(points - centre, axis=1)
     hull = polygons.convex_hull(points[reach <= np.percentile(reach, 99)])

@@ -1,9 +1,10 @@
 """Learn how far a reconstruction is to be trusted: ``ros2 run magic_perception learn_confidence --out confidence.json``.
 
-Procedural scenes (:mod:`magic_perception.piles`) are perceived, with one camera, with two, and with two of which one is off by up to 10 mm.  A found thing
-is right where its masks and its solid overlap those of the true thing that it shares most pixels with by more than 0.8 (mean over the cameras that see it; by
-volume).  The chance of that is a logistic function of what speaks for and against the solid (:mod:`magic_perception.confidence`).  The table is of scenes
-that the weights know nothing of (five folds by scene); ``--out`` then gets the weights from everything.
+Procedural scenes (:mod:`magic_perception.piles`) are perceived, with one camera, with two, and with two of which one is off by up to 10 mm.
+A found thing is right where its masks and its solid overlap those of the true thing that it shares most pixels with by more than 0.8 (mean
+over the cameras that see it; by volume).  The chance of that is a logistic function of what speaks for and against the solid
+(:mod:`magic_perception.confidence`).  The table is of scenes that the weights know nothing of (five folds by scene); ``--out`` then gets
+the weights from everything.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ BINS = (0.0, 0.2, 0.5, 0.8, 1.0)
 
 @dataclass(frozen=True)
 class Judged:
-    """A found thing: its scene, how its solid came about, what its confidence is computed from (C,), and its overlaps with the truth (0..1)."""
+    """A found thing: its scene, how its solid came about, what its confidence is computed from (C,), and its overlaps with the truth
+    (0..1)."""
 
     scene: int
     shape: str

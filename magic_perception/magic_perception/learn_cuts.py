@@ -1,12 +1,13 @@
 """Learn which upright planes part things of different colours: ``python -m magic_perception.learn_cuts --out cuts.json``.
 
-The scenes are procedural: two and three neighbours of different colours and single things of several (:mod:`magic_perception.neighbours`), and piles
-(:mod:`magic_perception.piles`).  Every plane that is looked at in what seams leave together (:mod:`magic_perception.cuts`) is an example, which parts things
-where none has more than a tenth of itself on the other side.  The labelled scenes of OSD are left out, and judge the result.
+The scenes are procedural: two and three neighbours of different colours and single things of several (:mod:`magic_perception.neighbours`),
+and piles (:mod:`magic_perception.piles`).  Every plane that is looked at in what seams leave together (:mod:`magic_perception.cuts`) is an
+example, which parts things where none has more than a tenth of itself on the other side.  The labelled scenes of OSD are left out, and
+judge the result.
 
-The figures are of scenes that the weights know nothing of: each fifth of the scenes is judged by weights from the others.  With ``--first`` the scenes of
-other seeds are segmented whole, by the weights that ship: how many neighbours are so many things, things on each other two, and single things one; with ``--missing`` 30, 50 or 70 % of
-their depth is taken away, in blobs of 10 to 80 pixels.
+The figures are of scenes that the weights know nothing of: each fifth of the scenes is judged by weights from the others.  With ``--first``
+the scenes of other seeds are segmented whole, by the weights that ship: how many neighbours are so many things, things on each other two,
+and single things one; with ``--missing`` 30, 50 or 70 % of their depth is taken away, in blobs of 10 to 80 pixels.
 """
 
 from __future__ import annotations
@@ -103,7 +104,8 @@ def cross_validated(found: list[Cluster], folds: int = 5) -> str:
 
 
 def told(made: Pile, segmenter: DepthSegmenter) -> str:
-    """What becomes of a scene of neighbours, segmented whole: ``right``; ``merged``: some are one; ``torn``: there are more things than are; ``lost``."""
+    """What becomes of a scene of neighbours, segmented whole: ``right``; ``merged``: some are one; ``torn``: there are more things than
+    are; ``lost``."""
     labels = segmenter.segment(looked_at(made, Parameters()), (), Parameters())
     top = max(int(image.max()) for image in labels)
     votes = np.zeros((made.things, top + 1))

@@ -1,12 +1,12 @@
 """Learn which seams part things: ``ros2 run magic_perception learn_seams --data FOLDER --out seams.json``.
 
-The scenes are the labelled ones of OSD (FOLDER/rgbd/osd) and procedural piles (:mod:`magic_perception.piles`).  Every cluster is cut at all concave
-seams, and joined again by the truth; the criteria of each seam on the way (:mod:`magic_perception.seams`) are an example.  The chance of two things is a
-logistic function of them, fitted with a ridge penalty.
+The scenes are the labelled ones of OSD (FOLDER/rgbd/osd) and procedural piles (:mod:`magic_perception.piles`).  Every cluster is cut at all
+concave seams, and joined again by the truth; the criteria of each seam on the way (:mod:`magic_perception.seams`) are an example.  The
+chance of two things is a logistic function of them, fitted with a ridge penalty.
 
-The figures are of scenes that the weights know nothing of: the labelled scenes are cut into blocks of neighbouring numbers, since neighbours show
-the same things, and each block is segmented whole with weights from all others and one part of the piles; the other piles are judged by them as well.
-``--out`` then gets the weights from everything.
+The figures are of scenes that the weights know nothing of: the labelled scenes are cut into blocks of neighbouring numbers, since
+neighbours show the same things, and each block is segmented whole with weights from all others and one part of the piles; the other piles
+are judged by them as well. ``--out`` then gets the weights from everything.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class Examples:
 
 
 def clusters_of(looks: list[Looked], truth: list[NDArray[np.integer]], parameters: Parameters) -> list[Cluster]:
-    """The clusters of a scene that may be more than one thing; truth (H, W): for each look the number of the thing at each pixel, 0 and below for none."""
+    """The clusters of a scene that may be more than one thing; truth (H, W): for each look the number of the thing at each pixel, 0 and
+    below for none."""
     found = clustered(looks, (), parameters)
     seen = surfaces(looks, found)
     things = np.concatenate([image[where] for image, where in zip(truth, found.spots, strict=True)]).clip(0)

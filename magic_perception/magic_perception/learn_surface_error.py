@@ -1,10 +1,11 @@
 """Learn how far the surface of a reconstruction is off: ``ros2 run magic_perception learn_surface_error --out surface_error.json``.
 
-Procedural scenes are perceived: one of four of :mod:`magic_perception.piles`, and beside it a ball or a cylinder alone, of the others one tool alone, with one camera, with two, and with
-two of which one is off by up to 10 mm.  The error of a found thing is the root mean square distance between its surface and that of the true thing that it shares
-most pixels with.  What five of six stay below is the exponential of a linear function of what was seen (:mod:`magic_perception.surface_error`).  A few more things
-than that lie above what weights state that were fitted to others, so the constant is raised until five of six lie below on scenes held out from the fit.  The table is of
-scenes that neither knows (five folds by scene, within each of which it is done anew); ``--out`` then gets the weights from everything.
+Procedural scenes are perceived: one of four of :mod:`magic_perception.piles`, and beside it a ball or a cylinder alone, of the others one
+tool alone, with one camera, with two, and with two of which one is off by up to 10 mm.  The error of a found thing is the root mean square
+distance between its surface and that of the true thing that it shares most pixels with.  What five of six stay below is the exponential of
+a linear function of what was seen (:mod:`magic_perception.surface_error`).  A few more things than that lie above what weights state that
+were fitted to others, so the constant is raised until five of six lie below on scenes held out from the fit.  The table is of scenes that
+neither knows (five folds by scene, within each of which it is done anew); ``--out`` then gets the weights from everything.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ def judged(seed: int) -> list[Judged]:
 
 
 def learned(things: list[Judged], folds: int = 5) -> surface_error.Quantile:
-    """The weights of all things, with a constant by which :data:`surface_error.SHARE` of them lie below what weights state that do not know their scene."""
+    """The weights of all things, with a constant by which :data:`surface_error.SHARE` of them lie below what weights state that do not know
+    their scene."""
     errors = _numbers(things)[1]
     over = np.sort(np.log(np.maximum(errors, surface_error.LEAST) / _held_out(things, folds, _fitted)))
     place = min(int(np.ceil((len(over) + 1) * surface_error.SHARE)), len(over)) - 1
@@ -128,7 +130,8 @@ def _held_out(things: list[Judged], folds: int, fit: Callable[[list[Judged]], su
 
 
 def cross_validated(things: list[Judged], folds: int = 5) -> tuple[str, float]:
-    """How often things are off by less than is stated, by weights that know nothing of their scene; and the quantile's loss, in the logarithm."""
+    """How often things are off by less than is stated, by weights that know nothing of their scene; and the quantile's loss, in the
+    logarithm."""
     errors = _numbers(things)[1]
     stated = _held_out(things, folds, learned)
     over = np.log(np.maximum(errors, surface_error.LEAST) / stated)

@@ -57,8 +57,8 @@ def fit(
     ridge: float = 1.0,
     signs: NDArray[np.int64] | None = None,
 ) -> Logistic:
-    """Logistic regression with a ridge penalty on the standardised numbers: rows (N, C), truth (N,), weight (N,) of each; signs (C,): 1 or -1 where a
-    number is known to speak for or against, and its weight may not say otherwise."""
+    """Logistic regression with a ridge penalty on the standardised numbers: rows (N, C), truth (N,), weight (N,) of each; signs (C,): 1 or
+    -1 where a number is known to speak for or against, and its weight may not say otherwise."""
     from scipy.optimize import minimize
 
     mean, scale = rows.mean(axis=0), np.maximum(rows.std(axis=0), 1e-6)

@@ -70,10 +70,10 @@ def nearest(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np
 
 @dataclass(frozen=True)
 class Laid:
-    """A lying thing: its height map, the outlines of its parts, and whether it is flat, then ``thickness`` metres thick; else top and bottom
-    (rows, columns) of its relief over the cells of the map, m; ``hollow``: it is seen to be hollow from above, and its bottom is that of a thin thing, else
-    the table or the height below which cameras see past; ``thin``: what is not seen to be hollow from above taken for a thin thing nevertheless, as a bowl
-    is that lies so far on its side that it would hold no water."""
+    """A lying thing: its height map, the outlines of its parts, and whether it is flat, then ``thickness`` metres thick; else top and
+    bottom (rows, columns) of its relief over the cells of the map, m; ``hollow``: it is seen to be hollow from above, and its bottom is
+    that of a thin thing, else the table or the height below which cameras see past; ``thin``: what is not seen to be hollow from above
+    taken for a thin thing nevertheless, as a bowl is that lies so far on its side that it would hold no water."""
 
     grid: Grid
     parts: list[Polygon]
@@ -150,9 +150,11 @@ PLACES = 400
 PAST = 0.005
 #: The share of a column that cameras see empty from which nothing stands there.
 EMPTY = 0.4
-#: Of what is thinner, m, parts may be lost for want of whole columns; of what is thicker it is the round sides that have none down to the table.
+#: Of what is thinner, m, parts may be lost for want of whole columns; of what is thicker it is the round sides that have none down to the
+#: table.
 SLIM = 0.012
-#: Masks of two cameras disagree by so many pixels; what stands out from the rest by so much, m, is no smeared rim, and is torn by gaps of so much.
+#: Masks of two cameras disagree by so many pixels; what stands out from the rest by so much, m, is no smeared rim, and is torn by gaps of
+#: so much.
 ROOM, STICKS, TORN = 2, 0.010, 0.010
 #: Smear of depth carries a thing so far; in its corners, into which a disc of that radius does not reach, farther, m.
 FRINGE, SMEAR, CORNER = 0.004, 0.012, 0.06
@@ -167,11 +169,11 @@ def _passed(points: NDArray[np.float64], sights: list[Sight], noise: float) -> N
 
 
 def _upheld(sights: list[Sight], grid: Grid, top: NDArray[np.float32], noise: float) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Columns from the table up to ``top`` (rows, columns), m, held against what the cameras saw beside and through them: which of them are filled, and
-    from what height on, m.
+    """Columns from the table up to ``top`` (rows, columns), m, held against what the cameras saw beside and through them: which of them are
+    filled, and from what height on, m.
 
-    Smear of depth, and the heights given to pixels without, fill the corners of a thing in the air; there some camera sees the table below, or another
-    what is behind.
+    Smear of depth, and the heights given to pixels without, fill the corners of a thing in the air; there some camera sees the table below,
+    or another what is behind.
     """
     occupied, centres = np.isfinite(grid.top), grid.centres()
     shares = np.linspace(0, 1, 2 + int(PLACES * float(top[occupied].max())))
@@ -187,10 +189,11 @@ def _upheld(sights: list[Sight], grid: Grid, top: NDArray[np.float32], noise: fl
 
 
 def _lost(sights: list[Sight], grid: Grid, carved: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells (rows, columns) of the map of what stands out from what was carved of a flat thing and is missing in it, with what joins the two.
+    """Cells (rows, columns) of the map of what stands out from what was carved of a flat thing and is missing in it, with what joins the
+    two.
 
-    A rod that is hardly as wide as the thing is thick leaves no whole column in the masks of two cameras from either side, or crumbs of some, the less so
-    the farther their calibration is off; but each of them saw it.  What stands out by less is the rim, as it is smeared.
+    A rod that is hardly as wide as the thing is thick leaves no whole column in the masks of two cameras from either side, or crumbs of
+    some, the less so the farther their calibration is off; but each of them saw it.  What stands out by less is the rim, as it is smeared.
     """
     _, regions, stats, _ = cv2.connectedComponentsWithStats(carved.view(np.uint8), connectivity=8)
     large = np.append(False, stats[1:, cv2.CC_STAT_AREA] > CRUMB * stats[1:, cv2.CC_STAT_AREA].max(initial=0))
@@ -297,8 +300,8 @@ def relief(part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[
 def relief_pieces(
     part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.011
 ) -> list[Mesh]:
-    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least`` wide;
-    then neighbours are joined again where that fills little."""
+    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least``
+    wide; then neighbours are joined again where that fills little."""
     clouds = []
     queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.001), 0.001)]
     while queue:

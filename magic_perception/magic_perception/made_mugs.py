@@ -1,9 +1,9 @@
 """What becomes of a mug's handle: ``evaluate --mugs N``.
 
-Each of N made mugs of a drawn form, colour and place, two of three upright in a drawn turn, the third on its side, is seen by the two smearing
-D435 of the station.  Of each it is told how much of its handle's opening the better of the cameras has in sight
-(:class:`magic_core.loops.Opening`), whether the opening is open and the handle there in what perception makes of it, and how far the two surfaces
-are apart.
+Each of N made mugs of a drawn form, colour and place, two of three upright in a drawn turn, the third on its side, is seen by the two
+smearing D435 of the station.  Of each it is told how much of its handle's opening the better of the cameras has in sight
+(:class:`magic_core.loops.Opening`), whether the opening is open and the handle there in what perception makes of it, and how far the two
+surfaces are apart.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The scene while nothing changes, which is looked at more closely, and while the arm moves: as long as the pictures differ by the arm alone, and by what
-it holds, nothing is perceived anew.  No ROS here."""
+"""The scene while nothing changes, which is looked at more closely, and while the arm moves: as long as the pictures differ by the arm
+alone, and by what it holds, nothing is perceived anew.  No ROS here."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from magic_perception.robot_in_view import Held, RobotInView
 AFRESH = 10.0
 #: Of so many looks at a scene in which nothing changes the mean is perceived: with half of the noise handles come out that one look misses.
 LOOKS = 4
-#: Of a thing of which the robot hides more than this share that was seen before a part is hidden, and of which less than this share is left all of it.
+#: Of a thing of which the robot hides more than this share that was seen before a part is hidden, and of which less than this share is left
+#: all of it.
 PART, REST = 0.05, 0.1
 
 
 @dataclass(frozen=True)
 class Made:
-    """A scene and what it was made of: frames, fixtures, what the robot held; masks (H, W) in each frame by the ids of what was seen; carried: ids of what the
-    robot carries; looks: the frames of the last looks at it, the newest last; count: of how many it was made."""
+    """A scene and what it was made of: frames, fixtures, what the robot held; masks (H, W) in each frame by the ids of what was seen;
+    carried: ids of what the robot carries; looks: the frames of the last looks at it, the newest last; count: of how many it was made."""
 
     scene: Scene
     frames: list[RgbdFrame]
@@ -69,8 +70,8 @@ class Made:
         return all(unchanged(f, b) for f, b in zip(frames, self.frames, strict=True))
 
     def meanwhile(self, frames: list[RgbdFrame], robot: RobotInView, world_from_base: NDArray[np.float64] | None = None) -> Scene | None:
-        """The scene while the arm moves, what it carries taken along, and what it hides marked so; ``None``: it stands, or something else has changed, or
-        comes in sight that it hid, and all has to be looked at."""
+        """The scene while the arm moves, what it carries taken along, and what it hides marked so; ``None``: it stands, or something else
+        has changed, or comes in sight that it hid, and all has to be looked at."""
         stamp = _stamp(frames)
         items = [item for item in self.scene.objects if item.source == "camera"]
         standing = [item for item in items if item.id not in self.carried]

@@ -2,8 +2,8 @@
 
 Each of N procedural scenes (one thing, two to six apart, or a pile) is seen by two D435, mostly with smear, on wood, cloth or stripes, with
 cast shadows or more noise; half of the pairs stand at the station, the others anywhere.  It is perceived as it is, and with the
-second camera said to stand where it does not: off along the table, or turned about itself.  In each of N others, with an arm over the table in an
-attitude drawn about two, both cameras are said to stand elsewhere, by the same.
+second camera said to stand where it does not: off along the table, or turned about itself.  In each of N others, with an arm over the table
+in an attitude drawn about two, both cameras are said to stand elsewhere, by the same.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ LAMP = transforms.unit(np.array([0.5, -0.4, 0.8]))
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What differs between scenes besides the things: a cloth of squares or stripes on the wooden table, a cast shadow, depth noise of 3 mm at 0.5 m besides the sensor's."""
+    """What differs between scenes besides the things: a cloth of squares or stripes on the wooden table, a cast shadow, depth noise of 3 mm
+    at 0.5 m besides the sensor's."""
 
     cloth: bool = False
     stripes: bool = False

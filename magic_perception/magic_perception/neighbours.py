@@ -1,8 +1,8 @@
-"""Procedural neighbours of different colours, two or three, things on each other, and single things of several colours: what is to be parted, and what is to
-stay one.
+"""Procedural neighbours of different colours, two or three, things on each other, and single things of several colours: what is to be
+parted, and what is to stay one.
 
-A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), and as many threes, things that stand on another, single
-things, and single things that another hides in part.
+A round of a seed is one pair for each kind of pair, gap, height and equality of heights (108 of them), and as many threes, things that
+stand on another, single things, and single things that another hides in part.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from magic_perception.piles import Pile, _at, _box
 FORMS, GAPS = (("box", "box"), ("box", "cylinder"), ("cylinder", "cylinder")), (0.0, 0.003, 0.005, 0.008, 0.010, 0.015)
 HEIGHTS, EQUAL = ((0.012, 0.045), (0.05, 0.07), (0.07, 0.14)), (True, False)
 PAIRS = tuple(itertools.product(FORMS, GAPS, HEIGHTS, EQUAL))
-#: Single things, in turn: of two halves, of stripes, with a strap of the table's colour or a dark one, with a lid or a cap, printed, with a handle; a lying
-#: bottle; and families whose parts are repainted.
+#: Single things, in turn: of two halves, of stripes, with a strap of the table's colour or a dark one, with a lid or a cap, printed, with a
+#: handle; a lying bottle; and families whose parts are repainted.
 SINGLE = (
     "halves", "stripes", "strap", "lid", "cap", "bands", "print", "printed", "handle", "bottle",
     "mug", "hammer", "mallet", "ladle", "caliper", "scissors", "spoon", "mug_tree",
@@ -218,7 +218,8 @@ def stacked(seed: int, number: int) -> Pile:
 
 
 def torn(made: Pile, number: int) -> Pile:
-    """A scene of a number with a share of its things' depth missing in each picture, and as much of the rest, in blobs of one size; colour is whole."""
+    """A scene of a number with a share of its things' depth missing in each picture, and as much of the rest, in blobs of one size; colour
+    is whole."""
     share, wide = MISSING[number % len(MISSING)], BLOBS[number // len(MISSING) % len(BLOBS)]
     frames = []
     for i, (frame, truth) in enumerate(zip(made.frames, made.truth, strict=True)):

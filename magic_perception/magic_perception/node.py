@@ -82,9 +82,8 @@ class Perception(Node):
     mono8), ``camera/NAME/color/camera_info`` and ``camera/NAME/aligned_depth_to_color/image_raw`` (16UC1 mm or 32FC1 m);
     where an image is not published but its ``/compressed`` or ``/compressedDepth`` is, those;
     with ``aligned`` false, ``camera/NAME/depth/image_rect_raw`` and ``camera/NAME/depth/camera_info`` instead, and depth
-    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``in_hand`` (latched): what the robot holds; ``obstacles`` (latched): what other
-    software knows of; ``joint_states``: the robot
-    (parameters ``robot.*``) is cut out of every picture.
+    is registered through TF.  ``/tf``, ``/tf_static``; ``known_objects`` (latched): fixtures; ``in_hand`` (latched): what the robot holds;
+    ``obstacles`` (latched): what other software knows of; ``joint_states``: the robot (parameters ``robot.*``) is cut out of every picture.
     Publishes ``objects`` and ``perception/markers`` (latched), ``/diagnostics`` (1 Hz).
     """
 
@@ -101,7 +100,8 @@ class Perception(Node):
         self.tracker = Tracker()
         # The last scene and what it was made of.
         self.made: Made | None = None
-        # What was published last: the scene that it is but for its stamp, and the message.  And the scene whose markers nobody has seen yet.
+        # What was published last: the scene that it is but for its stamp, and the message.  And the scene whose markers nobody has seen
+        # yet.
         self.told: tuple[Scene, SceneObjectArray] | None = None
         self.unshown: Scene | None = None
         # By topic: calibrated fixtures, and what other software knows of.
@@ -365,7 +365,8 @@ class Perception(Node):
             self.get_logger().error(self.outcome.message, throttle_duration_sec=5.0)
 
     def tell_again(self, made: Made, frames: list[RgbdFrame], same: bool) -> bool:
-        """Publish the last scene once more where that is all that the newest frames tell: they show the same, or that and the arm on its way; false: there is more to see."""
+        """Publish the last scene once more where that is all that the newest frames tell: they show the same, or that and the arm on its
+        way; false: there is more to see."""
         if not made.recent(frames):
             return False
         if same:
@@ -383,7 +384,8 @@ class Perception(Node):
     def remember(
         self, scene: Scene, frames: list[RgbdFrame], report: Report, still: set[str]
     ) -> tuple[Scene, dict[str, list[np.ndarray]], frozenset[str]]:
-        """The scene under the names that its things had before, the masks (H, W) of each of them in the frames, and the names of those that the robot carries.
+        """The scene under the names that its things had before, the masks (H, W) of each of them in the frames, and the names of those that
+        the robot carries.
 
         The frames are kept for what they show; still: the cameras that did not move.
         """
@@ -415,7 +417,8 @@ class Perception(Node):
         return Outcome(DiagnosticStatus.WARN, Code.NO_OBJECTS, message, values)
 
     def gather(self, now: float) -> tuple[list[RgbdFrame], list[str], set[str]]:
-        """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for; notes; and which cameras stood still."""
+        """One averaged frame for each camera that is ready, once there is something new and nobody is worth waiting for; notes; and which
+        cameras stood still."""
         notes: list[str] = []
         with self.lock:
             streams = self.speaking(now, notes)
@@ -502,8 +505,8 @@ class Perception(Node):
         return streams
 
     def place(self, stream: Stream, now: float) -> tuple[list[Placed], float, MagicError | None]:
-        """A camera's pairs with where it was at their stamps; the first stamp, s, whose transform may still come (infinite: none); and why it no longer may for a later
-        pair than these."""
+        """A camera's pairs with where it was at their stamps; the first stamp, s, whose transform may still come (infinite: none); and why
+        it no longer may for a later pair than these."""
         found: list[Placed] = []
         pending = math.inf
         wrong: MagicError | None = None
@@ -592,8 +595,8 @@ class Perception(Node):
             return self.transforms.buffer.lookup(self.settings.frame, base, frame.stamp)
 
     def without_robot(self, frame: RgbdFrame) -> RgbdFrame:
-        """The frame, blind where the robot is; as it is where nobody tells, which the diagnostics then say.  Raises STALE_DATA where the arm is told of, but not
-        where it was then: an arm that is not cut out is a thing on the table."""
+        """The frame, blind where the robot is; as it is where nobody tells, which the diagnostics then say.  Raises STALE_DATA where the
+        arm is told of, but not where it was then: an arm that is not cut out is a thing on the table."""
         if self.robot is None:
             return frame
         try:

@@ -157,8 +157,8 @@ def _extrinsics(node: Node, camera: str) -> NDArray[np.float64] | None:
 
 
 def read_robot(node: Node, slack: float) -> RobotInView | None:
-    """Declare and read the parameters of the arm that is cut out of the pictures; ``None``: there is none to cut.  slack: by so much, s, a colour and a depth image of one
-    picture may be apart.  Raises BAD_REQUEST."""
+    """Declare and read the parameters of the arm that is cut out of the pictures; ``None``: there is none to cut.  slack: by so much, s, a
+    colour and a depth image of one picture may be apart.  Raises BAD_REQUEST."""
     p = partial(parameter, node)
     cuts = p("self_filter", True, "cut the robot (parameters robot.*) out of the pictures by joint_states; false where there is no arm")
     age = p("joint_state_age", 0.2, "how far a joint state may be from a picture's stamp, s", low=0.001, high=2.0)

@@ -24,7 +24,8 @@ class Parameters:
         looked at.  A table farther than -region_low[2] from the world's z = 0 is used and said.
     table_tilt : degrees, the largest angle between the table's normal and the world's up.
     table_band : points this near to a plane hypothesis agree with it.
-    snap_height, snap_tilt : a table found this near (m, degrees) to the plane z = 0 is taken to be that plane, and the cameras' small errors
+    snap_height, snap_tilt : a table found this near (m, degrees) to the plane z = 0 is taken to be that plane, and the cameras' small
+    errors
         of calibration are taken out; 0 turns it off.
     min_height : least height above the table that depth alone may call an object.
     min_pixels, min_extent : smaller things are noise.

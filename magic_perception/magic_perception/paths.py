@@ -23,7 +23,8 @@ HASTES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 #: Pictures of so long (s) are wrong together: what cameras take an edge or a face for changes with how they look at it.  So long to either
 #: side what two cameras say is compared.
 TOGETHER, COMPARED = 0.5, 1.0
-#: ... and where there is no second camera to contradict the first, variances are so many times larger than said: as much as they were found to be.
+#: ... and where there is no second camera to contradict the first, variances are so many times larger than said: as much as they were found
+#: to be.
 UNCONTRADICTED = 6.0
 #: What the reconstructed surface is off by is the same in all moments: standard deviations, m and rad.
 SURFACE = (0.003, np.deg2rad(1.0))
@@ -33,8 +34,8 @@ CLEAR = 0.10
 
 @dataclass(frozen=True)
 class Seen:
-    """What the pictures of a moment say near a pose (4, 4): information (6, 6) and pull (6,), of a change of the pose as :func:`moved` takes
-    it; through: share of the model that they look through there; apart: how far apart two cameras, each by itself, say it to be, as a
+    """What the pictures of a moment say near a pose (4, 4): information (6, 6) and pull (6,), of a change of the pose as :func:`moved`
+    takes it; through: share of the model that they look through there; apart: how far apart two cameras, each by itself, say it to be, as a
     chi-squared over its degrees of freedom, not a number where that was not looked at."""
 
     pose: Array
@@ -99,9 +100,9 @@ def likeliest(start: State, times: Array, told: Sequence[Seen | None], middle: A
 def doubted(times: Array, told: Sequence[Seen | None]) -> Array:
     """By which factor (T,) the variances of what was seen are larger than said.
 
-    What cameras are wrong in together with what they see, smeared edges, another thing taken for the tool, they are wrong in differently: how
-    far apart they say it to be, over COMPARED seconds to either side, tells of it.  Where more of the tool is looked through than of one that
-    is found, so much less is known.
+    What cameras are wrong in together with what they see, smeared edges, another thing taken for the tool, they are wrong in differently:
+    how far apart they say it to be, over COMPARED seconds to either side, tells of it.  Where more of the tool is looked through than of
+    one that is found, so much less is known.
     """
     apart = np.array([np.nan if seen is None else seen.apart for seen in told])
     looked = (np.abs(times[:, None] - times) <= COMPARED) & np.isfinite(apart)

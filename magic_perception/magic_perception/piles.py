@@ -1,4 +1,5 @@
-"""Procedural table-tops whose things are known: single things, and piles of boxes, tins, bowls, mugs and tools that touch and stand on each other.
+"""Procedural table-tops whose things are known: single things, and piles of boxes, tins, bowls, mugs and tools that touch and stand on each
+other.
 
 What a segmentation is taught and judged by where labelled pictures are few: seams between things, and the seams that one thing has itself.
 """
@@ -24,7 +25,8 @@ MIDDLE = (0.5, 0.0)
 
 @dataclass(frozen=True)
 class Pile:
-    """Frames of one scene, for each (H, W) the number of the thing at each pixel (from 1, 0 for the table, -1 for nothing), and the things' meshes."""
+    """Frames of one scene, for each (H, W) the number of the thing at each pixel (from 1, 0 for the table, -1 for nothing), and the things'
+    meshes."""
 
     frames: list[RgbdFrame]
     truth: list[NDArray[np.int32]]

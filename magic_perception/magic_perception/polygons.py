@@ -128,7 +128,8 @@ def convex_parts(polygon: Polygon, tolerance: float = 0.0) -> list[NDArray[np.fl
     """Cut a polygon with holes into convex rings (K, 2), counter-clockwise: triangles, merged greedily (Hertel and Mehlhorn 1983).
 
     Two parts are merged over their shared edge, longest edge first, where the area that the merged hull adds
-    is at most ``tolerance`` metres times half of the hull's perimeter (a mean depth of the filled notch); with 0 the parts tile the polygon.
+    is at most ``tolerance`` metres times half of the hull's perimeter (a mean depth of the filled notch); with 0 the parts tile the
+    polygon.
     """
     vertices, faces = triangulate(polygon)
     if len(faces) == 0:

@@ -6,12 +6,15 @@ takes their alpha shape and pulls it up (:func:`as_in_paper`).  :func:`reconstru
 * balls, upright cylinders and boxes are recognised by their residual;
 * flat things are carved: a cell of the table is part of the thing if the whole upright column above it, up to the
   measured thickness, falls into the thing's mask in every camera.  For a prism this is its visual hull; it takes its
-  sharpness from the colour image, not from depth, and a hole through which the table is seen stays open.  What stands out of a thing of less than
-  12 mm by 10 mm or more and was seen by each camera stays, though a rod thinner than the thing is high has no whole column in two masks;
+  sharpness from the colour image, not from depth, and a hole through which the table is seen stays open.  What stands out of a thing of
+  less than 12 mm by 10 mm or more and was seen by each camera stays, though a rod thinner than the thing is high has no whole column in two
+  masks;
 * a bowl with a handle that lies on its back (a spoon, a ladle) becomes a wall about a hollow, whose rim and profile are fitted;
-* other things that lie become a height field, filled down to where no camera sees past any more, or, where they are seen to be hollow from above, a shell;
+* other things that lie become a height field, filled down to where no camera sees past any more, or, where they are seen to be hollow from
+above, a shell;
 * things that stand on a round body (mugs, cans, bottles) become a body of revolution, open at the top where cameras
-  look into it, with the handle carved in its own upright plane in the same way as a flat thing, and by where the picture shows the body through it;
+  look into it, with the handle carved in its own upright plane in the same way as a flat thing, and by where the picture shows the body
+  through it;
 * bowls and dishes become a body of revolution as well, from their rim, their inside and what shows of their outside;
 * round things that lie on their side are built in the frame of their own axis as if they stood;
 * other standing things are stacked from layers, completed by point symmetry where no camera saw through the completion;

@@ -6,9 +6,9 @@ over it.  ``x`` is taken out of each moment's normal equations (by their Schur c
 tool lay where it lay first, and where its outline was seen since.  What is left of all moments says what ``d`` is, beside what it is
 expected to be: a Gaussian process over the surface, as far off as reconstructed surfaces are.
 
-A measured point belongs to what its ray meets, not to what is nearest to it: behind a wall of 3 mm the nearest is its other side, so that only
-points with errors towards the camera count, and the depth of a rim that has run over the hollow behind it is nearest to that rim.  Both made
-walls thicker.
+A measured point belongs to what its ray meets, not to what is nearest to it: behind a wall of 3 mm the nearest is its other side, so that
+only points with errors towards the camera count, and the depth of a rim that has run over the hollow behind it is nearest to that rim.
+Both made walls thicker.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ Array = NDArray[np.float64]
 OFF, TOGETHER = 0.003, 0.015
 #: Each time it is moved by at most so many deviations, and inwards by no more than this share of the thickness there.
 MOST, THINNER = 2.0, 0.4
-#: Standard deviation (m) of a measured point; the points of a picture count as so many at most; farther off (m), along their rays, they are not the tool's.
+#: Standard deviation (m) of a measured point; the points of a picture count as so many at most; farther off (m), along their rays, they are
+#: not the tool's.
 NOISE, WORTH, CLOSE = 0.004, 60.0, 0.010
 #: A surface is measured by what looks at it from no farther aside than this cosine.
 FACING = 0.3
@@ -60,8 +61,8 @@ class Picture(NamedTuple):
 
 
 class Met(NamedTuple):
-    """Where rays through measured points meet a surface, in its frame: how far (K,) m the points are before it along its normals (K, 3), at feet (K, 3);
-    which of the points, (M,), these are."""
+    """Where rays through measured points meet a surface, in its frame: how far (K,) m the points are before it along its normals (K, 3), at
+    feet (K, 3); which of the points, (M,), these are."""
 
     off: Array
     normals: Array
@@ -70,7 +71,8 @@ class Met(NamedTuple):
 
 
 class Reshaping:
-    """What pictures say of a surface: mesh, in its own frame; points (N, 3) on it with their normals (N, 3); first: what has mended it before."""
+    """What pictures say of a surface: mesh, in its own frame; points (N, 3) on it with their normals (N, 3); first: what has mended it
+    before."""
 
     def __init__(self, mesh: Mesh, points: Array, normals: Array, first: Reshaping | None = None) -> None:
         self._mesh, self._first = mesh, first
@@ -87,8 +89,8 @@ class Reshaping:
     def see(self, pictures: Sequence[Picture], pose: Array, middle: Array, known: Array) -> None:
         """Take what the pictures of a moment show.
 
-        pose (4, 4): where the tool is about; known (6, 6): how well, as information of a change of it, by a shift of the tool's middle (3,), in
-        its own frame, and by a turn about it.
+        pose (4, 4): where the tool is about; known (6, 6): how well, as information of a change of it, by a shift of the tool's middle
+        (3,), in its own frame, and by a turn about it.
         """
         known, pull = known.copy(), np.zeros(6)
         count = len(self._vector)
@@ -109,8 +111,8 @@ class Reshaping:
         self._vector += off - both.T @ moved[:, -1]
 
     def mended(self, pieces: Sequence[Mesh] = ()) -> tuple[Mesh, tuple[Mesh, ...]]:
-        """The mesh with its surface where the pictures say, and convex pieces of its solid (as it was before any mending), their corners moved as the surface
-        nearest to them is."""
+        """The mesh with its surface where the pictures say, and convex pieces of its solid (as it was before any mending), their corners
+        moved as the surface nearest to them is."""
         if self._first is not None:
             pieces = self._first.mended(pieces)[1]
         whole = trimesh.Trimesh(self._mesh.vertices, self._mesh.faces, process=True)  # what is one corner is moved as one
@@ -156,9 +158,11 @@ def raycaster(mesh: Mesh) -> o3d.t.geometry.RaycastingScene:
 
 
 def met(scene: o3d.t.geometry.RaycastingScene, points: Array, eye: Array) -> Met:
-    """Where rays from an eye (3,) through measured points (M, 3) meet a surface that faces it and is no farther than CLOSE from them, all in its frame.
+    """Where rays from an eye (3,) through measured points (M, 3) meet a surface that faces it and is no farther than CLOSE from them, all
+    in its frame.
 
-    What is in sight is what was measured; where that is farther off, as along the edge of what is before it, the sensor's depth is of something else.
+    What is in sight is what was measured; where that is farther off, as along the edge of what is before it, the sensor's depth is of
+    something else.
     """
     away = points - eye
     rays = np.concatenate([np.broadcast_to(eye, points.shape), away], axis=1).astype(np.float32)
@@ -171,8 +175,8 @@ def met(scene: o3d.t.geometry.RaycastingScene, points: Array, eye: Array) -> Met
 
 
 def divided(vertices: Array, faces: NDArray[np.int64], longest: float) -> tuple[Array, NDArray[np.int64]]:
-    """The same surface, vertices (V, 3) and faces (F, 3), with no edge longer than ``longest``, and closed if it was: an edge is halved for both
-    of its faces, when it is the longest of either."""
+    """The same surface, vertices (V, 3) and faces (F, 3), with no edge longer than ``longest``, and closed if it was: an edge is halved for
+    both of its faces, when it is the longest of either."""
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
     while True:
         edges, which = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_inverse=True)

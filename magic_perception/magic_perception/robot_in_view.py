@@ -21,8 +21,8 @@ from magic_perception.arm_seen import FLOOR, ArmInPicture
 SILENT = 2.0
 #: No part of an arm is farther than this from any of its axes, m.
 REACH = 1.5
-#: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds: a picture taken 0.2 s after it stopped is one of an arm that
-#: stands, and the tool in its hand is looked at in it.
+#: An arm moves where a joint has moved by more than this, rad (m), in the last so many seconds: a picture taken 0.2 s after it stopped is
+#: one of an arm that stands, and the tool in its hand is looked at in it.
 MOVES, MOMENT = 0.002, 0.15
 #: How an arm at rest is seen is measured again after so long, s; so many times are remembered.
 AGAIN, SIGHTINGS = 5.0, 8
@@ -143,8 +143,8 @@ class RobotInView:
         return frame
 
     def _arm(self, frame: RgbdFrame, state: dict[str, float], world_from_base: NDArray[np.float64] | None) -> ArmSeen | None:
-        """How a frame's camera sees the arm from where it stands: measured once in a while where the arm rests with an empty hand, and kept else, so
-        that a scene stays where it is when the arm begins to move."""
+        """How a frame's camera sees the arm from where it stands: measured once in a while where the arm rests with an empty hand, and kept
+        else, so that a scene stays where it is when the arm begins to move."""
         base = np.eye(4) if world_from_base is None else world_from_base
         place = np.concatenate([frame.world_from_camera.round(4).ravel(), base.round(4).ravel()]).tobytes()
         seen = self._seen.get(frame.camera)
@@ -171,7 +171,8 @@ class RobotInView:
         return any(abs(now[name] - then[name]) > MOVES for name in self.robot.names)
 
     def moved(self, held: Held, then: float, now: float, world_from_base: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """What has carried (4, 4), in the world, a thing in the hand from where it was at one stamp to where it is at another; raises as :meth:`cut`."""
+        """What has carried (4, 4), in the world, a thing in the hand from where it was at one stamp to where it is at another; raises as
+        :meth:`cut`."""
         base = np.eye(4) if world_from_base is None else np.asarray(world_from_base, dtype=float)
         was, here = (base @ self.robot.poses(self.history.at(self.robot.names, at, self.age))[held.link] for at in (then, now))
         return here @ transforms.inverse(was)

@@ -1,7 +1,8 @@
 """Room for what nobody saw: how far a thing may go on behind others.
 
-That something nearer borders on a thing in a picture does not say that a part of it is hidden: a camera from another side may look there, or what stands before it hides
-little.  So the space about its solid is asked cell by cell: which cells does every camera leave open, because other things are before them?
+That something nearer borders on a thing in a picture does not say that a part of it is hidden: a camera from another side may look there,
+or what stands before it hides little.  So the space about its solid is asked cell by cell: which cells does every camera leave open,
+because other things are before them?
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ EMPTY, OWN = 0.008, 0.003
 class Room:
     """How far from its solid a thing may go on out of sight, m.
 
-    behind: where every camera that has the place in its picture has another thing before it.  around: where one of them may also have the thing itself before it, as the
-    far side of everything is hidden.  by: the labels (negative: fixtures) that are before the places of ``behind`` farther off than ``far``.
+    behind: where every camera that has the place in its picture has another thing before it.  around: where one of them may also have the
+    thing itself before it, as the far side of everything is hidden.  by: the labels (negative: fixtures) that are before the places of
+    ``behind`` farther off than ``far``.
     """
 
     behind: float
@@ -66,7 +68,8 @@ def room(
 ) -> Room:
     """The room about the solid of a thing; mesh and others, the solids of other things and of fixtures: in the table frame.
 
-    Only cells count that hang together with the solid, where no other solid is, up to the height of its own.  What a camera takes for the table, or looks past, is empty.
+    Only cells count that hang together with the solid, where no other solid is, up to the height of its own.  What a camera takes for the
+    table, or looks past, is empty.
     """
     low, high = mesh.bounds
     sides = np.array([*(high - low)[:2] + 2 * MARGIN, high[2]])
@@ -110,7 +113,8 @@ def room(
 
 
 def _looked_at(look: Looked, labels: NDArray[np.int32], local: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """At points (N, 3) in the camera's frame: the label of their pixels (0 outside of the picture), and whether the camera sees them to be empty."""
+    """At points (N, 3) in the camera's frame: the label of their pixels (0 outside of the picture), and whether the camera sees them to be
+    empty."""
     k = look.frame.intrinsics
     z = np.maximum(local[:, 2], 1e-3)
     u, v = np.rint(k.fx * local[:, 0] / z + k.cx), np.rint(k.fy * local[:, 1] / z + k.cy)
@@ -123,7 +127,8 @@ def _looked_at(look: Looked, labels: NDArray[np.int32], local: NDArray[np.float6
 
 
 def _reach(open_: NDArray[np.bool_], points: NDArray[np.float64], mesh: Mesh, cell: float) -> tuple[float, NDArray[np.float32]]:
-    """How far from the solid the open cells reach that hang together with it, m, and how far each of the points (N, 3) of all cells does, 0 where it is none of them."""
+    """How far from the solid the open cells reach that hang together with it, m, and how far each of the points (N, 3) of all cells does, 0
+    where it is none of them."""
     from scipy import ndimage
 
     away = np.zeros(len(points), np.float32)

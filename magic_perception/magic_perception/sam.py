@@ -1,7 +1,7 @@
 """Masks by Segment Anything (Kirillov et al. 2023; SAM 2: Ravi et al. 2024) through transformers, prompted by the depth clusters.
 
-The network says which thing a pixel belongs to.  What is no thing's, by depth and colour together (the table, smear past an edge, the hole of a
-handle, a shadow without depth), stays out of its masks, which are as coarse as a quarter of the network's picture.
+The network says which thing a pixel belongs to.  What is no thing's, by depth and colour together (the table, smear past an edge, the hole
+of a handle, a shadow without depth), stays out of its masks, which are as coarse as a quarter of the network's picture.
 """
 
 from __future__ import annotations

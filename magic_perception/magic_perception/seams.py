@@ -1,7 +1,7 @@
 """Whether two parts that meet at a seam are two things or one.
 
-A concave seam alone does not say: a handle meets a mug's side, a ladle's stem its bowl, a post its base.  A dozen criteria are measured at each
-seam (:data:`CRITERIA`), and the chance of two things is a logistic function of them.  ``seams.json`` holds its weights, made by
+A concave seam alone does not say: a handle meets a mug's side, a ladle's stem its bowl, a post its base.  A dozen criteria are measured at
+each seam (:data:`CRITERIA`), and the chance of two things is a logistic function of them.  ``seams.json`` holds its weights, made by
 ``ros2 run magic_perception learn_seams`` from scenes whose things are known.
 """
 
@@ -40,8 +40,8 @@ CRITERIA = {
     "edge": "log of the median change of colour across the seam over that beside it within the parts",
 }
 
-#: What begins below FLOOR stands on the table; slack between the top of one and the bottom of what stands on it; the height of a foot; and how much
-#: wider than the narrowest place of a gap what faces it may be, m.
+#: What begins below FLOOR stands on the table; slack between the top of one and the bottom of what stands on it; the height of a foot; and
+#: how much wider than the narrowest place of a gap what faces it may be, m.
 FLOOR, REST, FOOT, BRIDGE = 0.015, 0.015, 0.025, 0.008
 
 
@@ -49,8 +49,8 @@ FLOOR, REST, FOOT, BRIDGE = 0.015, 0.015, 0.025, 0.008
 class Voxels:
     """A cluster's voxels and the pairs of neighbours among them.
 
-    centre, normal (V, 3); height (V,) above the table, m; rgb (V, 3), 0..1.  a, b (P,): the voxels of a pair; opening (P,): negative where the
-    surface bends inward; bend (P,): by so many degrees; clear (P,): whether the normals tell.
+    centre, normal (V, 3); height (V,) above the table, m; rgb (V, 3), 0..1.  a, b (P,): the voxels of a pair; opening (P,): negative where
+    the surface bends inward; bend (P,): by so many degrees; clear (P,): whether the normals tell.
     """
 
     centre: NDArray[np.float64]
@@ -142,7 +142,8 @@ def measured(voxels: Voxels, first: _Part, second: _Part, across: NDArray[np.boo
 
 
 def _before(voxels: Voxels, first: _Part, second: _Part, most: int = 60) -> float:
-    """Share of pairs of voxels, one of each part, of which either lies before the other's tangent plane by more than 5 mm and 10 degrees."""
+    """Share of pairs of voxels, one of each part, of which either lies before the other's tangent plane by more than 5 mm and 10
+    degrees."""
     i, j = (one.members[:: max(1, len(one.members) // most)] for one in (first, second))
     offset = voxels.centre[i][:, None] - voxels.centre[j][None]
     distance = np.linalg.norm(offset, axis=-1)
@@ -226,7 +227,8 @@ def learned() -> Judge:
 
 
 def _bridged(voxels: Voxels, part: NDArray[np.int64]) -> Voxels:
-    """The voxels with pairs across gaps in what was seen, which tell nothing of the surface, so that no group of parts is without a neighbour."""
+    """The voxels with pairs across gaps in what was seen, which tell nothing of the surface, so that no group of parts is without a
+    neighbour."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree

@@ -122,8 +122,8 @@ def _sees(other: Looked, mask: NDArray[np.bool_], cuts_there: list[Cut], look: L
 
 
 def joined(looks: list[Looked], labels: list[NDArray[np.int32]], label: int) -> float:
-    """The share, 0..1, of a thing's outline along which another thing goes on at its depth, in the camera where that is largest: there they touch, and
-    may be one thing that a seam has parted."""
+    """The share, 0..1, of a thing's outline along which another thing goes on at its depth, in the camera where that is largest: there they
+    touch, and may be one thing that a seam has parted."""
     largest = 0.0
     for look, image in zip(looks, labels, strict=True):
         x, y, w, h = cv2.boundingRect((image == label).view(np.uint8))

@@ -36,7 +36,8 @@ class Segmenter(Protocol):
 class DepthSegmenter:
     """Table plane, table colour, clusters: no weights but those of a few criteria of seams and of upright planes.
 
-    judge, cut: what tells whether a seam parts two things, and whether an upright plane does, instead of the weights that ship with the package.
+    judge, cut: what tells whether a seam parts two things, and whether an upright plane does, instead of the weights that ship with the
+    package.
     workers: processes that look at a part of the pictures.
     """
 

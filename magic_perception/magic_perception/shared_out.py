@@ -20,7 +20,8 @@ import numpy as np
 from magic_core.workers import Workers
 
 S, T, R = TypeVar("S"), TypeVar("T"), TypeVar("R")
-#: Another process is waited for so many times as long as this one took for what it did itself, and so many seconds more; then this one does that as well.
+#: Another process is waited for so many times as long as this one took for what it did itself, and so many seconds more; then this one does
+#: that as well.
 PATIENCE, MOMENT = 5.0, 1.0
 
 
@@ -38,17 +39,19 @@ def _ready() -> None:
 
 
 def shared_out(work: Callable[[S, T], R], given: S, items: Sequence[T], costs: Sequence[float], workers: Workers | None) -> list[R]:
-    """``work``, a function of a module, of what is given and each of the items: of some of them in the processes that are ready to, of the others here.
+    """``work``, a function of a module, of what is given and each of the items: of some of them in the processes that are ready to, of the
+    others here.
 
-    The dearest by costs are begun first.  Results do not depend on who did what.  A process that was killed, or is not heard of, is replaced.
+    The dearest by costs are begun first.  Results do not depend on who did what.  A process that was killed, or is not heard of, is
+    replaced.
     """
     with Shared(work, given, items, costs, workers) as shared:
         return shared.done()
 
 
 class Shared(Generic[S, T, R]):
-    """The same, begun by the others as soon as the context is entered: this process joins them in :meth:`done`.  What nobody has begun when the context
-    is left is not done."""
+    """The same, begun by the others as soon as the context is entered: this process joins them in :meth:`done`.  What nobody has begun when
+    the context is left is not done."""
 
     def __init__(self, work: Callable[[S, T], R], given: S, items: Sequence[T], costs: Sequence[float], workers: Workers | None) -> None:
         self._work, self._given, self._items, self._workers = work, given, items, workers

@@ -21,7 +21,8 @@ class Sight:
     """One camera's view of one thing.
 
     mask (H, W) bool: the thing; hidden (H, W) bool: something else in front may hide it, so that a miss there says nothing.
-    color (H, W, 3) uint8 RGB; depth (H, W) float32 metres, NaN none; heights (H, W) float32 above the table; sigma: noise of the heights at the thing.
+    color (H, W, 3) uint8 RGB; depth (H, W) float32 metres, NaN none; heights (H, W) float32 above the table; sigma: noise of the heights at
+    the thing.
     """
 
     intrinsics: Intrinsics
@@ -90,8 +91,8 @@ class Sight:
 
     @cached_property
     def reached(self) -> NDArray[np.float32]:
-        """A picture (H, W) of the height down to which each pixel's ray surely goes on, m: to the table beside the mask, in it to the greatest height
-        measured around; nowhere, infinite, where something else may hide the thing or depth is missing.
+        """A picture (H, W) of the height down to which each pixel's ray surely goes on, m: to the table beside the mask, in it to the
+        greatest height measured around; nowhere, infinite, where something else may hide the thing or depth is missing.
 
         What is raised beside the mask farther than smear reaches is taken for a part of the thing that colour has lost.
         """
@@ -177,7 +178,8 @@ def surfaces(sights: list[Sight], upsample: int = 1) -> tuple[NDArray[np.float64
 def carve(
     sights: list[Sight], columns: list[NDArray[np.float64]], see_through: float | None = None, weights: list[float] | None = None
 ) -> NDArray[np.float32]:
-    """Occupancy (rows, columns) 0..1 of cells, given the points (rows, columns, 3) of each cell's column: mean over cameras of the least mask.
+    """Occupancy (rows, columns) 0..1 of cells, given the points (rows, columns, 3) of each cell's column: mean over cameras of the least
+    mask.
 
     With ``see_through`` metres a camera that measured depth farther than that behind a cell saw it empty, and one
     that measured depth nearer than that before it says nothing.

@@ -1,10 +1,10 @@
 """Depth smeared past an edge or across a hole, taken out of a mask by colour; what depth lost, put back.
 
-The window of stereo matching carries a near surface's depth some pixels past its edge and over narrow gaps (a handle's hole); at thin bars it may
-carry the background's depth over the thing.  The colour image shows the edge.  Each connected region of a mask is judged with two
-histograms of colour, that of the table around it and that of its own inside: a pixel near the edge goes to whichever makes its neighbourhood
-likelier, and a region of the table's colour that the mask encloses is a hole.  What has the table's colour itself, or nearly, is left as it was: where the
-thing's own colours run into the table's, as a wooden spoon's do with the light, there is no edge to cut along.
+The window of stereo matching carries a near surface's depth some pixels past its edge and over narrow gaps (a handle's hole); at thin bars
+it may carry the background's depth over the thing.  The colour image shows the edge.  Each connected region of a mask is judged with two
+histograms of colour, that of the table around it and that of its own inside: a pixel near the edge goes to whichever makes its
+neighbourhood likelier, and a region of the table's colour that the mask encloses is a hole.  What has the table's colour itself, or nearly,
+is left as it was: where the thing's own colours run into the table's, as a wooden spoon's do with the light, there is no edge to cut along.
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 from magic_perception.clusters import connected
 from magic_perception.pixels import where
 
-#: Pixels, at a focal length of 615, by which depth reaches past an edge or falls short of it, and to which a hole may lie inside a mask's edge.
+#: Pixels, at a focal length of 615, by which depth reaches past an edge or falls short of it, and to which a hole may lie inside a mask's
+#: edge.
 REACH, DEEP = 9, 26
 #: Where smear is found to reach no farther than this, pixels, depth is not carried past edges.
 SHARP = 3
-#: Log of the ratio of likelihoods from which a pixel near the edge is the table's, and one without support in depth is the thing's; and that
-#: of a region's mean from which it is a hole.
+#: Log of the ratio of likelihoods from which a pixel near the edge is the table's, and one without support in depth is the thing's; and
+#: that of a region's mean from which it is a hole.
 TABLE, THING, HOLE = 1.0, 1.5, 2.5
-#: And that by which a thing's own pixel is clearly not the table's, and the share of those beside a patch that are so where there is an edge of colour.
+#: And that by which a thing's own pixel is clearly not the table's, and the share of those beside a patch that are so where there is an
+#: edge of colour.
 APART, MOST = 2.5, 0.4
 #: What is the table's differs from its colour around by less than so many squared standard deviations, shadows aside.
 LIKE = 25.0
@@ -39,7 +41,8 @@ STEP, BESIDE = 0.005, 3
 LEAST, SAMPLE = 12, 150
 #: Past such a share of the outlines nearest to a patch's inner pixels depth goes on where it is a face that stands on the table.
 STANDS = 0.6
-#: A patch with a larger share of the open around it than this may be the thing's end, where its pixels are off a plane by no more than so many metres in the middle.
+#: A patch with a larger share of the open around it than this may be the thing's end, where its pixels are off a plane by no more than so
+#: many metres in the middle.
 OPEN, EVEN = 0.5, 0.008
 #: Widths of the histograms' bins in lightness and in the two colour axes, of 256.
 BINS = (12, 5, 5)
@@ -105,10 +108,12 @@ def cleared(
     jump: NDArray[np.bool_],
     focal: float,
 ) -> tuple[NDArray[np.bool_], bool]:
-    """The mask (H, W) with smear taken out and lost rims put back; and whether things with an edge of colour show that depth is not carried past edges.
+    """The mask (H, W) with smear taken out and lost rims put back; and whether things with an edge of colour show that depth is not carried
+    past edges.
 
-    lab (H, W, 3): the picture (:func:`softened`); depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W): squared distance of the colour from
-    that of the table around, in the light or in a shadow, in standard deviations; possible (H, W): where the mask may grow; jump (H, W): :func:`falls_back`; focal: focal length, pixels.
+    lab (H, W, 3): the picture (:func:`softened`); depth (H, W) metres; table (H, W): pixels that are surely the table; unlike (H, W):
+    squared distance of the colour from that of the table around, in the light or in a shadow, in standard deviations; possible (H, W):
+    where the mask may grow; jump (H, W): :func:`falls_back`; focal: focal length, pixels.
     """
     scale = focal / 615
     most, deep = max(3, round(REACH * scale)), round(DEEP * scale)
@@ -149,10 +154,10 @@ class _Near:
 
 @dataclass(frozen=True)
 class _Told:
-    """Of one region in its window: log of how much likelier each pixel's colour is around the thing than on it; its distance from the outside, pixels;
-    for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind them, where there is an edge of
-    colour; whether past each pixel's nearest outline depth goes on; the region's own pixels that are clearly not the table's; and where there is an edge of
-    colour beside."""
+    """Of one region in its window: log of how much likelier each pixel's colour is around the thing than on it; its distance from the
+    outside, pixels; for pixels of the outline past which depth falls back how far the first pixel surely of the thing's colour lies behind
+    them, where there is an edge of colour; whether past each pixel's nearest outline depth goes on; the region's own pixels that are
+    clearly not the table's; and where there is an edge of colour beside."""
 
     field: NDArray[np.float32]
     within: NDArray[np.float32]
@@ -188,7 +193,8 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
     if np.count_nonzero(sure) < 0.3 * np.count_nonzero(mine):
         return None
     told = field(sure)
-    # Of a region of many things each has a small part of the histogram, so that colour that is not the table's even in a shadow is clear as well.
+    # Of a region of many things each has a small part of the histogram, so that colour that is not the table's even in a shadow is clear as
+    # well.
     clear = mine & ((told < -APART) | (near.unlike >= LIKE))
     count, share = (
         cv2.blur(x.astype(np.float32), (2 * most + 5,) * 2, borderType=cv2.BORDER_CONSTANT)
@@ -201,7 +207,8 @@ def _told(near: _Near, most: int, deep: int) -> _Told | None:
 
 
 def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float) -> NDArray[np.bool_]:
-    """Pixels (H, W) of a mask beyond whose nearest outline depth falls back, or is mostly missing: only there does stereo carry it past an edge.
+    """Pixels (H, W) of a mask beyond whose nearest outline depth falls back, or is mostly missing: only there does stereo carry it past an
+    edge.
 
     Where a thing meets the table towards the camera depth goes on.
     """
@@ -224,7 +231,8 @@ def falls_back(mask: NDArray[np.bool_], depth: NDArray[np.float32], focal: float
 
 
 def _width(told: list[_Told], most: int) -> int:
-    """How far smear reaches in a picture, pixels, at most ``most``: where the thing's colour begins behind most of the outlines past which depth falls back."""
+    """How far smear reaches in a picture, pixels, at most ``most``: where the thing's colour begins behind most of the outlines past which
+    depth falls back."""
     widths = np.concatenate([t.widths for t in told]) if told else np.zeros(0)
     widths = widths[widths <= 2 * most]
     if len(widths) < LEAST:
@@ -245,8 +253,8 @@ def _judged(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArr
 
 
 def _smeared(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDArray[np.bool_]:
-    """Of a region's pixels those that colour gives to the table: a rim of it no wider than smear is, and holes, which depth shows hollow or nothing can tell
-    from the table."""
+    """Of a region's pixels those that colour gives to the table: a rim of it no wider than smear is, and holes, which depth shows hollow or
+    nothing can tell from the table."""
     within = told.within
     empty = near.mine & (told.field > TABLE) & (near.unlike < LIKE)
     outside = cv2.dilate((~near.mine).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -274,7 +282,8 @@ def _smeared(near: _Near, told: _Told, reach: int, most: int, deep: int) -> NDAr
 
 
 def _hollow(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: tuple[slice, slice]) -> bool:
-    """Whether depth shows a patch of the table's colour in a region hollow, within the ring of the region's own about it, or is missing there."""
+    """Whether depth shows a patch of the table's colour in a region hollow, within the ring of the region's own about it, or is missing
+    there."""
     inside, rim = part & np.isfinite(near.depth[cut]), ring & np.isfinite(near.depth[cut])
     if np.count_nonzero(inside) < 0.7 * np.count_nonzero(part):
         return True
@@ -286,8 +295,8 @@ def _hollow(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: 
 
 
 def _sunk(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: tuple[slice, slice], empty: NDArray[np.bool_]) -> bool:
-    """Whether a patch of the table's colour has the region's own colours all around, as no face has that meets the table, and depth lies behind theirs, if only by as
-    much as is left of a hole that it fills."""
+    """Whether a patch of the table's colour has the region's own colours all around, as no face has that meets the table, and depth lies
+    behind theirs, if only by as much as is left of a hole that it fills."""
     border = (cv2.dilate(part.view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~part
     inside, rim = part & np.isfinite(near.depth[cut]), ring & np.isfinite(near.depth[cut])
     if float((near.mine[cut] & ~empty[cut])[border].mean()) < CLOSED or np.count_nonzero(rim) <= 8 or not inside.any():
@@ -296,15 +305,16 @@ def _sunk(near: _Near, part: NDArray[np.bool_], ring: NDArray[np.bool_], cut: tu
 
 
 def _stands(told: _Told, part: NDArray[np.bool_], cut: tuple[slice, slice], reach: int) -> bool:
-    """Whether a patch of the table's colour reaches farther in than smear does from outlines past most of which depth goes on: a face that meets the table
-    towards the camera.  Past a bar, and beside the hole that it encloses, depth falls back."""
+    """Whether a patch of the table's colour reaches farther in than smear does from outlines past most of which depth goes on: a face that
+    meets the table towards the camera.  Past a bar, and beside the hole that it encloses, depth falls back."""
     deep = part & (told.within[cut] > reach + 1)
     return np.count_nonzero(deep) >= LEAST and float(told.goes_on[cut][deep].mean()) > STANDS
 
 
 def _sticks_out(near: _Near, part: NDArray[np.bool_], empty: NDArray[np.bool_], away: int) -> bool:
-    """Whether a patch of the table's colour (H, W) has more of the open than of the region around it, is even, lies before what is there, and reaches more than
-    ``away`` pixels from all that is of the thing's own colours, farther than depth is carried: the end of a wooden handle on a wooden table."""
+    """Whether a patch of the table's colour (H, W) has more of the open than of the region around it, is even, lies before what is there,
+    and reaches more than ``away`` pixels from all that is of the thing's own colours, farther than depth is carried: the end of a wooden
+    handle on a wooden table."""
     x, y, w, h = cv2.boundingRect(part.view(np.uint8))
     cut = (slice(max(y - away - 1, 0), y + h + away + 1), slice(max(x - away - 1, 0), x + w + away + 1))
     here, mine, depth = part[cut], near.mine[cut], near.depth[cut]
@@ -353,7 +363,8 @@ def _enclosed(like: NDArray[np.bool_], mask: NDArray[np.bool_], share: float = 0
 
 #: Of a pixel whose depth is not the thing's: its own largest height over the table, and that which the mask has nearby at least, m; pixels.
 LOW, HIGH, NEARBY = 0.008, 0.030, 6
-#: A bar up to so many pixels wide has the depth of what is behind it mixed into its own; there a fall of so many metres nearby is none of the bar's.
+#: A bar up to so many pixels wide has the depth of what is behind it mixed into its own; there a fall of so many metres nearby is none of
+#: the bar's.
 BAR, FALL = 11, 0.015
 
 

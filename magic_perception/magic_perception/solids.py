@@ -194,7 +194,8 @@ def lofted(rings: NDArray[np.float64]) -> Mesh:
 
 
 def loft_pieces(rings: NDArray[np.float64], tolerance: float = 0.004) -> list[Mesh]:
-    """Convex hulls of runs of rings (L, K, 3): a run grows upwards as long as its hull keeps within ``tolerance`` metres of the rings in it."""
+    """Convex hulls of runs of rings (L, K, 3): a run grows upwards as long as its hull keeps within ``tolerance`` metres of the rings in
+    it."""
     pieces = []
     start = 0
     flat = rings[..., :2]

@@ -86,7 +86,8 @@ def resident() -> float:
 
 
 def measure(frames: int, segmenter: Segmenter, seed: int = 0, workers: Workers | None = None, pairs: int = 8) -> dict:
-    """Seconds by stage and resident memory over ``frames`` scenes, made of ``pairs`` captures over and over, ids tracked as the node does."""
+    """Seconds by stage and resident memory over ``frames`` scenes, made of ``pairs`` captures over and over, ids tracked as the node
+    does."""
     captured = frame_pairs(min(pairs, frames), seed)
     parameters = Parameters(seed=seed)
     tracker = Tracker()

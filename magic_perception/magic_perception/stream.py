@@ -162,8 +162,8 @@ def next_scene(
     more are known), the last of them at most ``skew`` seconds old, that is ``period`` later than the scene before (``done``) and
     before ``limit``.  A camera's next frame is waited for where it may still come before that stamp, unless all is ``settled``:
     nothing is under way.  Where more than a period is waiting, whole periods are passed over.  So which frames are averaged depends on
-    their stamps, and not on when each came or when this is asked.  A stamp at which a frame of a camera is missing makes no scene: in the one before it
-    what moves is elsewhere.
+    their stamps, and not on when each came or when this is asked.  A stamp at which a frame of a camera is missing makes no scene: in the
+    one before it what moves is elsewhere.
     """
     if not stamps or not all(stamps.values()):
         return None

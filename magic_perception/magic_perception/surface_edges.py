@@ -20,8 +20,8 @@ SUPPORT = 0.06
 def on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:
     """Labels (H, W) whose seams follow the surfaces on either side: parts come in voxels, several pixels wide.
 
-    Near a seam a pixel that lies off the plane through its own label's pixels farther in, and on that of the other's, is the other's.  Of a plane the inverse
-    depth is linear in the picture, so that moments over a window fit all planes at once.
+    Near a seam a pixel that lies off the plane through its own label's pixels farther in, and on that of the other's, is the other's.  Of a
+    plane the inverse depth is linear in the picture, so that moments over a window fit all planes at once.
     """
     meets, things = np.zeros(labels.shape, bool), window(labels > 0)
     for axis in range(2):

@@ -1,9 +1,10 @@
 """How far the surface of a reconstruction is likely to be off, computed from what was seen of it.
 
-A thing may overlap the truth by little and be right to a millimetre, as what is thin does (:mod:`magic_perception.confidence`), or overlap it well and have its
-handle elsewhere.  What a motion meets is the surface.  The root mean square distance between it and the true one, below which it is for five of six things,
-is the exponential of a linear function of a few numbers: the quantile regression whose weights ``surface_error.json`` holds.
-``ros2 run magic_perception learn_surface_error`` fits them anew; ``docs/results_perception.md`` says how it does on others.
+A thing may overlap the truth by little and be right to a millimetre, as what is thin does (:mod:`magic_perception.confidence`), or overlap
+it well and have its handle elsewhere.  What a motion meets is the surface.  The root mean square distance between it and the true one,
+below which it is for five of six things, is the exponential of a linear function of a few numbers: the quantile regression whose weights
+``surface_error.json`` holds. ``ros2 run magic_perception learn_surface_error`` fits them anew; ``docs/results_perception.md`` says how it
+does on others.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ SIGNS = np.array([sign for _, sign in NUMBERS.values()])
 
 @dataclass(frozen=True)
 class Departure:
-    """How far a solid departs from what was seen of it, m: astray, the largest distance of its silhouette from the mask, or of the mask from its silhouette, in any
-    camera; gap, the root mean square distance of the measured points from it."""
+    """How far a solid departs from what was seen of it, m: astray, the largest distance of its silhouette from the mask, or of the mask
+    from its silhouette, in any camera; gap, the root mean square distance of the measured points from it."""
 
     astray: float
     gap: float
@@ -150,8 +151,8 @@ class Quantile:
 def fit(
     rows: NDArray[np.float64], errors: NDArray[np.float64], share: float = SHARE, ridge: float = 1.0, signs: NDArray[np.int64] = SIGNS
 ) -> Quantile:
-    """Quantile regression of the logarithm of errors (N,) in metres on rows (N, C), with a ridge penalty on the standardised numbers; signs (C,): 1 or -1 where
-    more of a number is known to be worse or better, and its weight may not say otherwise.
+    """Quantile regression of the logarithm of errors (N,) in metres on rows (N, C), with a ridge penalty on the standardised numbers; signs
+    (C,): 1 or -1 where more of a number is known to be worse or better, and its weight may not say otherwise.
 
     The quantile's loss has a corner, which is rounded over a tenth in the logarithm.
     """

@@ -119,8 +119,8 @@ def standing(
     """How many things stand on a level, and its area in m^2.
 
     heights (N,) and xy (N, 2) metres in a frame with z up.  A thing is a connected region of at most half a metre that rises from the
-    level by more than 12 mm, and around which at least six tenths of what is seen is the level.  It counts by the share of its outline at which the level
-    is seen: specks of noise on a floor far below have gaps around them.
+    level by more than 12 mm, and around which at least six tenths of what is seen is the level.  It counts by the share of its outline at
+    which the level is seen: specks of noise on a floor far below have gaps around them.
     """
     low = bounds(xy)[0] - 4 * cell
     index = np.floor((xy - low) / cell).astype(int)
@@ -154,9 +154,9 @@ def standing(
 def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> list[Support]:
     """The level ``plane`` and those parallel to it that hold many points (N, 3), the likeliest table first.
 
-    The table is the level that most things stand on; of levels with the same claim (:data:`ALIKE`) the one that more points lie on.  A level a little above another
-    counts where it is as wide as a tray, a board or a mat; one high above another where it is as wide as a table: the top
-    of a box is none, though things may stand on it.
+    The table is the level that most things stand on; of levels with the same claim (:data:`ALIKE`) the one that more points lie on.  A
+    level a little above another counts where it is as wide as a tray, a board or a mat; one high above another where it is as wide as a
+    table: the top of a box is none, though things may stand on it.
     """
     frame = world_from_plane(plane)
     local = transforms.apply(transforms.inverse(frame), points)
@@ -206,7 +206,8 @@ def world_from_plane(plane: Plane) -> NDArray[np.float64]:
     return transforms.make(np.column_stack([x, np.cross(z, x), z]), -plane.coefficients[3] * z)
 
 
-#: Cosine between a plane's normal and the picture's down beyond which the plane is upright: a wall, seen by a camera that looks down by 15 degrees.
+#: Cosine between a plane's normal and the picture's down beyond which the plane is upright: a wall, seen by a camera that looks down by 15
+#: degrees.
 UPRIGHT = 0.26
 #: Points that tell the planes of a picture apart.
 ENOUGH = 20000
@@ -218,7 +219,8 @@ def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 
     Nothing but the picture's own up, which a camera on its tripod or in a hand keeps roughly, tells a wall from a table: a plane whose
     normal points down in the picture is upright, and of two at right angles the one that faces up less.  Of the others the one that
     most things stand on is the table.
-    ``notes`` gets a sentence where another plane has the same claim.  Raises ``NO_TABLE``; ``TABLE_AMBIGUOUS`` where all planes are upright.
+    ``notes`` gets a sentence where another plane has the same claim.  Raises ``NO_TABLE``; ``TABLE_AMBIGUOUS`` where all planes are
+    upright.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim == 3:
@@ -261,7 +263,8 @@ def table_in_view(points: NDArray[np.float64], band: float = 0.008, seed: int = 
     plane = best.plane
     near = points[np.abs(plane.heights(points)) < 2 * band]
     if plane is not first and len(near) > 300:
-        # The largest plane that the points near it tell of may be another, inclined to it (a box's side that meets it): then it stays as it was found.
+        # The largest plane that the points near it tell of may be another, inclined to it (a box's side that meets it): then it stays as it
+        # was found.
         try:
             plane = fit_plane(near, plane.normal, 5.0, band, seed=seed)
         except MagicError:

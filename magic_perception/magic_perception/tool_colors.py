@@ -19,8 +19,8 @@ from scipy.ndimage import gaussian_filter
 from magic_core.camera import RgbdFrame
 
 Array = NDArray[np.float64]
-#: Colours are told apart by L*, a* and b* in bins of so many units (of 256), blurred by as many bins as the light on a surface changes them;
-#: a colour that the tool has not shown is its own with this share of an even chance.
+#: Colours are told apart by L*, a* and b* in bins of so many units (of 256), blurred by as many bins as the light on a surface changes
+#: them; a colour that the tool has not shown is its own with this share of an even chance.
 BIN, BLUR, STRANGE = (16, 4, 4), (2.0, 1.5, 1.5), 0.02
 SHAPE = tuple(256 // size for size in BIN)
 EVEN = 1 / math.prod(SHAPE)
@@ -35,8 +35,9 @@ LEARNING = (0.1, 0.3)
 
 
 class Said(NamedTuple):
-    """What the colours of a picture say.  tool (H, W): the logarithm of how much likelier the colours about a pixel are the tool's than those of anything
-    else; touches (H, W): it is not, and rather that of a hand or of another thing, which may touch the tool, than that of ground."""
+    """What the colours of a picture say.  tool (H, W): the logarithm of how much likelier the colours about a pixel are the tool's than
+    those of anything else; touches (H, W): it is not, and rather that of a hand or of another thing, which may touch the tool, than that of
+    ground."""
 
     tool: NDArray[np.float32]
     touches: NDArray[np.bool_]

@@ -50,10 +50,10 @@ class _Track:
 class Tracker:
     """Hands ids on from the last scenes.
 
-    An object takes the id of the one it resembles most in place (within ``reach`` metres of where that was, or would be if it went on as it did) and in
-    size (box edges within ``growth`` of each other plus 15 mm).  What is left then takes the id of what is missing where both are alike in size
-    and colour, no farther apart than a robot may have moved it, and nothing else could be either of them.
-    A thing not seen for ``memory`` scenes is forgotten, but its number is not given out again.  ``standing``: ids of what is where it was before.
+    An object takes the id of the one it resembles most in place (within ``reach`` metres of where that was, or would be if it went on as it
+    did) and in size (box edges within ``growth`` of each other plus 15 mm).  What is left then takes the id of what is missing where both
+    are alike in size and colour, no farther apart than a robot may have moved it, and nothing else could be either of them. A thing not
+    seen for ``memory`` scenes is forgotten, but its number is not given out again.  ``standing``: ids of what is where it was before.
     """
 
     def __init__(self, reach: float = 0.10, growth: float = 0.5, memory: int = 10) -> None:
@@ -88,7 +88,8 @@ class Tracker:
         return replace(scene, objects=(*renamed, *(o for o in scene.objects if o.source != "camera")))
 
     def carried(self, item: SceneObject) -> bool:
-        """Whether an object of the newest scene is where it is by the grace of what holds it: it hangs, or the robot is before it and it was not there before."""
+        """Whether an object of the newest scene is where it is by the grace of what holds it: it hangs, or the robot is before it and it
+        was not there before."""
         return item.source == "camera" and (item.hanging or (ROBOT in item.cut_off and item.id not in self.standing))
 
     def _near(self, new: list[_Track]) -> dict[int, str]:

@@ -170,8 +170,8 @@ def patch(random, low, high, z, step):
 
 
 def over_floor(turn):
-    """Points (N, 3) of a table of 0.32 by 0.80 m with two boxes on it, half a metre above a floor that shows more of itself, and on which four
-    specks of noise lie, each seen from one side only; all turned about the vertical."""
+    """Points (N, 3) of a table of 0.32 by 0.80 m with two boxes on it, half a metre above a floor that shows more of itself, and on which
+    four specks of noise lie, each seen from one side only; all turned about the vertical."""
     random = np.random.default_rng(0)
     made = partial(patch, random)
     top, floor, rest = made((-0.16, -0.40), (0.16, 0.40), 0.5, 0.006), made((0.3, -0.8), (1.3, 0.8), 0.0, 0.009), []

@@ -10,7 +10,8 @@ TOOL, GROUND = np.array([112.0, 82.0, 55.0]), np.array([186.0, 152.0, 112.0])
 
 
 def strip(low, high, angle, ground=GROUND):
-    """A picture, as sharp as a lens makes it, of a strip of the tool's colour about its middle: from ``low`` to ``high`` pixels along a direction."""
+    """A picture, as sharp as a lens makes it, of a strip of the tool's colour about its middle: from ``low`` to ``high`` pixels along a
+    direction."""
     fine, size = 8, 60
     v, u = (np.indices((size * fine,) * 2) + 0.5) / fine - 0.5
     along = (u - size / 2) * np.cos(angle) + (v - size / 2) * np.sin(angle)

@@ -123,7 +123,8 @@ def test_criteria_of_two_rectangles(monkeypatch):
     monkeypatch.setattr(cuts, "CELL", 0.001)
     seen = cuts.Seen.of(side_by_side(0.08, 0.07, 0.0), lambda asked: seen_past(asked, 0.07))
     told_ = dict(zip(cuts.CRITERIA, cuts.measured(seen, cuts.Plane(0.0, 0.5, 3.0)), strict=True))
-    # The hull is a rectangle of 60 x 80 mm and a trapezoid from 80 to 70; in it beside the smaller rectangle two triangles, of which 4 mm beside the plane are nobody's.
+    # The hull is a rectangle of 60 x 80 mm and a trapezoid from 80 to 70; in it beside the smaller rectangle two triangles, of which 4 mm
+    # beside the plane are nobody's.
     hull, beside = 60 * 80 + 60 * 75, 60 * 5 * (56 / 60) ** 2
     assert cuts.SEEN * np.exp(told_["hull"]) == pytest.approx(beside / hull, abs=0.005)
     assert told_["block"] == pytest.approx(told_["hull"])

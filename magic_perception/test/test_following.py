@@ -93,8 +93,8 @@ def test_a_thin_tool_in_a_hand_is_held_by_its_colours(hanger):
 
 
 def scooped():
-    """A spoon with a hand on its handle, and a ball of another colour that stands about at first, then lies in its bowl: spoon, poses (T, 4, 4), times (T,),
-    pictures, and the ball where it stood."""
+    """A spoon with a hand on its handle, and a ball of another colour that stands about at first, then lies in its bowl: spoon, poses (T,
+    4, 4), times (T,), pictures, and the ball where it stood."""
     spoon, ball = make("spoon", 1, **SPOON), make("sphere", 3, radius=0.035)
     times, poses = path(spoon)
     middle = spoon.contact("bowl", spoon.view("section"), towards=(0, 0, 1)).object_from_contact[:3, 3] + [0, 0, 0.035]

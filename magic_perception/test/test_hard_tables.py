@@ -1,4 +1,5 @@
-"""Segmentation of table-tops that are hard to see, by the sensor model with smear: near neighbours, boards, dark and glossy tables, lost depth.
+"""Segmentation of table-tops that are hard to see, by the sensor model with smear: near neighbours, boards, dark and glossy tables, lost
+depth.
 
 What is asked is that each thing is found once, with its mask, and nothing else of a thing's size.
 """
@@ -217,7 +218,8 @@ def test_a_face_that_the_picture_ends_is_one_with_what_lies_in_its_plane(behind,
 
 
 def test_beside_a_post_a_cup_does_not_end():
-    """One camera has a post before the cup, and beside the post stereo has no depth: half the cup is colour alone there, which is neither cup nor table."""
+    """One camera has a post before the cup, and beside the post stereo has no depth: half the cup is colour alone there, which is neither
+    cup nor table."""
     post = shapes.make("rod", 0, radius=0.006, height=0.38, length=0.19, foot=0.05)
     post = replace(post.as_object("post", transforms.make(translation=[0.56, 0.0, -post.mesh.bounds[0, 2]])), source="known")
     cup = scenes.placed(shapes.make("mug", 89).mesh, 0.446, 0.272, 1.025)

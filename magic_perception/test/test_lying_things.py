@@ -24,7 +24,8 @@ def found(frames):
 
 
 def before_the_station(mesh, yaw, off=np.zeros(3)):
-    """The mesh on the table, and what two smeared pictures from the station's cameras make of it; one is said to be ``off`` (3,), m, from where it is."""
+    """The mesh on the table, and what two smeared pictures from the station's cameras make of it; one is said to be ``off`` (3,), m, from
+    where it is."""
     mesh = mesh.transformed(transforms.from_rpy(0, 0, yaw, [0.45, -0.05, 0.0]))
     mesh = mesh.transformed(transforms.make(None, [0, 0, -mesh.bounds[0, 2]]))
     caster = sensor.scene_raycaster([mesh])

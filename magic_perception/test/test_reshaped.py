@@ -28,8 +28,8 @@ def measured(true, pose, eye, rng):
 
 
 def mended(model, true, turned, rng):
-    """The model, and as a piece of itself, after a moment in which it lies and those in which it is turned (N, 4, 4), then 3 mm from where it is
-    thought to be."""
+    """The model, and as a piece of itself, after a moment in which it lies and those in which it is turned (N, 4, 4), then 3 mm from where
+    it is thought to be."""
     mesh = from_trimesh(model)
     points, face = trimesh.sample.sample_surface(model, 500, seed=1)
     reshaping = Reshaping(mesh, np.asarray(points), np.asarray(model.face_normals[face]))

@@ -274,7 +274,8 @@ def test_joint_states_on_their_way_are_waited_for(panda):
 
 
 def hook_at(robot, away=0.0):
-    """An L hook in the hand of an arm over the table, as it is told of, and its mesh in the world: ``away`` metres from there along its shaft."""
+    """An L hook in the hand of an arm over the table, as it is told of, and its mesh in the world: ``away`` metres from there along its
+    shaft."""
     world_from_tip = robot.poses(robot.arm_positions(OVER_THE_TABLE))[robot.config.move_group]
     hook = make("l_hook", 3, length=0.22, tip=0.08, width=0.02, thickness=0.015)
     # Level, the shaft between the fingers, its bend beyond them.

@@ -75,7 +75,8 @@ def test_parts_are_joined_until_none_is_likelier_one():
 
 
 def faces_of(blocks):
-    """Voxels of the front, left and top faces of blocks (low and high corner, m, colour 0..1), where no other block covers them; normals as smooth as cameras'."""
+    """Voxels of the front, left and top faces of blocks (low and high corner, m, colour 0..1), where no other block covers them; normals as
+    smooth as cameras'."""
     points, normal, color = [], [], []
     for number, (low, high, paint) in enumerate(blocks):
         for axis, end, way in ((1, low, -1.0), (0, low, -1.0), (2, high, 1.0)):
@@ -222,7 +223,8 @@ def test_parts_across_a_gap_are_judged_too():
     ids=["level", "an edge", "a hollow", "a corner", "a step"],
 )
 def test_parts_on_both_sides_of_a_gap_in_depth_are_one_where_their_surface_goes_on(rise, bend, count):
-    """Two patches of different colours, 40 mm apart: the second ``rise`` metres higher, or bent up about the middle of the gap by so many degrees."""
+    """Two patches of different colours, 40 mm apart: the second ``rise`` metres higher, or bent up about the middle of the gap by so many
+    degrees."""
     s, t = (a.ravel() for a in np.meshgrid(np.arange(0.020, 0.080, 0.004), np.arange(0, 0.060, 0.004), indexing="ij"))
     zero, turn = np.zeros_like(s), np.radians(bend)
     place = np.vstack([np.column_stack([-s, t, zero]), np.column_stack([s * np.cos(turn), t, s * np.sin(turn) + rise])])
@@ -257,7 +259,8 @@ def test_the_outside_of_a_bowl_belongs_to_its_inside_though_little_of_it_shows()
 
 
 def ladle():
-    """Points and normals (N, 3) of a bowl's inside, of its near wall's outside with a long handle, and of an egg that lies in it at the wall."""
+    """Points and normals (N, 3) of a bowl's inside, of its near wall's outside with a long handle, and of an egg that lies in it at the
+    wall."""
     turn, up = (a.ravel() for a in np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(0, 1, 16), indexing="ij"))
     way = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
     wall = np.column_stack([(0.03 + 0.02 * up)[:, None] * way[:, :2], 0.03 + 0.05 * up])

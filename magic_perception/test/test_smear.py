@@ -138,7 +138,8 @@ def test_a_bar_whose_middle_a_thing_of_another_colour_hides_is_one() -> None:
 
 @pytest.mark.parametrize("stands", [True, False])
 def test_a_foot_of_the_tables_colour_is_no_hole_where_depth_goes_on_past_it(stands: bool) -> None:
-    # The lower part of a thing that tapers to its foot has the table's colour, and falls back from its upper part as the bottom of a hollow does.
+    # The lower part of a thing that tapers to its foot has the table's colour, and falls back from its upper part as the bottom of a hollow
+    # does.
     mask, foot = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
     mask[60:140, 60:140] = True
     foot[118:140, 60:140] = True
@@ -154,7 +155,8 @@ def test_a_foot_of_the_tables_colour_is_no_hole_where_depth_goes_on_past_it(stan
 
 @pytest.mark.parametrize("length, kept", [(70, True), (8, False)])
 def test_what_sticks_out_farther_than_smear_is_carried_is_no_smear(length: int, kept: bool) -> None:
-    # The end of a wooden handle on a wooden table: raised as its head is, of the table's colour, and narrower than twice what smear reaches.
+    # The end of a wooden handle on a wooden table: raised as its head is, of the table's colour, and narrower than twice what smear
+    # reaches.
     head, bar = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
     head[60:140, 30:90] = True
     bar[93:107, 90 : 90 + length] = True
@@ -168,7 +170,8 @@ def test_what_sticks_out_farther_than_smear_is_carried_is_no_smear(length: int, 
 def test_a_bar_is_cut_along_an_edge_of_colour_and_not_where_its_own_runs_into_the_tables(
     light: tuple[int, int, int], unlike: float, kept: bool
 ) -> None:
-    """A third of a bar has the table's colour, the rest hardly another: that third is the bar's own.  Beside quite another colour it is smear."""
+    """A third of a bar has the table's colour, the rest hardly another: that third is the bar's own.  Beside quite another colour it is
+    smear."""
     mask, lit = np.zeros((200, 200), bool), np.zeros((200, 200), bool)
     mask[93:107, 30:170] = True
     lit[93:102, 30:170] = True

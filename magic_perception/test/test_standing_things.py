@@ -74,7 +74,8 @@ def test_the_distance_to_a_rounded_box_is_zero_on_its_corners_and_exact_beside_i
 
 
 def arcs(pen: bool, handle: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (N, 3), normals (N, 3) and labels (N,) of a tapered mug: its outside before the axis, its inside beyond, and what belongs to either."""
+    """Points (N, 3), normals (N, 3) and labels (N,) of a tapered mug: its outside before the axis, its inside beyond, and what belongs to
+    either."""
     turn, z = (a.ravel() for a in np.meshgrid(np.linspace(-1.2, 1.2, 40), np.linspace(0.01, 0.1, 30)))
     radius = 0.03 + 0.13 * z
     front = np.column_stack([-radius * np.cos(turn), radius * np.sin(turn), z])

@@ -45,14 +45,15 @@ STEP_LENGTH = 0.005
 STEP_ANGLE = np.deg2rad(2.0)
 #: Gap kept between tool and table, metres, at least, and the share of the target's height that a larger one may take up.
 TABLE_CLEARANCE, LOW_SHARE = 0.001, 0.2
-#: A tool that goes beneath its target does so along what it goes up; on the table it only pushes.  The share of the target's height that the room for
-#: the contact may take up there: gap and lip together have to stay well below the target's middle, or it is driven along before the lip.  But a tool turns
-#: in the hand, which holds it about its middle: as much room as its contact is off then, in metres for each metre from there, a long one needs.
+#: A tool that goes beneath its target does so along what it goes up; on the table it only pushes.  The share of the target's height that
+#: the room for the contact may take up there: gap and lip together have to stay well below the target's middle, or it is driven along
+#: before the lip.  But a tool turns in the hand, which holds it about its middle: as much room as its contact is off then, in metres for
+#: each metre from there, a long one needs.
 BENEATH_SHARE, TURNED_IN_HAND = 0.05, 0.01
 #: A tool is beneath its target where its side at the contact faces up by at least so much (cosine).
 BENEATH = 0.7
-#: What comes so near (m) to the sides of a target that is met is to be beside it; into how many sectors about it that is parted; how far (m) within
-#: a side the lower end of it is looked for.
+#: What comes so near (m) to the sides of a target that is met is to be beside it; into how many sectors about it that is parted; how far
+#: (m) within a side the lower end of it is looked for.
 TOUCHED, SECTORS, INSIDE = 0.003, 36, 0.0005
 #: By so much (rad) a tool is turned out of the attitude in which its contact was seen, where it would pass over its target in that.
 LEVELLED = np.deg2rad(45.0)
@@ -65,13 +66,13 @@ DWELL = 0.5
 #: By how much an approach is drawn in, in order of trial.
 SHARES = (1.0, 0.75, 0.55, 0.4, 0.28, 0.2, 0.12)
 #: The gap in metres that a tool keeps to a fixed target until it is let go, in order of trial: what cameras and hand do not know of
-#: where the tool is, two standard deviations, then what room there is.  It falls so far.  An approach to a target that moves keeps the first of
-#: them, or as much as there is.
+#: where the tool is, two standard deviations, then what room there is.  It falls so far.  An approach to a target that moves keeps the
+#: first of them, or as much as there is.
 GAPS = (0.006, 0.0045, 0.003, 0.0015)
 #: Where there is no such place it is let go so much of the way from its approach to the contact, in order of trial.
 SHORT = (0.75, 0.5, 0.25, 0.0)
-#: Room (m) with which a tool is slid over a fixed target, if there is so much, how far aside (m) from how it was shown that is looked for, by
-#: which steps (m), and on how many points of the tool's surface at how many poses it is measured.
+#: Room (m) with which a tool is slid over a fixed target, if there is so much, how far aside (m) from how it was shown that is looked for,
+#: by which steps (m), and on how many points of the tool's surface at how many poses it is measured.
 ROOM, ROOM_ASIDE, ROOM_STEPS, ROOM_POINTS, ROOM_POSES = 0.010, 0.02, (0.004, 0.002, 0.001), 3000, 9
 #: Where the tool turns between waypoints, what is so far from the contact (m) moves at the waypoint's speed.
 TURNING_ARM = 0.15
@@ -188,8 +189,8 @@ def _ends_beneath(world_from_meeting: NDArray[np.float64], plane: NDArray[np.flo
 
 
 def _share_of_height(target: SceneObject, plane: NDArray[np.float64], gap: float, share: float) -> float:
-    """``gap`` (m), as to obstacles, for a tool that has turned a little in the gripper would scrape along the table with the far end of a long
-    handle; but no more than a share of the target's height, so that a low target is met all the same."""
+    """``gap`` (m), as to obstacles, for a tool that has turned a little in the gripper would scrape along the table with the far end of a
+    long handle; but no more than a share of the target's height, so that a low target is met all the same."""
     pieces = np.concatenate([piece.vertices for piece in solid_pieces(target)])
     height = float((transforms.apply(target.world_from_object, pieces) @ plane[:3] + plane[3]).max())
     return max(TABLE_CLEARANCE, min(gap, share * height))
@@ -198,7 +199,8 @@ def _share_of_height(target: SceneObject, plane: NDArray[np.float64], gap: float
 def _room_beneath(
     tool: SceneObject, tool_from_contact: NDArray[np.float64], target: SceneObject, plane: NDArray[np.float64], gap: float
 ) -> float:
-    """The room (m), ``gap`` or less, to what a tool goes up along that goes beneath its target (:data:`BENEATH_SHARE`, :data:`TURNED_IN_HAND`)."""
+    """The room (m), ``gap`` or less, to what a tool goes up along that goes beneath its target (:data:`BENEATH_SHARE`,
+    :data:`TURNED_IN_HAND`)."""
     off = TURNED_IN_HAND * float(np.linalg.norm(tool_from_contact[:3, 3] - mass_centre(solid_pieces(tool))[1]))
     return max(_share_of_height(target, plane, gap, BENEATH_SHARE), min(gap, off))
 
@@ -211,9 +213,10 @@ def _beside(
     plane: NDArray[np.float64],
     clearance: float,
 ) -> float:
-    """The gap (m) to the table, ``clearance`` or less where the table raises parts of the tool that are to be beside the target until little of them
-    is: no more than a share of what the target rises above the lower side of each where the tool is led without any gap.  The stem of a hook that
-    stands on its plate was led over a cylinder."""
+    """The gap (m) to the table, ``clearance`` or less where the table raises parts of the tool that are to be beside the target until
+    little of them
+    is: no more than a share of what the target rises above the lower side of each where the tool is led without any gap.  The stem of a
+    hook that stands on its plate was led over a cylinder."""
     import trimesh
 
     up, points = plane[:3], outer_points(tool)
@@ -285,7 +288,8 @@ def tool_contact_frame(candidate: ContactCandidate, reflection: str) -> NDArray[
 
 
 def placed_contact_frame(strategy: Strategy, candidate: ContactCandidate, reflection: str) -> NDArray[np.float64]:
-    """As :func:`tool_contact_frame`, turned and shifted so that further contacts, which no waypoint names, meet the target together with it.
+    """As :func:`tool_contact_frame`, turned and shifted so that further contacts, which no waypoint names, meet the target together with
+    it.
 
     Raises BAD_REQUEST for a candidate that lacks contacts of the strategy.
     """
@@ -339,9 +343,9 @@ def drawn_in(
 
     A ring that is lowered over a target has less room than a hook that comes from the open side.  Offsets across the view
     direction are scaled, of the approach's waypoints from that of the contact, of the retreat's from that of the goal; the
-    largest of :data:`SHARES` counts at which the approach keeps the first of :data:`GAPS` to the target, as neither is quite where it was seen; where
-    none does, the approach goes from the one with most room to where there is most beside it.  Where that is not clear either, or the strategy has no
-    approach that ends in a contact, it comes back as it is.
+    largest of :data:`SHARES` counts at which the approach keeps the first of :data:`GAPS` to the target, as neither is quite where it was
+    seen; where none does, the approach goes from the one with most room to where there is most beside it.  Where that is not clear either,
+    or the strategy has no approach that ends in a contact, it comes back as it is.
 
     A tool that is let go on a fixed target is let go above it: approach and contact keep the largest of :data:`GAPS` for which
     there is room, so that a tool that is not quite where it was seen does not press on what cannot give way; where there is none at the
@@ -394,7 +398,8 @@ def drawn_in(
 
 
 def _seated(strategy: Strategy, gap: float, aside: float) -> Strategy:
-    """The strategy ``aside`` metres along the contact's tangent, its contact and all that follows ``gap`` metres from the target or more."""
+    """The strategy ``aside`` metres along the contact's tangent, its contact and all that follows ``gap`` metres from the target or
+    more."""
 
     def moved(w: Waypoint) -> Waypoint:
         x, y, z = (float(value) for value in w.offset)
@@ -404,7 +409,8 @@ def _seated(strategy: Strategy, gap: float, aside: float) -> Strategy:
 
 
 def _stopped_short(strategy: Strategy, meets: int, share: float) -> Strategy:
-    """The strategy with its contact, and all that follows, at a share of the way across the view direction from the approach to the contact."""
+    """The strategy with its contact, and all that follows, at a share of the way across the view direction from the approach to the
+    contact."""
     waypoints = list(strategy.waypoints)
     short = (1 - share) * (np.asarray(waypoints[meets - 1].offset, dtype=float) - np.asarray(waypoints[meets].offset, dtype=float))
     for i in range(meets, len(waypoints)):
@@ -420,8 +426,8 @@ def _with_room(
     target: SceneObject,
     world_from_contact: NDArray[np.float64],
 ) -> Strategy:
-    """The strategy, its approach shifted across the view direction to where the tool, at the poses (T, 4, 4) of it, is farthest from the target; no
-    farther than it takes for :data:`ROOM`.  Uphill from where it is, so that what goes round the target goes on round it."""
+    """The strategy, its approach shifted across the view direction to where the tool, at the poses (T, 4, 4) of it, is farthest from the
+    target; no farther than it takes for :data:`ROOM`.  Uphill from where it is, so that what goes round the target goes on round it."""
     wall = Raycaster([_solid(target).transformed(target.world_from_object)])
     swept = _swept(_surface(tool), poses)
 

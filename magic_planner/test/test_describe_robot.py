@@ -119,14 +119,16 @@ def test_a_real_linkage_of_somebody_elses_is_reduced():
 
 
 def test_pairs_that_cannot_meet_are_found_and_those_that_can_are_kept(tmp_path):
-    """Of the six-axis arm: by its dimensions the forearm can fold back on to the shoulder, and nothing reaches its own neighbour's neighbour's foot."""
+    """Of the six-axis arm: by its dimensions the forearm can fold back on to the shoulder, and nothing reaches its own neighbour's
+    neighbour's foot."""
     found = describe_robot.describe(six_axis_file(tmp_path), tmp_path / "out", tip="tip", home=six_axis.HOME, samples=1500)
     pairs = found.pairs
     assert ("foot", "turn") in pairs.adjacent and ("left_finger", "right_finger") in pairs.adjacent
     assert not pairs.home
     # The elbow turns by 2.6 rad either way: the hand of an arm folded up meets shoulder and foot.
     assert ("flange", "shoulder") in pairs.checked or ("left_finger", "shoulder") in pairs.checked
-    # The shoulder's own upper end, 0.4 m from its joint, never meets the foot: its lower end begins 0.04 m above it and it tilts by 1.9 rad at most.
+    # The shoulder's own upper end, 0.4 m from its joint, never meets the foot: its lower end begins 0.04 m above it and it tilts by 1.9 rad
+    # at most.
     assert ("elbow", "turn") in pairs.never
     everything = sum(map(len, (pairs.adjacent, pairs.always, pairs.home, pairs.never, pairs.checked)))
     assert everything == math.comb(len(six_axis.BOXES) + 2, 2)

@@ -76,7 +76,8 @@ def test_pieces_that_abut_are_gone_through_as_one():
     ],
 )
 def test_fingers_close_on_the_last_face_between_them(start, opening, length, beside):
-    """Two bars with a gap of 30 mm, and one far from both: of a line from the first or the second, however wide fingers about it are open."""
+    """Two bars with a gap of 30 mm, and one far from both: of a line from the first or the second, however wide fingers about it are
+    open."""
     bars = solid([piece((0, 0, 0), (x, 0, 0), (0.02, 0.1, 0.02)) for x in (0.0, 0.05, 0.25)])
     found, normal, before = between(bars, np.array([[start, 0.001, 0.002]]), np.array([[1.0, 0, 0]]), opening)
     assert found[0] == pytest.approx(length, abs=1e-6) and before[0] == beside

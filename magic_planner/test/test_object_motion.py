@@ -146,7 +146,8 @@ def test_a_tool_in_a_gripper_keeps_off_the_table_as_off_other_things_and_meets_a
 
 @pytest.mark.parametrize(("high", "above"), [(0.018, 0.0024), (0.025, TABLE_CLEARANCE), (0.010, 0.0036)])
 def test_a_stem_that_the_table_holds_up_is_not_led_over_its_target(high, above):
-    """A plate on edge and the stem that it carries, whose lower side is ``high`` over the plate's: the target, 30 mm high, is to be met by both."""
+    """A plate on edge and the stem that it carries, whose lower side is ``high`` over the plate's: the target, 30 mm high, is to be met by
+    both."""
     strategy, _tool, _, _ = setup()
     plate, stem = scenes.box([0.004, 0.08, 2 * high + 0.006]), scenes.box([0.1, 0.006, 0.006], [-0.05, 0, 0])
     tool = scenes.item("tool", [plate, stem], transforms.make(translation=[0.45, 0.25, high + 0.003]), scenes.DOWN)
@@ -160,7 +161,8 @@ def test_a_stem_that_the_table_holds_up_is_not_led_over_its_target(high, above):
 
 @pytest.mark.parametrize("turn", [90, 30])
 def test_a_tool_that_goes_beneath_its_target_keeps_off_the_table_as_others_do(turn):
-    """It goes beneath where it turns, at a wall: until then it pushes its target along, and scraped along the table a long one slips in the fingers."""
+    """It goes beneath where it turns, at a wall: until then it pushes its target along, and scraped along the table a long one slips in the
+    fingers."""
     tall, tool_contact = scenes.hook(thickness=0.08)
     target, target_contact = scenes.standing_cylinder(0.02)
     times = np.linspace(0, 2, 9)
@@ -363,8 +365,8 @@ def test_a_ring_is_lowered_over_its_target_where_the_hook_comes_from_behind():
 
 @pytest.mark.parametrize(("radius", "room"), [(0.0262, 0.0005), (0.029, 0.0035), (0.03, 0.0045), (0.0405, 0.006)])
 def test_a_tool_is_lowered_over_its_target_with_the_room_that_there_is(radius, room):
-    """Of a cylinder of 50 mm a ring of 60 mm is 5 mm clear about its middle, and 1.6 mm at the first share of the approach that is clear at all; one
-    of 81 mm is 1 mm clear of its far side as the approach was shown."""
+    """Of a cylinder of 50 mm a ring of 60 mm is 5 mm clear about its middle, and 1.6 mm at the first share of the approach that is clear at
+    all; one of 81 mm is 1 mm clear of its far side as the approach was shown."""
     tool, tool_contact = ring(radius)
     target, target_contact = scenes.standing_cylinder(0.025)
     motion = plan_tool_motion(scenes.pulling(), tool, target, scenes.candidate(tool, tool_contact, target_contact))
@@ -404,7 +406,8 @@ def hung(tool, tool_contact):
 
 @pytest.mark.parametrize(("radius", "room", "aside"), [(0.014, 0.0072, 0.004), (0.04, 0.0095, 0.0)])
 def test_a_tool_is_slid_over_a_fixed_target_where_there_is_most_room(radius, room, aside):
-    """In a hole of 28 mm a rod of 12 mm has 8 mm about it, but only 4 as it was shown; in one of 80 mm the 10 that are asked for, as it was shown."""
+    """In a hole of 28 mm a rod of 12 mm has 8 mm about it, but only 4 as it was shown; in one of 80 mm the 10 that are asked for, as it was
+    shown."""
     tool, tool_contact = ring(radius)
     motion, rod = hung(tool, tool_contact)
     body = Body("tool", tool.pieces)

@@ -15,7 +15,8 @@ END = 0.525
 
 
 def scoop(radius, before=0.04):
-    """The motion that brings a plate's contact to a cylinder's, 0.1 m along and up with it, turned beneath it, and 0.2 m up; without a wall, and with one so far beyond."""
+    """The motion that brings a plate's contact to a cylinder's, 0.1 m along and up with it, turned beneath it, and 0.2 m up; without a
+    wall, and with one so far beyond."""
     plate = scenes.item("tool", [scenes.box([0.01, 0.04, 0.02])], transforms.make(translation=[0.8, 0.3, 0.05]), scenes.DOWN)
     on_plate = scenes.contact(scenes.DOWN, [-0.005, 0, 0], [-1, 0, 0])
     _, shown_contact = scenes.standing_cylinder(SHOWN)

@@ -27,7 +27,8 @@ WAYPOINTS = (
 
 
 def two_contacts(waypoints=WAYPOINTS, twist=0.0):
-    """The hook with its inner side and its outer, the cylinder with its far side and its near; the outer side's normal turned by ``twist``."""
+    """The hook with its inner side and its outer, the cylinder with its far side and its near; the outer side's normal turned by
+    ``twist``."""
     tool, inner = scenes.hook()
     target, far = scenes.standing_cylinder()
     outer = scenes.contact(scenes.DOWN, [0.15, 0.05, 0], [np.cos(twist), np.sin(twist), 0])

@@ -178,7 +178,8 @@ def test_a_cancel_is_answered_within_one_search(arm):
     given, obstacles = walled()
 
     def planned(cancel_at):
-        """How often a plan was asked whether it is cancelled, which it was from that time on; seconds from then to its answer, if that was CANCELED."""
+        """How often a plan was asked whether it is cancelled, which it was from that time on; seconds from then to its answer, if that was
+        CANCELED."""
         asked, since = 0, math.inf
 
         def cancelled():

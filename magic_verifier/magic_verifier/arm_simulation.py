@@ -51,17 +51,17 @@ HARDER = 100.0
 #: A target that weighs more than so many times the tool is pushed by more solver iterations, in proportion, up to so many times as many:
 #: with too few a light tool lags behind the hand by what it moves in a step, which is read as a load on the pads, and creeps out of them.
 HEAVIER, MOST_ITERATIONS = 10.0, 4.0
-#: While the fingers close on a tool that weighs less than this (kg) steps are solved by more iterations, in proportion, up to so many times as
-#: many: with 8 the fingers sank through a spoon of 18 g from both sides, with 16 through one of 9 g, and squeezed light hooks out.
+#: While the fingers close on a tool that weighs less than this (kg) steps are solved by more iterations, in proportion, up to so many times
+#: as many: with 8 the fingers sank through a spoon of 18 g from both sides, with 16 through one of 9 g, and squeezed light hooks out.
 LIGHTER, MOST_CLOSING = 0.07, 16.0
-#: A tool that lies on the table is left unsolved once it has been slower than this (m/s) for 0.4 s, until the fingers begin to close or something
-#: touches it: half of a step are contacts with the table that do nothing.
+#: A tool that lies on the table is left unsolved once it has been slower than this (m/s) for 0.4 s, until the fingers begin to close or
+#: something touches it: half of a step are contacts with the table that do nothing.
 LYING = 0.001
 #: An arm that has let go and come to the end of its motion is left to stand still, unsolved, after so many seconds.
 ASLEEP = 0.15
-#: So is one that holds its tool at the end, and the tool with it, where the pads bear no more than this share of what they hold and it has moved by
-#: no more than so many metres since it was looked at last: what is then done to the target (0.1 m/s to a ball of 0.1 kg, 0.3 m from the
-#: pads, are a fifth of what these hold) moves neither.
+#: So is one that holds its tool at the end, and the tool with it, where the pads bear no more than this share of what they hold and it has
+#: moved by no more than so many metres since it was looked at last: what is then done to the target (0.1 m/s to a ball of 0.1 kg, 0.3 m
+#: from the pads, are a fifth of what these hold) moves neither.
 BORNE, STILL = 0.5, 0.0001
 
 
@@ -79,8 +79,8 @@ class Held:
 
 @dataclass
 class _Closing:
-    """How the fingers close: ``press``, the force of each (N); seconds since they began, and for which they have stood still; metres between
-    them, step by step; the solver iterations of the tool before."""
+    """How the fingers close: ``press``, the force of each (N); seconds since they began, and for which they have stood still; metres
+    between them, step by step; the solver iterations of the tool before."""
 
     press: float
     seconds: float = 0.0
@@ -108,8 +108,8 @@ class ArmRun:
     the plan has it: real pads have turned it as they do, which those about its reconstruction would do once more.
     ``lag``: seconds by which the arm follows its command late; ``begin``: the moment of the trajectory at which a run
     with an empty hand begins.  ``rests``: the tool was seen to lie where it is, and does so until something touches it, whatever its shape
-    and its masses are taken to be.  ``offset``: the contact offset (m) of tool and target as soon as the tool is held; closing fingers need the
-    world's.  :attr:`stands_still`: the tool may be taken to stay where it is when the motion is over and it is held still.
+    and its masses are taken to be.  ``offset``: the contact offset (m) of tool and target as soon as the tool is held; closing fingers need
+    the world's.  :attr:`stands_still`: the tool may be taken to stay where it is when the motion is over and it is held still.
     """
 
     variant = "arm"
@@ -193,7 +193,8 @@ class ArmRun:
         self.world.let_go(TOOL)
 
     def _commands(self) -> NDArray[np.float64]:
-        """What the drives are told (N, J), step by step: ahead of the trajectory by what they lead by, and kept for the command's period."""
+        """What the drives are told (N, J), step by step: ahead of the trajectory by what they lead by, and kept for the command's
+        period."""
         led = self._q + self._arm.lead * self._qd
         if self.options.command_period > 0:
             # A command that stays is that of the middle of its time.
@@ -203,8 +204,8 @@ class ArmRun:
         return led
 
     def _begin(self, held: Held | None, begin: float) -> None:
-        """Put arm, fingers and a tool in the hand where the run begins: with the tool as it was ``held``, or as the plan has it in the hand,
-        or with an empty hand at the moment ``begin``."""
+        """Put arm, fingers and a tool in the hand where the run begins: with the tool as it was ``held``, or as the plan has it in the
+        hand, or with an empty hand at the moment ``begin``."""
         if self._in_hand:
             self._arm.place(self._q[0], min(self._motion.grasp_width + WIDER, self.robot.config.opening))
             self.world.component(TOOL).disable_gravity = True

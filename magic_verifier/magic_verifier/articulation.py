@@ -322,8 +322,8 @@ def _unloadable(robot: Description, error: Exception) -> MagicError:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """The engine's builder of an arm; for each link the bits of its filter and how many collision shapes it has; of the links that were left out which one
-    carries each, and where on it that is (4, 4)."""
+    """The engine's builder of an arm; for each link the bits of its filter and how many collision shapes it has; of the links that were
+    left out which one carries each, and where on it that is (4, 4)."""
 
     builder: Any
     groups: dict[str, int]
@@ -359,8 +359,9 @@ def _prepared(robot: Description) -> _Prepared:
 def _leave_out_bare(robot: Description, tree: ET.Element) -> dict[str, tuple[str, NDArray[np.float64]]]:
     """Take links out of a URDF that are no more than names of a place: fixed on another one, with neither mass nor shape.
 
-    The engine solves each link in every part of every step, whether or not a joint moves it.  Those that a moving joint hangs on stay, for parent
-    and child of a joint are never tested for contact, and so does what the fingers hang on.  Returns for each which link carries it, and where on it that is (4, 4).
+    The engine solves each link in every part of every step, whether or not a joint moves it.  Those that a moving joint hangs on stay, for
+    parent and child of a joint are never tested for contact, and so does what the fingers hang on.  Returns for each which link carries it,
+    and where on it that is (4, 4).
     """
     poses, parents = robot.poses({}), {name: joint.parent for name, joint in robot.joints.items()}
     above = {joint.child: name for name, joint in robot.joints.items()}

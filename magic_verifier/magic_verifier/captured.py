@@ -3,10 +3,9 @@
 :func:`lay_out` puts the true objects on the table: the target and its fixtures where
 the demonstration had them, each tool in a turn drawn by the seed, where nothing else
 stands, as it comes to rest.  :func:`capture` looks at them with the model of two
-D435 that smear depth past edges and over small holes (:data:`magic_core.sensor.SMEARED`), :func:`perceive` reconstructs them as the perception
-node does, and :func:`pair` says which reconstruction is which thing.  Everything after that
-(match, plan, verify) sees the reconstructions alone.  :func:`judge` carries the motion
-out once more, on the true meshes, with a friction and densities that the strategy
+D435 that smear depth past edges and over small holes (:data:`magic_core.sensor.SMEARED`), :func:`perceive` reconstructs them as the
+perception node does, and :func:`pair` says which reconstruction is which thing.  Everything after that (match, plan, verify) sees the
+reconstructions alone.  :func:`judge` carries the motion out once more, on the true meshes, with a friction and densities that the strategy
 does not know: what came of the motion, not what was thought of it.
 """
 

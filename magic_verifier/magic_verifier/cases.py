@@ -24,11 +24,12 @@ VARIANTS = ("fg", "arm", "fg_no_selection")
 #: only judges it).  All but the last get as many candidates as ``magic``, and the same planner and verifier.
 BASELINES = ("pca", "fpfh_icp", "curvature")
 METHODS = ("magic", *BASELINES, "dino", "no_feature_pca_patch", "no_two_step_curvature", "no_simulation_verification")
-#: What the tools of an evaluation are taken for: ``meshes`` as they are, ``images`` as two cameras see them (:mod:`magic_verifier.captured`).
+#: What the tools of an evaluation are taken for: ``meshes`` as they are, ``images`` as two cameras see them
+#: (:mod:`magic_verifier.captured`).
 SOURCES = ("meshes", "images")
 #: Sets that there are for every strategy, beside those of its own: the capital letters, and negative controls, which no method can do:
-#: the strategy's near misses, and plain things of the matcher's own control families (bars, discs, blades, bottles, ...).  Of these the first
-#: :data:`CONTROL_COUNT` that geometry forbids (:mod:`magic_verifier.feasibility`) are taken.
+#: the strategy's near misses, and plain things of the matcher's own control families (bars, discs, blades, bottles, ...).  Of these the
+#: first :data:`CONTROL_COUNT` that geometry forbids (:mod:`magic_verifier.feasibility`) are taken.
 SETS = ("alphabet", "controls")
 PLAIN = ("bar", "disc", "rod", "torch", "blade", "polygon", "bottle", "driver", "segment", "bent")
 CONTROL_COUNT, CONTROL_SEEDS = 12, 60_000
@@ -38,7 +39,8 @@ TARGET_SETS = {"mug_tree": tuple(range(3))}
 
 @dataclass(frozen=True)
 class Options:
-    """What an evaluation is run with; see the command's ``--help``.  ``task`` and ``like``: the name of a strategy's folder, or its path."""
+    """What an evaluation is run with; see the command's ``--help``.  ``task`` and ``like``: the name of a strategy's folder, or its
+    path."""
 
     task: str
     variant: str = "fg"

@@ -12,8 +12,9 @@ from magic_core import transforms
 class Place:
     """Where a thing stands on a table.
 
-    Its outline is the convex hull of its corners, seen along the table's normal.  What is turned about an axis that it is round about, as a can is,
-    stays in its outline, and nothing of it is taken to have moved; a bar that is turned about its middle leaves its outline by up to half its length.
+    Its outline is the convex hull of its corners, seen along the table's normal.  What is turned about an axis that it is round about, as a
+    can is, stays in its outline, and nothing of it is taken to have moved; a bar that is turned about its middle leaves its outline by up
+    to half its length.
     """
 
     def __init__(
@@ -25,8 +26,8 @@ class Place:
         self._outline = ConvexHull(transforms.apply(pose, corners) @ across.T).equations
 
     def left_by(self, pose: NDArray[np.float64], middle: NDArray[np.float64]) -> float:
-        """Metres along the table by which it has left its place, now that ``pose`` and ``middle`` are these: the way of its middle, or how far it
-        reaches out of its old outline, whichever is more."""
+        """Metres along the table by which it has left its place, now that ``pose`` and ``middle`` are these: the way of its middle, or how
+        far it reaches out of its old outline, whichever is more."""
         seen = transforms.apply(pose, self._corners) @ self._across.T
         beyond = seen @ self._outline[:, :2].T + self._outline[:, 2]
         # Not a number where one of them is none.

@@ -289,7 +289,8 @@ def _why_not_pulled(mesh: Mesh, views: list[CanonicalView], target: SceneObject)
 
 
 def _why_not_hung(mesh: Mesh, views: list[CanonicalView], radius: float, drop: float) -> str:
-    """Why a tool that is seen in these views does not hang on a rod of a radius, m, or not with its middle no more than ``drop`` m below the rod's top; empty where it does."""
+    """Why a tool that is seen in these views does not hang on a rod of a radius, m, or not with its middle no more than ``drop`` m below
+    the rod's top; empty where it does."""
     solid = mesh.to_trimesh()
     weight = np.stack([solid.center_mass if solid.is_volume else solid.centroid, mesh.bounds.mean(axis=0)])
     lower = False

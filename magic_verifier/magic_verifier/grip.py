@@ -34,9 +34,9 @@ SOFTNESS, LEAST = 0.001, 0.003
 #: Shear stiffness (N/m) of two pads of 18 mm square and 1.5 mm thick, of rubber with a shear modulus of 1 MPa: 2 G A / t.  Across the
 #: pads they are stiffer still.  Their damping time (s).
 STIFFNESS, RELAXATION = 4e5, 0.005
-#: Along the pads the fingers give way as well (N/m; s), 2 mm at what pads hold.  Pads that alone did would be read wrongly: the engine gives a
-#: whole step's weight to a tool at the step's beginning, which leaves the grip of a long light one displaced at its end by more than its load
-#: makes.  It was 0.73 of what pads hold of a spoon of 50 g that asks for 0.29 of it, and is 0.36.
+#: Along the pads the fingers give way as well (N/m; s), 2 mm at what pads hold.  Pads that alone did would be read wrongly: the engine
+#: gives a whole step's weight to a tool at the step's beginning, which leaves the grip of a long light one displaced at its end by more
+#: than its load makes.  It was 0.73 of what pads hold of a spoon of 50 g that asks for 0.29 of it, and is 0.36.
 SHEAR, SHEAR_RELAXATION = 5e4, 0.01
 
 
@@ -94,8 +94,8 @@ def patch_of(touches: list[Touch], world_from_tcp: Array, closing: int, friction
 
 
 def _wedged(normals: Array, towards: Array, within: float) -> NDArray[np.bool_]:
-    """Which of the touches of one pad, with these normals (N, 3), press together ``towards`` the other one (3,), no further from it than ``within``
-    (a cosine): the two edges of a pad in a hollow each push aside what they touch, and both hold it.  None where they do not."""
+    """Which of the touches of one pad, with these normals (N, 3), press together ``towards`` the other one (3,), no further from it than
+    ``within`` (a cosine): the two edges of a pad in a hollow each push aside what they touch, and both hold it.  None where they do not."""
     facing = normals @ towards > 0
     if not facing.any():
         return facing

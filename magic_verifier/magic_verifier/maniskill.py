@@ -6,8 +6,8 @@ and cube become scene objects by their collision shapes, the matcher looks for t
 verifier work as for any other scene, and what the verifier passes is sent to the environment as joint targets.  Whether it
 succeeded says the environment.
 
-ManiSkill is not installed with the project (``requirements-maniskill.txt``) and is imported by :func:`environment` only, which leaves out all
-that is to be drawn: neither a renderer nor a graphics card is needed.
+ManiSkill is not installed with the project (``requirements-maniskill.txt``) and is imported by :func:`environment` only, which leaves out
+all that is to be drawn: neither a renderer nor a graphics card is needed.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ BEYOND = 0.03
 DRIFT = 1.0
 #: How much of the pull may be gone before a cube that has some play is taken along (m).
 PLAY = 0.01
-#: The pull need not point at the arm: turns of its direction about the vertical (rad), in order of trial.  First those to which the tool, as
-#: it lies, is brought soonest.
+#: The pull need not point at the arm: turns of its direction about the vertical (rad), in order of trial.  First those to which the tool,
+#: as it lies, is brought soonest.
 TURNS = tuple(np.deg2rad((-30.0, -15.0, -45.0, 0.0, 30.0, 15.0)))
 #: The environment gives 5 s for what the strategy does in 15: its clock may go so many times faster, and of the arm's limits more is
 #: used than is asked of a real one.  The fingers have closed after so many seconds.
@@ -76,7 +76,8 @@ AWAY = 0.045
 GRIP_SHARE = 1.4
 #: Such a further box is smaller by this on each side (m).
 CORE = 0.0005
-#: Of what rollouts draw, what the environment tells exactly is drawn by a little only, so that no motion passes that hangs on the last digit.
+#: Of what rollouts draw, what the environment tells exactly is drawn by a little only, so that no motion passes that hangs on the last
+#: digit.
 WIDTHS = {"friction": 0.1, "tool_density": 0.05, "target_density": 0.05, "centre_of_mass": 0.01, "grip_force": 0.05, "stiffness": 0.05}
 #: More rollouts than usual have to show that a motion succeeds: whether the tool creeps between the fingers, and how far, is chance.
 #: A cube that lies against the tool is pushed a little as that is lifted, which nobody forbids.
@@ -213,7 +214,8 @@ def pull_for(middle: Array, turn: float, near: float = NEAR) -> tuple[Array, flo
 
 
 def posed(strategy: Strategy, given: Episode, turn: float) -> Strategy:
-    """The strategy as this episode asks for it: direction and length of the pull, the physics; ``GOAL_NOT_REACHED`` where no pull that way helps."""
+    """The strategy as this episode asks for it: direction and length of the pull, the physics; ``GOAL_NOT_REACHED`` where no pull that way
+    helps."""
     middle = given.target.world_from_object[:3, 3]
     direction, least = pull_for(middle, turn)
     _, whole = pull_for(middle, turn, NEAR - BEYOND)

@@ -27,7 +27,8 @@ from magic_verifier.verification import Proposal, Verdict, verify_proposal
 from magic_verifier.workers import simulating
 
 NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
-#: Feedback is for people: each phase once, and else no more often than so, s.  A rollout takes a fraction of the time that the motion itself takes.
+#: Feedback is for people: each phase once, and else no more often than so, s.  A rollout takes a fraction of the time that the motion
+#: itself takes.
 FEEDBACK_PERIOD = 0.1
 #: Goals that end so were not judged.
 UNJUDGED = (Code.CANCELED, Code.INTERNAL, Code.BAD_REQUEST, Code.UNKNOWN_STRATEGY, Code.BAD_STRATEGY)

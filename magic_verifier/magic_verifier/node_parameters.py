@@ -22,8 +22,10 @@ MAX_REPETITIONS = 1000
 class Parameters:
     """What the node is told.
 
-    strategies: folder of the strategies, empty: the installed ones.  timeout: s for a goal that names none.  settings: of the simulation, by variant.
-    rollouts: at most, of a goal that names no number.  spreads: what rollouts draw.  workers: processes that simulate, this one among them.  limits: what a motion may do.
+    strategies: folder of the strategies, empty: the installed ones.  timeout: s for a goal that names none.  settings: of the simulation,
+    by variant.
+    rollouts: at most, of a goal that names no number.  spreads: what rollouts draw.  workers: processes that simulate, this one among them.
+    limits: what a motion may do.
     arm: the arm's controller and fingers.  film_frames: of a film strip.
     """
 

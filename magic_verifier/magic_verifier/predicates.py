@@ -110,8 +110,8 @@ class Simulated:
         self._before = self.run.time, {name: (world.centre_of_mass(name), world.pose(name)) for name in moved}
 
     def speeds(self, name: str) -> tuple[float, float]:
-        """No faster than things moved since :meth:`note`: of what is held between contacts that press against each other the engine tells a velocity
-        (0.5 rad/s of a V on a rod) with which it does not move."""
+        """No faster than things moved since :meth:`note`: of what is held between contacts that press against each other the engine tells a
+        velocity (0.5 rad/s of a V on a rod) with which it does not move."""
         world = self.run.world
         speed, turning = float(np.linalg.norm(world.velocity(name))), float(np.linalg.norm(world.turning(name)))
         if self._before is not None and name in self._before[1] and (seconds := self.run.time - self._before[0]) > 0:

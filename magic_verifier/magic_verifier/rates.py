@@ -44,7 +44,8 @@ def passes(successes: int, count: int, required: float, z: float = Z95) -> bool:
 
 def fewest(required: float, tried: int = 0) -> int:
     """With how many rollouts, none of which fails, a success rate is shown to be no lower than required, after so many motions that were
-    simulated for the same task before: given to :func:`magic_verifier.verification.verify_proposal` as the most there may be, one that fails is a no."""
+    simulated for the same task before: given to :func:`magic_verifier.verification.verify_proposal` as the most there may be, one that
+    fails is a no."""
     count = 1
     while not passes(count, count, required, deviations(tried)):
         count += 1

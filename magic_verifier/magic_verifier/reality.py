@@ -37,7 +37,8 @@ from magic_verifier.simulation import DYNAMIC, Settings, World
 CHOSEN_ON = 4
 #: The corners of a cube of half edge 1.
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-#: Directions (7, 3) to the points that stand for a rounded corner of an octant: along its axes, so that the faces stay flat, and between them.
+#: Directions (7, 3) to the points that stand for a rounded corner of an octant: along its axes, so that the faces stay flat, and between
+#: them.
 ROUND = np.array([d / np.linalg.norm(d) for d in itertools.product((0.0, 1.0), repeat=3) if any(d)])
 #: A rollout ends when the cube has been slower than this (m/s, rad/s) for REST_STEPS steps, else after LONGEST seconds.
 REST_SPEED, REST_SPIN, REST_STEPS, LONGEST = 0.02, 0.2, 24, 3.0
@@ -85,7 +86,8 @@ class Setting:
 
 @dataclass(frozen=True)
 class Toss:
-    """One toss: state at its first row (position (3,) m, velocity (3,) m/s, spin (3,) rad/s, all in the world) and the face that ended up."""
+    """One toss: state at its first row (position (3,) m, velocity (3,) m/s, spin (3,) rad/s, all in the world) and the face that ended
+    up."""
 
     number: int
     position: NDArray[np.float64]
@@ -151,7 +153,8 @@ def read(folder: Path, setting: Setting) -> list[Toss]:
 def as_toss(number: int, rows: NDArray[np.float64], setting: Setting) -> Toss:
     """A toss from its rows (T, 13): the state at the first row, fitted to all rows of free flight from there on.
 
-    In free flight positions are a parabola of known curvature, and a cube, whose principal moments of inertia are equal, turns at a constant rate.
+    In free flight positions are a parabola of known curvature, and a cube, whose principal moments of inertia are equal, turns at a
+    constant rate.
     """
     half = setting.edge / 2
     positions = rows[:, :3] * half

@@ -101,10 +101,11 @@ class Task:
     """Everything that a rollout is a function of, beside its number: it may be sent to another process.
 
     ``eyes``: how well tool and target are known, and by how much these widths are to be multiplied; ``start``: the moment of the
-    motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``overlap``: how deep the tool that is led goes into
-    things as it was planned, m, where that is known; ``longer``: how many times as long their
-    steps are; ``offset``: the contact offset of their worlds, and of tool and target in the arm's scene as given as soon as it holds the tool, m
-    (``None``: that of the scene as given); ``shares``: how much of what is drawn of the tool's surface its corners are shifted by (:func:`magic_verifier.uncertainty.shares`).
+    motion at which drawn rollouts begin; ``held``: the tool in the arm's hand at that moment; ``overlap``: how deep the tool that is led
+    goes into things as it was planned, m, where that is known; ``longer``: how many times as long their steps are; ``offset``: the contact
+    offset of their worlds, and of tool and target in the arm's scene as given as soon as it holds the tool, m (``None``: that of the scene
+    as given); ``shares``: how much of what is drawn of the tool's surface its corners are shifted by
+    (:func:`magic_verifier.uncertainty.shares`).
     """
 
     strategy: Strategy
@@ -151,7 +152,8 @@ class Outcome:
 
 
 class Stop:
-    """When a simulation is to end before its time: at a deadline (of ``time.monotonic``) or a request to cancel; never where there is neither."""
+    """When a simulation is to end before its time: at a deadline (of ``time.monotonic``) or a request to cancel; never where there is
+    neither."""
 
     def __init__(self, deadline: float | None = None, cancel: Callable[[], bool] | None = None) -> None:
         self._deadline = deadline
@@ -174,7 +176,8 @@ def rollout(
     begin: Callable[[Task], None] | None = None,
 ) -> Outcome:
     """One rollout, a function of ``task`` and ``index`` alone.  ``begin`` hears of the first one, as soon as it is known, the task of the
-    others: how the arm has the tool in its hand at the task's start, or how deep the tool goes into things.  Raises for cancel and deadline only."""
+    others: how the arm has the tool in its hand at the task's start, or how deep the tool goes into things.  Raises for cancel and deadline
+    only."""
     this = _Rollout(task, index, stop or Stop(), progress, record, begin)
     try:
         judgement = this.judged()
@@ -345,8 +348,8 @@ def _refuse_intrusions(
 ) -> dict[str, float]:
     """Raise where the planned tool goes through static things; returns what was measured.
 
-    Where that is not to be ``measured``, for it is shown to nobody, what is allowed in any case need not be found; ``planned``: what was of the
-    tool as it is thought to be, m.
+    Where that is not to be ``measured``, for it is shown to nobody, what is allowed in any case need not be found; ``planned``: what was of
+    the tool as it is thought to be, m.
     """
     loose = {o.id for o in run.setup.obstacles if o.loose}
     harmless = min(limits.overlap, limits.press, limits.shove if loose else np.inf)
@@ -417,7 +420,8 @@ def _refuse_early_touch(run: Any, watched: list[str], limits: Limits) -> None:
 
 
 class _Others:
-    """Refuses a motion that moves loose things which have no part in it.  Each stands where it was seen until something that moves touches it."""
+    """Refuses a motion that moves loose things which have no part in it.  Each stands where it was seen until something that moves touches
+    it."""
 
     def __init__(self, run: Any, limits: Limits) -> None:
         self._run, self._limits = run, limits
@@ -530,7 +534,8 @@ def along_table(moved: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[ND
 
 
 def standing(drawn: Body, seen: Body, tool_from_held: NDArray[np.float64], table: NDArray[np.float64]) -> Body:
-    """A tool of a drawn shape on the table (4,), displaced from where it was ``seen`` along the table and about the vertical alone, by what is drawn.
+    """A tool of a drawn shape on the table (4,), displaced from where it was ``seen`` along the table and about the vertical alone, by what
+    is drawn.
 
     It was seen to stand: no height, tilt or underside is drawn with which it would not.  What is drawn of heights fades out towards
     the table, over the lower half of the tool; without that mugs toppled that stood as they were seen to stand.

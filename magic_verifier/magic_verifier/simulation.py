@@ -210,7 +210,8 @@ class _Piece:
         return cls(transforms.apply(world_from_shape, corners), np.column_stack([normals, offsets]))
 
     def ends(self, points: NDArray[np.float64], along: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How far (P,) along a direction from each of the points (P, 3) its line enters and leaves; what it misses leaves before it enters."""
+        """How far (P,) along a direction from each of the points (P, 3) its line enters and leaves; what it misses leaves before it
+        enters."""
         slope = self.planes[:, :3] @ along
         height = points @ self.planes[:, :3].T + self.planes[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -227,7 +228,8 @@ def _planes(corners: bytes) -> NDArray[np.float64]:
 
 
 def _facing(upper: _Piece, lower: _Piece, along: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (P, 3) of the lower of two pieces under the upper one, on a grid across the direction up, and the gaps (P,) between them there."""
+    """Points (P, 3) of the lower of two pieces under the upper one, on a grid across the direction up, and the gaps (P,) between them
+    there."""
     side = transforms.unit(np.cross(along, np.eye(3)[int(np.abs(along).argmin())]))
     across = np.stack([side, np.cross(along, side)])
     flat = [piece.corners @ across.T for piece in (upper, lower)]
@@ -467,7 +469,8 @@ class World:
         self._bodies[name].linear_damping = self._bodies[name].angular_damping = float(damping)
 
     def doze(self, name: str, speed: float) -> None:
-        """Let the engine leave a body where it is once it has been slower than this (m/s) for 0.4 s, until something touches it; 0: never."""
+        """Let the engine leave a body where it is once it has been slower than this (m/s) for 0.4 s, until something touches it; 0:
+        never."""
         self._bodies[name].sleep_threshold = speed**2 / 2
         if speed == 0 and not self._bodies[name].kinematic:
             self._bodies[name].wake_up()
@@ -536,8 +539,8 @@ class World:
         return result
 
     def pressed(self, first: str, second: str, depth: float, along: NDArray[np.float64]) -> list[Touch]:
-        """Where two bodies touch, one of which gives way by ``depth`` metres ``along`` a unit direction (3,): the contact points of the last step, and
-        what else of the pieces that touch is no farther apart along it, on a grid across it, without an impulse.
+        """Where two bodies touch, one of which gives way by ``depth`` metres ``along`` a unit direction (3,): the contact points of the
+        last step, and what else of the pieces that touch is no farther apart along it, on a grid across it, without an impulse.
 
         Rigid faces a little askew touch along an edge, or at a corner, and nothing else of them is among the engine's points.
         """
@@ -567,7 +570,8 @@ class World:
         return max([0.0, *(-point.separation for contact in self._between(first, second) for point in contact.points)])
 
     def force(self, first: str, second: str) -> float:
-        """With how many newtons two bodies pressed on each other in the last step: all their contact points, whichever way each of them goes."""
+        """With how many newtons two bodies pressed on each other in the last step: all their contact points, whichever way each of them
+        goes."""
         return sum(math.hypot(*p.impulse.tolist()) for contact in self._between(first, second) for p in contact.points) / self.timestep
 
     def _between(self, first: str, second: str) -> list[Any]:

@@ -3,7 +3,8 @@
 A table is a grid of cells; a cell is a set of cases under one :class:`Options`, the paper's figure beside ours.  Cells that several
 tables share are run once.  Each finished case is a line of ``cases.jsonl`` in the output folder, so that the command goes on where it
 stopped, and a short run is the beginning of the long one: of each cell the cases are taken in an order drawn by the seed.  What is
-written from them (``tables.txt``, ``tables.csv``, ``tables.html``) is a function of these lines alone, and a case is one of its options, its name and the
+written from them (``tables.txt``, ``tables.csv``, ``tables.html``) is a function of these lines alone, and a case is one of its options,
+its name and the
 seed: the number of jobs changes the time, not the result.
 """
 
@@ -96,7 +97,8 @@ NO_WEIGHTS = "no weights at hand"
 class Cell:
     """One figure: where it stands, what is run for it (nothing, for the reason given in ``missing``), and what the paper says.
 
-    ``paper``: percent; ``paper_seconds`` a problem; ``one_each``: each tool with one of the targets, in turn; quick: cases of the short run.
+    ``paper``: percent; ``paper_seconds`` a problem; ``one_each``: each tool with one of the targets, in turn; quick: cases of the short
+    run.
     """
 
     table: str

@@ -24,9 +24,11 @@ PICTURES, PICTURE_WIDTH = 12, 420
 
 @dataclass(frozen=True)
 class Figure:
-    """What came of a cell: counts without the cases that geometry forbids, which stand apart, and the median of the seconds a problem: a machine may have been suspended in one.
+    """What came of a cell: counts without the cases that geometry forbids, which stand apart, and the median of the seconds a problem: a
+    machine may have been suspended in one.
 
-    ``wanted`` and ``done``: cases asked for and finished; ``missing``: why nothing was run; ``truth``: the four counts of :func:`magic_verifier.evaluate.truths`, for cases from images.
+    ``wanted`` and ``done``: cases asked for and finished; ``missing``: why nothing was run; ``truth``: the four counts of
+    :func:`magic_verifier.evaluate.truths`, for cases from images.
     """
 
     table: str

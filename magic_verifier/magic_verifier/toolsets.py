@@ -11,8 +11,9 @@
           unseen: {each: ["caliper:{}", "hanger:{}"], first: 50000, count: 60, paired: true}
         near_misses: [letter:60001,glyph=I]          # the first of the set `controls`
 
-Of ``each`` the entries come in turn, with numbers from ``first`` up; another seed of the evaluation begins ``a_seed`` (``count``) further.  A
-``paired`` set gives each tool one of the targets, in turn, others all of them.  How tools and targets are named: :mod:`magic_verifier.cases`.
+Of ``each`` the entries come in turn, with numbers from ``first`` up; another seed of the evaluation begins ``a_seed`` (``count``) further.
+A ``paired`` set gives each tool one of the targets, in turn, others all of them.  How tools and targets are named:
+:mod:`magic_verifier.cases`.
 """
 
 from __future__ import annotations

@@ -278,7 +278,8 @@ def seen_through(mesh: Mesh, world_from_tool: Array, frame: RgbdFrame, seed: int
 
 
 def check_seen(what: str, mesh: Mesh, times: Array, world_from_tool: Array, frames: list[RgbdFrame]) -> int:
-    """Refuse a track, times (T,) and poses (T, 4, 4) of the tool, that leads it to where the cameras see through it: it is not fixed to the tool, or not in this world.
+    """Refuse a track, times (T,) and poses (T, 4, 4) of the tool, that leads it to where the cameras see through it: it is not fixed to the
+    tool, or not in this world.
 
     Pictures in which the tool moves fast are left out, stamps and exposure differ too much there.  Raises BAD_MOTION; returns the
     number of pictures that told anything.

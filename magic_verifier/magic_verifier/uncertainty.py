@@ -30,12 +30,13 @@ FILE = Path(__file__).with_name("uncertainty.yaml")
 KINDS = ("normal", "factor", "uniform")
 #: Normals are cut at so many widths.
 CUT = 2.0
-#: Waves that make up a smooth error of a surface, and the shortest, m, but no longer than this part of the object's largest extent, which is the longest: whatever
-#: the size of a thing, the errors of a reconstruction agree over some 20 to 50 mm and no farther (24 tools of 80 to 420 mm); longer ones are in place and size.
+#: Waves that make up a smooth error of a surface, and the shortest, m, but no longer than this part of the object's largest extent, which
+#: is the longest: whatever the size of a thing, the errors of a reconstruction agree over some 20 to 50 mm and no farther (24 tools of 80
+#: to 420 mm); longer ones are in place and size.
 WAVES = 3
 SHORTEST, SHORTEST_PART = 0.05, 0.4
-#: Within so many metres of a point that a camera saw a surface is as well known as the file has it, and from so many on it is known no better for it.  Of 76 seen tools the
-#: surface was off by 1.1 to 1.8 mm within 5 mm of one, whether 1 mm or 4 was stated of all of it.
+#: Within so many metres of a point that a camera saw a surface is as well known as the file has it, and from so many on it is known no
+#: better for it.  Of 76 seen tools the surface was off by 1.1 to 1.8 mm within 5 mm of one, whether 1 mm or 4 was stated of all of it.
 SEEN, UNSEEN = 0.005, 0.015
 #: A wall keeps at least this share of its thickness.
 THINNEST = 0.4
@@ -151,7 +152,8 @@ def _read(path: Path, _changed: int) -> Uncertainty:
 @dataclass(frozen=True)
 class ShapeError:
     """What is wrong with an object's shape: size (3,) m of its extents, thickness m of its walls, and waves that shift its surface:
-    amplitudes (K, 3) m, directions (K, 3), how long they are (K,) between the shortest, 0, and the longest that there are, 1, phases (K,)."""
+    amplitudes (K, 3) m, directions (K, 3), how long they are (K,) between the shortest, 0, and the longest that there are, 1, phases
+    (K,)."""
 
     size: Array
     thickness: float
@@ -161,7 +163,8 @@ class ShapeError:
     phases: Array
 
     def applied(self, body: Body, shares: Sequence[Array] | None = None) -> Body:
-        """The body as it then is; a ball stays a ball, of another size.  shares: for each hull (N,), the shares of the waves that its corners are shifted by."""
+        """The body as it then is; a ball stays a ball, of another size.  shares: for each hull (N,), the shares of the waves that its
+        corners are shifted by."""
         corners = body.corners
         low, high = corners.min(axis=0), corners.max(axis=0)
         middle, extent = (low + high) / 2, high - low
@@ -280,7 +283,8 @@ def draw(uncertainty: Uncertainty, tool: tuple[Eyes, float], target: tuple[Eyes,
 
 
 def shares(item: SceneObject, wider: float, hulls: Sequence[Array]) -> tuple[Array, ...] | None:
-    """For each hull of an object, in its frame, the shares (N,) of the drawn waves that its corners are shifted by; ``None``: all by all of them.
+    """For each hull of an object, in its frame, the shares (N,) of the drawn waves that its corners are shifted by; ``None``: all by all of
+    them.
 
     What a surface is off by beyond what the file has is where no camera saw it, and not near the points that one saw.
     """

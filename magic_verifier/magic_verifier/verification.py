@@ -49,9 +49,9 @@ ROLLOUTS = 24
 LEAD, NEAR = 0.1, 0.03
 #: A drawn rollout takes steps so many times as long as the scene as given: the longest for which the tool is slow enough (:func:`_longer`).
 LONGER = {"fg": (4.0, 2.0), "arm": (2.0,)}
-#: Where the arm moves a free ball contacts are solved ahead of a touch as far as the tool at its fastest, or the ball in a fall, comes in a step, and no less than
-#: twice this (m), what goals take for a touch: every piece of a bowl that its ball is near to costs, touched or not.  Faces that meet faces find
-#: fewer of their points so, and a cylinder that hardly stays in its hook may do otherwise (1 of 26 draws).
+#: Where the arm moves a free ball contacts are solved ahead of a touch as far as the tool at its fastest, or the ball in a fall, comes in a
+#: step, and no less than twice this (m), what goals take for a touch: every piece of a bowl that its ball is near to costs, touched or not.
+#: Faces that meet faces find fewer of their points so, and a cylinder that hardly stays in its hook may do otherwise (1 of 26 draws).
 LEAST_OFFSET = goals.TOUCH / 2
 #: A parameter is named as the cause of failures if as clean a separation by any of the parameters had a chance of less than this.
 BY_CHANCE = 0.05
@@ -84,9 +84,9 @@ class Proposal:
 class Verdict:
     """The answer: code OK exactly where success.
 
-    success_rate over the rollouts with its interval (rate_low, rate_high), 95 % or what :func:`magic_verifier.rates.level` says; failures: reasons of the failing ones with their
-    counts; runs: what each rollout came to, the scene as given first; metrics and recording of the judged run (the first one that
-    failed, else the first); simulated seconds over all runs, seconds of wall time.
+    success_rate over the rollouts with its interval (rate_low, rate_high), 95 % or what :func:`magic_verifier.rates.level` says; failures:
+    reasons of the failing ones with their counts; runs: what each rollout came to, the scene as given first; metrics and recording of the
+    judged run (the first one that failed, else the first); simulated seconds over all runs, seconds of wall time.
     """
 
     success: bool
@@ -234,8 +234,8 @@ def _longer(setup: Setup, plan: MotionPlan, start: float) -> float:
 
 
 def _offset(setup: Setup, plan: MotionPlan, start: float, longer: float) -> float:
-    """The contact offset (m) of drawn rollouts: half of how far the tool, or a ball that begins to fall, comes in one of their steps, between
-    :data:`LEAST_OFFSET` and that of the scene as given."""
+    """The contact offset (m) of drawn rollouts: half of how far the tool, or a ball that begins to fall, comes in one of their steps,
+    between :data:`LEAST_OFFSET` and that of the scene as given."""
     settings = setup.settings
     step = longer / settings.frequency
     come = max(speed(plan.tool_motion, setup.tool, start) * step, settings.gravity * step**2)
@@ -327,7 +327,8 @@ class _Elsewhere:
             self.fill(end)
 
     def fill(self, end: int) -> None:
-        """Give out what can be: one more than there are processes, so that none waits for this one to look round, but not the last one that is
+        """Give out what can be: one more than there are processes, so that none waits for this one to look round, but not the last one that
+        is
         left: this process would wait for it, while another is still at what it was given before."""
         while self._pool is not None and self._packed is not None and len(self._waiting) < self._most(end):
             try:

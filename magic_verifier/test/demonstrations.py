@@ -83,7 +83,8 @@ def pressing():
 
 
 def shunting():
-    """A block is pushed away by the outside of a hook's tip, then, the tool lifted over it, pulled nearer by its inside; the target's way of each."""
+    """A block is pushed away by the outside of a hook's tip, then, the tool lifted over it, pulled nearer by its inside; the target's way
+    of each."""
     tool = scenes.item(
         "tool", [scenes.block((-0.25, 0.0), (-0.01, 0.01), (0.0, 0.02)), scenes.block((-0.02, 0.0), (0.01, 0.08), (0.0, 0.02))], LYING
     )

@@ -1,4 +1,5 @@
-"""Cases seen by cameras: the layout is fair, reconstructions belong to the right things, and the truth is judged apart from what was seen."""
+"""Cases seen by cameras: the layout is fair, reconstructions belong to the right things, and the truth is judged apart from what was
+seen."""
 
 import json
 from dataclasses import replace

@@ -198,8 +198,8 @@ def run_of(options, speed=0.0, grasp_time=0.1):
 
 
 def closing_on(block, physics, rests=False, grasp_time=0.2, offset=None):
-    """The Panda at home, its hand straight down to a stand 20 mm below the tip, closing after so many seconds on a block (its ranges about the tip,
-    y along the fingers' way, z up); also where the block is put."""
+    """The Panda at home, its hand straight down to a stand 20 mm below the tip, closing after so many seconds on a block (its ranges about
+    the tip, y along the fingers' way, z up); also where the block is put."""
     robot = Description()
     home = np.asarray(robot.config.home, dtype=float)
     tcp = robot.forward(home)[0]
@@ -299,7 +299,8 @@ def test_contacts_are_solved_less_far_ahead_once_the_tool_is_held():
 
 @pytest.mark.parametrize("ends", [-0.3, -0.04])
 def test_what_lies_still_is_not_solved_until_the_fingers_close(ends, monkeypatch):
-    """A bar that lies on its stand, and one that reaches beyond it and tips; fingers close on the first as on one that was solved all the time."""
+    """A bar that lies on its stand, and one that reaches beyond it and tips; fingers close on the first as on one that was solved all the
+    time."""
     held = []
     for speed in (LYING, 0.0):
         monkeypatch.setattr(arm_simulation, "LYING", speed)

@@ -1,4 +1,5 @@
-"""What nobody should send to the verifier node: each goal is answered with a code and a sentence, in bounded time, and the node lives on."""
+"""What nobody should send to the verifier node: each goal is answered with a code and a sentence, in bounded time, and the node lives
+on."""
 
 import os
 import threading

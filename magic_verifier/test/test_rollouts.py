@@ -218,7 +218,8 @@ def test_how_often_a_motion_is_verified_is_what_the_documentation_says(rate, ver
 
 
 def test_one_of_many_that_often_fail_is_not_verified_by_chance():
-    """Of eight motions that each fail in 3 of 10 cases one is verified in two runs of five at the same level, in one of eight at their own."""
+    """Of eight motions that each fail in 3 of 10 cases one is verified in two runs of five at the same level, in one of eight at their
+    own."""
     required = Limits().required_rate
     alike, held = 1.0, 1.0
     for tried in range(8):
@@ -294,7 +295,8 @@ def test_a_shape_error_does_what_it_says():
 
 
 def test_one_seen_shape_is_off_by_more_than_another():
-    """By how much surfaces of seen tools were off, in shares of what was stated: 0.50, 0.64 and 0.83 in the quarters, and five of six by less than 0.93."""
+    """By how much surfaces of seen tools were off, in shares of what was stated: 0.50, 0.64 and 0.83 in the quarters, and five of six by
+    less than 0.93."""
     spreads = uncertainty.read()
 
     def off(eyes):
@@ -310,7 +312,8 @@ def test_one_seen_shape_is_off_by_more_than_another():
 
 
 def test_where_a_camera_saw_a_surface_it_is_known_best():
-    """The back of a cup that nobody saw made the rim, which both cameras saw to a millimetre, corrugated by three: drawn fingers slipped off it."""
+    """The back of a cup that nobody saw made the rim, which both cameras saw to a millimetre, corrugated by three: drawn fingers slipped
+    off it."""
     spreads = uncertainty.read()
     strategy, tool, target, *obstacles, plan = scenes.hooking("L")
     top = tool.mesh.bounds[1, 2]

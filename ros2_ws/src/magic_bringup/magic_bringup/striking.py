@@ -2,7 +2,8 @@
 
 hammering  a peg lies in a slot and resists.  A mallet is swung in the plane of the table, about a hand and forearm's length behind its
            handle, and strikes the peg's end with its face.  The hand holds it loosely: from just before the blow the tool flies by
-           its own momentum (phase ``strike``), so that what drives the peg is the tool's mass, where it is and how it hits.  Goal ``drive``.
+           its own momentum (phase ``strike``), so that what drives the peg is the tool's mass, where it is and how it hits.  Goal
+           ``drive``.
 sweeping   several cylinders stand side by side; the mallet's handle, lying, sweeps them away from the robot.  Goal ``sweep``.
 """
 

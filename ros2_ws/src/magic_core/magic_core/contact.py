@@ -75,7 +75,8 @@ class ContactCandidate:
 
     Attributes
     ----------
-    rotation, flipped : the in-plane turn of the reference view (rad, 0..2 pi), and whether it was mirrored, under which the reference looked
+    rotation, flipped : the in-plane turn of the reference view (rad, 0..2 pi), and whether it was mirrored, under which the reference
+    looked
         most like the new tool.
     s_dino, s_curv, score : the global score, the local one, and their combination.
     tool_from_reference : (4, 4), carries the reference tool's frame onto the new tool's frame by aligning the contact frames.

@@ -1,4 +1,5 @@
-"""Who serves a service and who waits for its answers, by DDS endpoint: a server that was restarted is another one than before.  Whether a bag is played."""
+"""Who serves a service and who waits for its answers, by DDS endpoint: a server that was restarted is another one than before.  Whether a
+bag is played."""
 
 from __future__ import annotations
 

@@ -16,7 +16,8 @@ places, at once or one after the other, each is an entry of a list beside them, 
     contacts:
     - name: back
       tool: {pixel: [372.6, 168.8], normal: [1.0, 0.0], radius: .inf, concave: false, scale: 0.06}
-      target: {pixel: [191.5, 316.0], normal: [0.0, 1.0], radius: .inf, concave: false, scale: 0.02, normal_in_world: [-1.0, 0.0, 0.0], outline: outer}
+      target: {pixel: [191.5, 316.0], normal: [0.0, 1.0], radius: .inf, concave: false, scale: 0.02, normal_in_world: [-1.0, 0.0, 0.0],
+      outline: outer}
 
 Under ``target``, ``turned_by: 40`` allows motion and goal to be turned by up to 40 degrees about the
 vertical where other things stand in the way.

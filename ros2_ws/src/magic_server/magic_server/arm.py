@@ -46,7 +46,8 @@ class ArmSettings:
     effort : N of the gripper; 0: the driver's own.
     grasp_tolerance : m that the opening of the closed fingers may differ from the planned one.
     presence : s to wait for a server.
-    gripper_command, gripper_joint : the gripper's action, of :mod:`magic_server.gripper`, and the joint's name, which ParallelGripperCommand
+    gripper_command, gripper_joint : the gripper's action, of :mod:`magic_server.gripper`, and the joint's name, which
+    ParallelGripperCommand
         asks for.
     """
 

@@ -63,8 +63,8 @@ GRASP_ONLY = frozenset({Code.GRASP_SLIPPED})
 
 @dataclass(frozen=True)
 class Request:
-    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`, :mod:`magic_core.open_words`) or empty: the matcher chooses.
-    timeout in seconds for everything.  tool_mass, target_mass: kg, 0 where nobody knows."""
+    """One run.  tool_id and target_id are ids, names in words (:mod:`magic_core.naming`, :mod:`magic_core.open_words`) or empty: the
+    matcher chooses. timeout in seconds for everything.  tool_mass, target_mass: kg, 0 where nobody knows."""
 
     strategy: str
     variant: str
@@ -114,7 +114,8 @@ class Trial:
 
 @dataclass(frozen=True)
 class Planned:
-    """What the planner answered; ``plan`` counts only where the code is OK.  state_known: whether it begins where the arm was heard to be; else at home."""
+    """What the planner answered; ``plan`` counts only where the code is OK.  state_known: whether it begins where the arm was heard to be;
+    else at home."""
 
     code: Code
     message: str = ""
@@ -163,8 +164,8 @@ class Progress:
 class Outcome:
     """How a run ended.  ``verified`` says that physics agreed, by ``verdict``; only then may the plan be published.
 
-    ``plan`` is also filled in for the best match of a strategy that simulation cannot judge; its code is OK only if the caller allowed that.
-    ``state_known`` is the plan's.  ``seconds`` holds the wall time for which the run waited for each stage, and ``total``.
+    ``plan`` is also filled in for the best match of a strategy that simulation cannot judge; its code is OK only if the caller allowed
+    that. ``state_known`` is the plan's.  ``seconds`` holds the wall time for which the run waited for each stage, and ``total``.
     """
 
     code: Code
@@ -290,8 +291,8 @@ class Agenda:
 class Choice:
     """Which of the motions that physics passed is taken: the surest.
 
-    One of which no rollout failed is taken at once.  Of verified motions that were carried out on the truth 8 of 677 failed where no rollout had,
-    and 6 of 92 where some had: of the next :data:`MORE` trials one may be surer.
+    One of which no rollout failed is taken at once.  Of verified motions that were carried out on the truth 8 of 677 failed where no
+    rollout had, and 6 of 92 where some had: of the next :data:`MORE` trials one may be surer.
     """
 
     #: So many further trials are made for a motion that is surer than one that passed.

@@ -530,7 +530,8 @@ def _stands_in(scene: SceneObjectArray, candidate: ContactCandidate, target_id: 
 
 
 def check_ids(scene: SceneObjectArray) -> None:
-    """Refuse objects two of which have one id: what is asked for by it would be one of them, and the other in no plan; raises BAD_REQUEST."""
+    """Refuse objects two of which have one id: what is asked for by it would be one of them, and the other in no plan; raises
+    BAD_REQUEST."""
     counts = Counter(item.id for item in scene.objects)
     twice = sorted(name for name, count in counts.items() if count > 1)
     if twice:
