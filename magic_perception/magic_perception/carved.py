@@ -15,13 +15,25 @@ from magic_core.mesh import Mesh
 from magic_perception.sight import Sight, surfaces
 from magic_perception.solids import Reconstruction, joined
 
+#: Cells that touch along an edge alone are joined so many times: each time may make others.
+EDGE_ROUNDS = 10
+#: A part that holds less than this share of the largest one's cells is a speck.
+LEAST_PART = 0.03
+#: Convex pieces are hulls of the cells in blocks so wide (m), larger ones where there would be more than the next.
+BLOCK = 0.012
+MOST_BLOCKS = 100
+#: Cells of the grid, at most, none smaller than 2 mm.
+CELLS = 60000
+#: Faces of the mesh, at most.
+FACES = 20000
 
-def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: int = 20000) -> Reconstruction:
-    """The carved solid.  ``cells``: of the grid, at most, none smaller than 2 mm; ``faces``: of the mesh, at most."""
+
+def build_carved(sights: list[Sight], noise: float) -> Reconstruction:
+    """The carved solid; noise: of the depth, m."""
     points, _ = surfaces(sights)
     low = np.append(np.percentile(points[:, :2], 0.5, axis=0) - 0.008, 0.0)
     high = np.percentile(points, 99.5, axis=0) + [0.008, 0.008, 0.003]
-    cell = float(max(0.002, (np.prod(high - low) / cells) ** (1 / 3)))
+    cell = float(max(0.002, (np.prod(high - low) / CELLS) ** (1 / 3)))
     axes = [np.arange(a + cell / 2, b + cell / 2, cell) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     field = np.ones(grid.shape[:3], np.float32)
@@ -41,7 +53,7 @@ def build_carved(sights: list[Sight], noise: float, cells: int = 60000, faces: i
     mesh = surface_net(field, axes, 0.5)
     if not closed(mesh):
         mesh = level_surface(field, axes, 0.5)
-    mesh = _thinned(mesh, faces)
+    mesh = _thinned(mesh, FACES)
     return Reconstruction(mesh, tuple(_pieces(field, axes)), "carved")
 
 
@@ -74,22 +86,22 @@ def _blurred(field: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
     return gaussian_filter(np.pad(field, 2), cells)[1:-1, 1:-1, 1:-1]
 
 
-def _largest(field: NDArray[np.float32], share: float = 0.03) -> NDArray[np.float32]:
-    """The field with its parts that hold less than ``share`` of the largest part's cells taken out."""
+def _largest(field: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The field with its parts that hold less than :data:`LEAST_PART` of the largest part's cells taken out."""
     from scipy.ndimage import label
 
     parts, _ = label(field > 0.5)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    keep = sizes >= share * sizes.max(initial=1)
+    keep = sizes >= LEAST_PART * sizes.max(initial=1)
     keep[0] = True
     return np.where(keep[parts], field, np.float32(0))
 
 
-def _joined_edges(field: NDArray[np.float32], level: float, rounds: int = 10) -> NDArray[np.float32]:
+def _joined_edges(field: NDArray[np.float32], level: float) -> NDArray[np.float32]:
     """The field with cells filled in where two others touch along an edge alone: there no surface would be closed."""
     field = field.copy()
-    for _ in range(rounds):
+    for _ in range(EDGE_ROUNDS):
         changed = False
         for axis in range(3):
             plane = np.moveaxis(field, axis, 0)  # a view: writing to it writes to the field
@@ -213,16 +225,16 @@ def _thinned(mesh: Mesh, faces: int) -> Mesh:
     return thinned if closed(thinned) else mesh
 
 
-def _pieces(field: NDArray[np.float32], axes: list[NDArray[np.float64]], block: float = 0.012, most: int = 100) -> list[Mesh]:
-    """Convex pieces: hulls of the cells in blocks of ``block`` metres, larger where there were more than ``most``, joined where that fills
-    little."""
+def _pieces(field: NDArray[np.float32], axes: list[NDArray[np.float64]]) -> list[Mesh]:
+    """Convex pieces: hulls of the cells in blocks of :data:`BLOCK` metres, larger where there were more than :data:`MOST_BLOCKS`, joined
+    where that fills little."""
     steps = np.array([float(a[1] - a[0]) for a in axes])
     start = np.array([a[0] for a in axes]) - steps
     spots = np.argwhere(field > 0.5)
-    size = max(2, round(block / steps[0]))
+    size = max(2, round(BLOCK / steps[0]))
     while True:
         _, group = np.unique((spots // size) @ np.array([1, 10_000, 100_000_000]), return_inverse=True)
-        if group.max() < most:
+        if group.max() < MOST_BLOCKS:
             break
         size += 1
     order = np.argsort(group, kind="stable")

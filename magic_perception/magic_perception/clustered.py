@@ -18,6 +18,9 @@ from magic_perception.parameters import Parameters
 from magic_perception.pixels import where
 from magic_perception.shared_out import shared_out
 
+#: Pixels of a line across a gap whose colours are compared, its ends among them.
+SAMPLES = 8
+
 
 @dataclass(frozen=True)
 class Bridges:
@@ -86,7 +89,7 @@ def _in_look(
 STEEP, NOISE = 1.0, 0.004
 
 
-def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> Bridges:
+def _bridges(looked: Looked, mask: NDArray[np.bool_]) -> Bridges:
     """Across the gaps in a mask's depth, between pixels of the flattened picture: what colour shows to be one thing is not two for want of
     depth.
 
@@ -98,7 +101,7 @@ def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> Bridg
     own, z = mask[cut], looked.frame.depth[cut]
     seen = own & np.isfinite(z)
     if w == 0 or not seen.any():
-        return Bridges(np.zeros((0, 2), np.int64), np.zeros((0, samples - 2, 3), np.float32))
+        return Bridges(np.zeros((0, 2), np.int64), np.zeros((0, SAMPLES - 2, 3), np.float32))
     _, index = cv2.distanceTransformWithLabels((~seen).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     source = np.zeros(int(index.max()) + 1, np.int64)
     source[index[seen]] = np.flatnonzero(seen)
@@ -116,7 +119,7 @@ def _bridges(looked: Looked, mask: NDArray[np.bool_], samples: int = 8) -> Bridg
     k = looked.frame.intrinsics
     even = (apart > 2) & (flat[a] == flat[b]) & (np.abs(z1 - z0) < STEEP * apart * np.minimum(z0, z1) / k.fx + NOISE)
     a, b, z0, z1 = a[even], b[even], z0[even, None], z1[even, None]
-    t = np.linspace(0, 1, samples)[1:-1]
+    t = np.linspace(0, 1, SAMPLES)[1:-1]
     u, v = (
         (1 - t) * p[even, None] + t * q[even, None]
         for p, q in ((u0 + cut[1].start, u1 + cut[1].start), (v0 + cut[0].start, v1 + cut[0].start))

@@ -11,16 +11,25 @@ from numpy.typing import NDArray
 from magic_perception import clusters, seams
 from magic_perception.attached import COLOR, shade
 
+#: Points are smoothed over squares of so many pixels, for their normals.
+SMOOTHED = 7
+#: What stands on another has so many voxels.
+LEAST_ON_TOP = 50
+#: Two voxels between which the surface bends inward by this angle (degrees) or more are on the two sides of a seam.
+CONCAVE = 12.0
+#: A part of fewer voxels goes to the nearest other.
+LEAST_PIECE = 12
 
-def normals(points: NDArray[np.float32], eye: NDArray[np.float64], size: int = 7) -> NDArray[np.float32]:
+
+def normals(points: NDArray[np.float32], eye: NDArray[np.float64]) -> NDArray[np.float32]:
     """Unit normals (H, W, 3) of an organised cloud (H, W, 3), towards the eye, from differences of smoothed points; NaN at gaps and jumps.
 
     Computed at every second pixel; four pixels share one.
     """
     height, width = points.shape[:2]
     valid = np.isfinite(points[..., 0])
-    weight = cv2.blur(valid.astype(np.float32), (size, size))[::2, ::2]
-    smooth = cv2.blur(np.where(valid[..., None], points, np.float32(0)), (size, size))[::2, ::2]
+    weight = cv2.blur(valid.astype(np.float32), (SMOOTHED, SMOOTHED))[::2, ::2]
+    smooth = cv2.blur(np.where(valid[..., None], points, np.float32(0)), (SMOOTHED, SMOOTHED))[::2, ::2]
     with np.errstate(invalid="ignore", divide="ignore"):
         x, y, z = (np.where(weight < 0.6, np.float32(np.nan), smooth[..., axis] / weight) for axis in range(3))
         du, dv = ([np.full_like(x, np.nan) for _ in range(3)] for _ in range(2))
@@ -113,12 +122,12 @@ def _over_gaps(
     return a, b, np.where(np.maximum(one, two) < slack, 1.0, -1.0), ~step
 
 
-def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArray[np.int64]:
+def pieces(voxels: seams.Voxels) -> NDArray[np.int64]:
     """Parts (V,) from 0 of the voxels, cut at every concave seam.
 
-    Two voxels are joined where the surface between them is convex or bent inward by less than ``angle`` degrees, over a gap by as much on
-    each :data:`REACH` of it, and where at least half of the voxels next to both agree.  A part of fewer than ``least`` voxels goes to the
-    nearest other.
+    Two voxels are joined where the surface between them is convex or bent inward by less than :data:`CONCAVE` degrees, over a gap by as
+    much on each :data:`REACH` of it, and where at least half of the voxels next to both agree.  A part of fewer than :data:`LEAST_PIECE`
+    voxels goes to the nearest other.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -126,7 +135,7 @@ def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArra
 
     n, a, b = len(voxels.centre), voxels.a, voxels.b
     apart = np.linalg.norm(voxels.centre[a] - voxels.centre[b], axis=1)
-    convex = ((voxels.opening > 0) | (voxels.bend < angle * np.maximum(apart / REACH, 1))) & voxels.clear
+    convex = ((voxels.opening > 0) | (voxels.bend < CONCAVE * np.maximum(apart / REACH, 1))) & voxels.clear
     joined = coo_matrix((np.ones(convex.sum()), (a[convex], b[convex])), shape=(n, n)).tocsr()
     joined = joined + joined.T
     near = coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n)).tocsr()
@@ -135,7 +144,7 @@ def pieces(voxels: seams.Voxels, angle: float = 12.0, least: int = 12) -> NDArra
     agree = np.asarray((joined[a].multiply(joined[b])).sum(axis=1)).ravel()
     keep = convex & (agree >= 0.5 * common)
     part = connected_components(coo_matrix((np.ones(keep.sum()), (a[keep], b[keep])), shape=(n, n)), directed=False)[1]
-    large = np.bincount(part)[part] >= least
+    large = np.bincount(part)[part] >= LEAST_PIECE
     if not large.any():
         return np.zeros(n, np.int64)
     nearest = np.nonzero(large)[0][cKDTree(voxels.centre[large]).query(voxels.centre[~large])[1]]
@@ -159,7 +168,7 @@ BAND, GOES_ON = 0.016, 0.3
 ASIDE, PAINT = 0.010, 0.08
 
 
-def on_tops(voxels: seams.Voxels, least: int = 50) -> NDArray[np.int64]:
+def on_tops(voxels: seams.Voxels) -> NDArray[np.int64]:
     """Parts (V,) from 0 of the voxels, cut where something stands on a level face: it hangs together with what bears it where their sides
     lie in one plane, or where its own side is seen before the other's back edge, and no seam bends inward all around."""
     from scipy.sparse import coo_matrix
@@ -176,7 +185,7 @@ def on_tops(voxels: seams.Voxels, least: int = 50) -> NDArray[np.int64]:
             told = (upper[voxels.a] != upper[voxels.b]) & voxels.clear
             inward = (voxels.opening[told] < 0) & (voxels.bend[told] > 25)
             bent = np.count_nonzero(inward) > BENT * len(inward)
-            if np.count_nonzero(upper) >= least and bent and _going_on(voxels, (part == 0) & ~upper, upper, level) <= GOES_ON:
+            if np.count_nonzero(upper) >= LEAST_ON_TOP and bent and _going_on(voxels, (part == 0) & ~upper, upper, level) <= GOES_ON:
                 part[upper] = part.max() + 1
     return part
 

@@ -13,6 +13,11 @@ from magic_perception.looks import Looked
 from magic_perception.parameters import Parameters
 from magic_perception.pixels import where, window
 
+#: What spans more than this share of the picture (a tray's rim, a wall) encloses the table itself.
+ENCLOSING = 0.2
+#: Pixels so near to a mask's edge are judged anew by the two colours at it.
+FATTENED = 3
+
 
 def masked_mean(values: NDArray[np.float32], weights: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean of values over a size x size window, counting only where weights are, and the share of the window that counts."""
@@ -289,17 +294,17 @@ def _closed(high: NDArray[np.bool_], missing: NDArray[np.bool_], other: NDArray[
     return np.take(plain, regions) & ~other
 
 
-def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_], share: float = 0.2) -> NDArray[np.bool_]:
+def _outside(table: NDArray[np.bool_], raised: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The table, or what else (H, W), without what lies in the convex hull of something raised: the floor of a bowl is as low as the table,
     but has the bowl's colour.
 
-    What spans more than ``share`` of the picture (a tray's rim, a wall) encloses the table itself.
+    What spans more than :data:`ENCLOSING` of the picture (a tray's rim, a wall) encloses the table itself.
     """
     covered = np.zeros(table.shape, np.uint8)
     outlines, _ = cv2.findContours(raised.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     for outline in outlines:
         hull = cv2.convexHull(outline)
-        if cv2.contourArea(hull) < share * table.size:
+        if cv2.contourArea(hull) < ENCLOSING * table.size:
             cv2.fillConvexPoly(covered, hull, 1)
     return table & (covered == 0)
 
@@ -336,18 +341,16 @@ def _fill_bowls(mask: NDArray[np.bool_], looked: Looked, other: NDArray[np.bool_
     return result
 
 
-def _two_colors(
-    mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], firm: NDArray[np.bool_], reach: int = 3
-) -> NDArray[np.bool_]:
+def _two_colors(mask: NDArray[np.bool_], looked: Looked, table: NDArray[np.bool_], firm: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Move a mask's edge to where the colour is half way between the thing's and the table's next to it.
 
-    Depth fattens edges by some pixels and a threshold on colour by one; pixels within ``reach`` of the edge are judged
+    Depth fattens edges by some pixels and a threshold on colour by one; pixels within :data:`FATTENED` of the edge are judged
     anew by the share of the thing's colour in theirs, wherever the two colours differ enough to tell; those of ``firm`` (H, W) stay.
     """
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FATTENED + 1, 2 * FATTENED + 1))
     # The means look at most 15 pixels around, so that what lies farther off changes nothing.
     margin = 16
-    result, things = mask.copy(), window(mask, reach + margin)
+    result, things = mask.copy(), window(mask, FATTENED + margin)
     own, table, firm, open_, heights, color = (
         picture[things] for picture in (mask, table, firm, looked.open, looked.heights, looked.frame.color)
     )

@@ -31,6 +31,8 @@ HOLE = 6e-5
 BOW = 0.2
 #: A handle is no thicker than this, m; points lie about its plane with a deviation of so much.
 THICKEST, ABOUT = 0.03, 0.006
+#: Clusters of points beyond a body within this angle (rad) of the largest one are of the same handle.
+APART = 0.44
 
 
 @dataclass(frozen=True)
@@ -213,9 +215,9 @@ def _largest_hole(plane: _Plane, solid: NDArray[np.uint8], body: Body) -> float:
     return float(stats[1:, cv2.CC_STAT_AREA].max(initial=0)) * CELL**2
 
 
-def standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> NDArray[np.float64]:
-    """Of the points (N, 3) beyond the body the largest cluster, and the others in its direction, to ``apart`` radians: a handle that depth
-    tore."""
+def standing_off(out: NDArray[np.float64], body: Body) -> NDArray[np.float64]:
+    """Of the points (N, 3) beyond the body the largest cluster, and the others in its direction, to :data:`APART` radians: a handle that
+    depth tore."""
     labels = clusters.cluster(out, 0.012, 4, 0.003)
     if labels.max(initial=-1) < 0:
         return out
@@ -223,7 +225,7 @@ def standing_off(out: NDArray[np.float64], body: Body, apart: float = 0.44) -> N
     middles = np.array([out[labels == i, :2].mean(axis=0) - body.axis for i in range(len(sizes))])
     angles = np.arctan2(middles[:, 1], middles[:, 0])
     off = np.abs((angles - angles[np.argmax(sizes)] + np.pi) % (2 * np.pi) - np.pi)
-    return out[np.isin(labels, np.flatnonzero((off < apart) & (sizes >= 8)))]
+    return out[np.isin(labels, np.flatnonzero((off < APART) & (sizes >= 8)))]
 
 
 def _drawn(sight: Sight, body: Body) -> NDArray[np.bool_]:

@@ -34,6 +34,8 @@ LOOSE = 0.25
 #: What carries a thing out of sight is under its middle, within this, m, and is a part of it: no more than this share of its height, as a
 #: ball's or an egg's underside and a vase's foot are.
 FOOT, UNDERSIDE = 0.01, 0.4
+#: What is nearer to a fixture than this (m) may hang on it.
+AT_FIXTURE = 0.02
 
 
 def veil(looks: list[Looked], labels: list[NDArray[np.int32]]) -> list[NDArray[np.int32]]:
@@ -234,10 +236,10 @@ def seen_through(
     return empty.any(axis=0)
 
 
-def _touches(points: NDArray[np.float64], fixtures: tuple[Mesh, ...], reach: float = 0.02) -> bool:
+def _touches(points: NDArray[np.float64], fixtures: tuple[Mesh, ...]) -> bool:
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
     for mesh in fixtures:
         scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-    return bool(scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy().min() < reach)
+    return bool(scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy().min() < AT_FIXTURE)

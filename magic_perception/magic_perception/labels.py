@@ -13,6 +13,8 @@ from magic_perception.pixels import where, window
 
 #: Least share of a thing's pixels that has depth of its own in one camera at least.
 MEASURED = 0.2
+#: Unlabelled pixels take the label of one so near, in pixels.
+REACH = 24.0
 
 
 def with_depth(labels: list[NDArray[np.int32]], looks: list[Looked], parameters: Parameters) -> list[NDArray[np.int32]]:
@@ -31,10 +33,10 @@ def with_depth(labels: list[NDArray[np.int32]], looks: list[Looked], parameters:
     return sizeable([table[image] for image in labels], looks, parameters)
 
 
-def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0) -> NDArray[np.int32]:
-    """Give pixels of the mask that have no label the one of the nearest labelled pixel within ``reach`` pixels, if both are of one
+def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Give pixels of the mask that have no label the one of the nearest labelled pixel within :data:`REACH` pixels, if both are of one
     connected region."""
-    margin = int(np.ceil(reach))
+    margin = int(np.ceil(REACH))
     cut = window(mask, margin)
     part = labels[cut]
     seen = part > 0
@@ -53,7 +55,7 @@ def fill(labels: NDArray[np.int32], mask: NDArray[np.bool_], reach: float = 24.0
     table = np.zeros(int(np.count_nonzero(seen)) + 1, np.int32)
     table[index[seen]] = part[seen]
     result = labels.copy()
-    result[cut][near] = np.where(missing & (distance <= reach), np.take(table, index), part)
+    result[cut][near] = np.where(missing & (distance <= REACH), np.take(table, index), part)
     return result
 
 

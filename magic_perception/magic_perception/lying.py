@@ -19,6 +19,14 @@ from magic_perception.percentiles import bounds
 from magic_perception.sight import Sight, carve, surfaces
 from magic_perception.solids import Reconstruction, extruded, joined
 
+#: Empty cells about a height map.
+BORDER = 4
+#: Points of a relief's surface are so far apart, m.
+LATTICE = 0.003
+#: A cell of the partition of a relief is cut until both of its surfaces are flat to this (m), or it is no wider than the next.
+FLAT_TO = 0.002
+LEAST_CELL = 0.011
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -35,11 +43,11 @@ class Grid:
         return np.stack([x, y], axis=-1) * self.cell + self.origin
 
 
-def height_map(points: NDArray[np.float64], cell: float, margin: int = 4) -> Grid:
+def height_map(points: NDArray[np.float64], cell: float) -> Grid:
     """The highest points (N, 3) over each cell; gaps of two cells closed, threads of one cell dropped."""
     low, high = bounds(points[:, :2])
-    low = low - margin * cell
-    size = np.ceil((high - low) / cell).astype(int) + margin + 1
+    low = low - BORDER * cell
+    size = np.ceil((high - low) / cell).astype(int) + BORDER + 1
     if size.max() > 1200:
         raise MagicError(
             Code.RECONSTRUCTION_FAILED, "extent of one object in metres", np.round(size * cell, 2).tolist(), f"below {1200 * cell}"
@@ -271,15 +279,15 @@ def _at(field: NDArray[np.float32], grid: Grid, xy: NDArray[np.float64]) -> NDAr
     return cv2.remap(field, local[:, 0:1], local[:, 1:2], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(float)
 
 
-def relief(part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], step: float = 0.003) -> Mesh:
+def relief(part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32]) -> Mesh:
     """The solid between two height maps over a polygon: Delaunay over its rings and a lattice inside, with walls; watertight."""
     from scipy.spatial import Delaunay
 
-    ring = polygons.ring_points(part, step * 0.8)
+    ring = polygons.ring_points(part, LATTICE * 0.8)
     x0, y0, x1, y1 = part.bounds
-    y, x = np.mgrid[y0:y1:step, x0:x1:step]
+    y, x = np.mgrid[y0:y1:LATTICE, x0:x1:LATTICE]
     lattice = np.column_stack([x.ravel(), y.ravel()])
-    lattice = lattice[shapely.contains_xy(part.buffer(-0.6 * step), lattice)]
+    lattice = lattice[shapely.contains_xy(part.buffer(-0.6 * LATTICE), lattice)]
     flat = np.concatenate([ring, lattice])
     faces = Delaunay(flat).simplices.astype(np.int64)
     middle = flat[faces].mean(axis=1)
@@ -297,11 +305,9 @@ def relief(part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[
     return Mesh(vertices, np.concatenate([faces[:, ::-1], faces + n, *polygons._walls(faces, n)]))
 
 
-def relief_pieces(
-    part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32], tolerance: float = 0.002, least: float = 0.011
-) -> list[Mesh]:
-    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to ``tolerance`` or the cell is ``least``
-    wide; then neighbours are joined again where that fills little."""
+def relief_pieces(part: Polygon, grid: Grid, top: NDArray[np.float32], bottom: NDArray[np.float32]) -> list[Mesh]:
+    """Convex hulls over a convex partition of a polygon, cut on until both surfaces are flat to :data:`FLAT_TO` or the cell is
+    :data:`LEAST_CELL` wide; then neighbours are joined again where that fills little."""
     clouds = []
     queue = [(Polygon(ring), 0) for ring in polygons.convex_parts(part.simplify(0.001), 0.001)]
     while queue:
@@ -314,7 +320,7 @@ def relief_pieces(
         lattice = lattice[shapely.contains_xy(cell, lattice)]
         xy = np.concatenate([np.asarray(cell.exterior.coords)[:-1], lattice])
         high, low = np.maximum(_at(top, grid, xy), 0.001), _at(bottom, grid, xy)
-        if depth < 10 and size.max() > least and max(_bend(xy, high), _bend(xy, low)) > tolerance:
+        if depth < 10 and size.max() > LEAST_CELL and max(_bend(xy, high), _bend(xy, low)) > FLAT_TO:
             long = int(np.argmax(size))
             half = (box[long] + box[long + 2]) / 2
             first, second = box.copy(), box.copy()

@@ -12,6 +12,9 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from magic_core.mesh import Mesh
 
+#: Holes of less than this (m^2) are noise, and closed.
+NOISE_HOLE = 1.2e-5
+
 
 def parts_of(shape: shapely.Geometry) -> list[Polygon]:
     """The polygons of a polygon, a multi-polygon or a collection, largest first; nothing for what has no area."""
@@ -23,13 +26,11 @@ def parts_of(shape: shapely.Geometry) -> list[Polygon]:
     return sorted(found, key=lambda p: -p.area)
 
 
-def outline(
-    field: NDArray, origin: NDArray[np.float64], cell: float, level: float = 0.5, min_hole: float = 1.2e-5, simplify: float | None = None
-) -> list[Polygon]:
+def outline(field: NDArray, origin: NDArray[np.float64], cell: float, level: float = 0.5, simplify: float | None = None) -> list[Polygon]:
     """Polygons with holes where a field over a grid is above a level, to a fraction of a cell.
 
     field (rows, columns): value at the cell's centre, row i at y = origin[1] + i cell, column j at x = origin[0] + j cell.
-    Holes smaller than ``min_hole`` square metres are noise and closed.  ``simplify`` metres (default 0.3 cells).
+    Holes smaller than :data:`NOISE_HOLE` square metres are noise and closed.  ``simplify`` metres (default 0.3 cells).
     """
     from contourpy import FillType, contour_generator
 
@@ -40,7 +41,7 @@ def outline(
         rings = [(points[a:b] - 1) * cell + origin for a, b in itertools.pairwise(offsets)]
         if len(rings[0]) < 4:
             continue
-        holes = [ring for ring in rings[1:] if len(ring) >= 4 and Polygon(ring).area > min_hole]
+        holes = [ring for ring in rings[1:] if len(ring) >= 4 and Polygon(ring).area > NOISE_HOLE]
         shape = Polygon(rings[0], holes).simplify(0.3 * cell if simplify is None else simplify)
         result += parts_of(shape if shape.is_valid else shape.buffer(0))
     return sorted(result, key=lambda p: -p.area)

@@ -11,6 +11,9 @@ from magic_core.mesh import Mesh
 from magic_perception.percentiles import percentile
 from magic_perception.solids import Reconstruction
 
+#: Steps of a full turn of what is turned to a ring.
+SEGMENTS = 48
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -31,7 +34,7 @@ class Cylinder:
     residual: float
 
 
-def fit_circle(points: NDArray[np.float64], rounds: int = 4, band: float | None = None) -> tuple[NDArray[np.float64], float]:
+def fit_circle(points: NDArray[np.float64], rounds: int = 4) -> tuple[NDArray[np.float64], float]:
     """Centre (2,) and radius of the circle through points (N, 2), by least squares, refitted to the nearest 80 %."""
     kept = points
     centre, radius = points.mean(axis=0), 0.0
@@ -44,7 +47,7 @@ def fit_circle(points: NDArray[np.float64], rounds: int = 4, band: float | None 
         centre = mean + offset
         radius = float(np.sqrt(squared.mean() + offset @ offset))
         residual = np.abs(np.hypot(*(points - centre).T) - radius)
-        kept = points[residual <= max(percentile(residual, 80), 1e-4 if band is None else band)]
+        kept = points[residual <= max(percentile(residual, 80), 1e-4)]
     return centre, radius
 
 
@@ -196,22 +199,22 @@ def revolve(profile: NDArray[np.float64], centre: NDArray[np.float64], segments:
     return Mesh(vertices, np.concatenate(faces))
 
 
-def turn_ring(profile: NDArray[np.float64], centre: NDArray[np.float64], segments: int = 48) -> Mesh:
+def turn_ring(profile: NDArray[np.float64], centre: NDArray[np.float64]) -> Mesh:
     """The ring that a closed polyline (K, 2) of (radius, z), radius above 0, sweeps about the upright axis through ``centre`` (2,).
 
     The line runs counter-clockwise in (radius, z).  Watertight, of genus 1.
     """
     profile = np.asarray(profile, float)
-    angle = np.arange(segments) * 2 * np.pi / segments
+    angle = np.arange(SEGMENTS) * 2 * np.pi / SEGMENTS
     k = len(profile)
     vertices = np.stack(
-        [profile[:, None, 0] * np.cos(angle), profile[:, None, 0] * np.sin(angle), np.repeat(profile[:, 1:2], segments, axis=1)], axis=-1
+        [profile[:, None, 0] * np.cos(angle), profile[:, None, 0] * np.sin(angle), np.repeat(profile[:, 1:2], SEGMENTS, axis=1)], axis=-1
     ).reshape(-1, 3)
     vertices[:, :2] += centre
-    i = np.arange(segments)
-    j = (i + 1) % segments
+    i = np.arange(SEGMENTS)
+    j = (i + 1) % SEGMENTS
     faces = []
     for row in range(k):
-        a, b = row * segments, ((row + 1) % k) * segments
+        a, b = row * SEGMENTS, ((row + 1) % k) * SEGMENTS
         faces += [np.column_stack([a + i, a + j, b + j]), np.column_stack([a + i, b + j, b + i])]
     return Mesh(vertices, np.concatenate(faces))

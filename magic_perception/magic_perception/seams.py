@@ -43,6 +43,8 @@ CRITERIA = {
 #: What begins below FLOOR stands on the table; slack between the top of one and the bottom of what stands on it; the height of a foot; and
 #: how much wider than the narrowest place of a gap what faces it may be, m.
 FLOOR, REST, FOOT, BRIDGE = 0.015, 0.015, 0.025, 0.008
+#: Voxels of each part, at most, that are compared in pairs.
+COMPARED = 60
 
 
 @dataclass(frozen=True)
@@ -141,10 +143,10 @@ def measured(voxels: Voxels, first: _Part, second: _Part, across: NDArray[np.boo
     ])  # fmt: skip
 
 
-def _before(voxels: Voxels, first: _Part, second: _Part, most: int = 60) -> float:
+def _before(voxels: Voxels, first: _Part, second: _Part) -> float:
     """Share of pairs of voxels, one of each part, of which either lies before the other's tangent plane by more than 5 mm and 10
     degrees."""
-    i, j = (one.members[:: max(1, len(one.members) // most)] for one in (first, second))
+    i, j = (one.members[:: max(1, len(one.members) // COMPARED)] for one in (first, second))
     offset = voxels.centre[i][:, None] - voxels.centre[j][None]
     distance = np.linalg.norm(offset, axis=-1)
     slack = np.maximum(0.005, 0.17 * distance)

@@ -24,6 +24,8 @@ NEARER = 0.012
 AROUND = 8
 #: Depth beside an edge is compared so many pixels across it.
 ACROSS = 4
+#: Points of a solid's surface that are looked at from each camera.
+POINTS = 800
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ class Witnessed:
     far: float
 
 
-def witnessed(mesh: Mesh, sights: list[Sight], count: int = 800, seed: int = 0) -> Witnessed:
+def witnessed(mesh: Mesh, sights: list[Sight]) -> Witnessed:
     """Sample the surface of a solid (table frame) and look at it from each camera."""
     import open3d as o3d
 
@@ -169,16 +171,16 @@ def witnessed(mesh: Mesh, sights: list[Sight], count: int = 800, seed: int = 0) 
     weight = np.where(lying, 0, area)
     if weight.sum() <= 0:
         return Witnessed(0.0, 1.0, 1.0)
-    rng = np.random.default_rng(seed)
-    face = rng.choice(len(weight), count, p=weight / weight.sum())
-    a, b = rng.random((2, count))
+    rng = np.random.default_rng(0)
+    face = rng.choice(len(weight), POINTS, p=weight / weight.sum())
+    a, b = rng.random((2, POINTS))
     swap = a + b > 1
     a[swap], b[swap] = 1 - a[swap], 1 - b[swap]
     points = corners[face, 0] + a[:, None] * (corners[face, 1] - corners[face, 0]) + b[:, None] * (corners[face, 2] - corners[face, 0])
     normals = normal[face]
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-    seen = np.zeros(count, bool)
+    seen = np.zeros(POINTS, bool)
     gaps = []
     for sight in sights:
         toward = sight.eye - points

@@ -15,6 +15,11 @@ from magic_core.mesh import Mesh
 from magic_perception.pixels import where, window
 from magic_perception.smear import LOW, REACH
 
+#: A mesh is compared with a picture at every so many pixels.
+EVERY = 3
+#: Differences of depth up to this (m) are noise.
+DEPTH_NOISE = 0.010
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -246,8 +251,9 @@ class Agreement:
         return self.overlap * (1 - self.through)
 
 
-def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.010) -> Agreement:
-    """Compare a mesh with the masks and depths of all cameras, at every ``step``-th pixel; ``margin`` metres of depth are noise."""
+def agreement(mesh: Mesh, sights: list[Sight]) -> Agreement:
+    """Compare a mesh with the masks and depths of all cameras, at every :data:`EVERY`-th pixel; :data:`DEPTH_NOISE` metres of depth are
+    noise."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -256,8 +262,8 @@ def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.
     for sight in sights:
         x, y, w, h = cv2.boundingRect(sight.mask.view(np.uint8))
         pad = 24
-        v = np.arange(max(y - pad, 0), min(y + h + pad, sight.mask.shape[0]), step)
-        u = np.arange(max(x - pad, 0), min(x + w + pad, sight.mask.shape[1]), step)
+        v = np.arange(max(y - pad, 0), min(y + h + pad, sight.mask.shape[0]), EVERY)
+        u = np.arange(max(x - pad, 0), min(x + w + pad, sight.mask.shape[1]), EVERY)
         k = sight.intrinsics
         rays = np.empty((len(v), len(u), 6), np.float32)
         rays[..., :3] = sight.eye
@@ -275,7 +281,7 @@ def agreement(mesh: Mesh, sights: list[Sight], step: int = 3, margin: float = 0.
         overlaps.append(np.count_nonzero(drawn & mask & told) / max(np.count_nonzero((drawn | mask) & told), 1))
         inner = cv2.erode(drawn.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & told
         with np.errstate(invalid="ignore"):
-            into = inner & mask & (seen > depth + max(margin, 3 * sight.sigma))
+            into = inner & mask & (seen > depth + max(DEPTH_NOISE, 3 * sight.sigma))
         if into.any():
             far, back = np.float32(5.0), rays[into]
             back[:, :3] += far * back[:, 3:]

@@ -13,6 +13,11 @@ from magic_core.mesh import Mesh, concatenate
 from magic_perception import polygons
 from magic_perception.sight import Agreement
 
+#: Convex parts of what is pulled up keep to its outline by this, m.
+PRISM = 0.0004
+#: A run of rings is one piece as long as its hull keeps within this (m) of them.
+RUN = 0.004
+
 
 @dataclass(frozen=True)
 class Reconstruction:
@@ -171,9 +176,9 @@ class _Joining:
             heapq.heappush(self._queue, (excess, i, j))
 
 
-def extruded(parts: list[Polygon], height: float, shape: str, tolerance: float = 0.0004) -> Reconstruction:
+def extruded(parts: list[Polygon], height: float, shape: str) -> Reconstruction:
     """Polygons pulled up from the table, with the prisms of their convex parts."""
-    pieces = [polygons.prism(ring, 0.0, height) for part in parts for ring in polygons.convex_parts(part.simplify(0.0005), tolerance)]
+    pieces = [polygons.prism(ring, 0.0, height) for part in parts for ring in polygons.convex_parts(part.simplify(0.0005), PRISM)]
     return Reconstruction(concatenate([polygons.extrude(part, 0.0, height) for part in parts]), tuple(pieces), shape)
 
 
@@ -193,8 +198,8 @@ def lofted(rings: NDArray[np.float64]) -> Mesh:
     return Mesh(vertices, np.concatenate(faces))
 
 
-def loft_pieces(rings: NDArray[np.float64], tolerance: float = 0.004) -> list[Mesh]:
-    """Convex hulls of runs of rings (L, K, 3): a run grows upwards as long as its hull keeps within ``tolerance`` metres of the rings in
+def loft_pieces(rings: NDArray[np.float64]) -> list[Mesh]:
+    """Convex hulls of runs of rings (L, K, 3): a run grows upwards as long as its hull keeps within :data:`RUN` metres of the rings in
     it."""
     pieces = []
     start = 0
@@ -210,7 +215,7 @@ def loft_pieces(rings: NDArray[np.float64], tolerance: float = 0.004) -> list[Me
                 # The hull's section between the run's ends holds at least their blend.
                 share = (row - start) / (stop + 1 - start)
                 blend = polygons.area_of(polygons.convex_hull(np.concatenate([(1 - share) * a + share * b, flat[row]])))
-                if blend - area[row] > tolerance * perimeter[row] / 2:
+                if blend - area[row] > RUN * perimeter[row] / 2:
                     fits = False
                     break
             if not fits:

@@ -15,6 +15,8 @@ BAND, FITTED = 6, 14
 OFF, ON = 2.5, 1.5
 #: Least share of the window that tells of a surface.
 SUPPORT = 0.06
+#: A pixel at a seam goes to the label that most of the square of so many pixels about it have.
+NEIGHBOURS = 7
 
 
 def on_surfaces(labels: NDArray[np.int32], look: Looked) -> NDArray[np.int32]:
@@ -87,14 +89,14 @@ def _off_plane(
     return np.where(enough, np.abs(depth[rows, columns] - 1 / np.maximum(told, 1e-3)), np.inf)
 
 
-def _smooth_seams(labels: NDArray[np.int32], near: NDArray[np.bool_], size: int = 7) -> NDArray[np.int32]:
+def _smooth_seams(labels: NDArray[np.int32], near: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Labels (H, W) with each labelled pixel of ``near`` given to the label that most of its neighbours have."""
     best, winner = np.zeros(labels.shape, np.float32), labels.copy()
     x, y, w, h = cv2.boundingRect(near.view(np.uint8))
-    cut = (slice(max(y - size, 0), y + h + size), slice(max(x - size, 0), x + w + size))
+    cut = (slice(max(y - NEIGHBOURS, 0), y + h + NEIGHBOURS), slice(max(x - NEIGHBOURS, 0), x + w + NEIGHBOURS))
     part = labels[cut]
     for label in (int(i) for i in np.unique(part[near[cut] & (part > 0)])):
-        share = cv2.blur((part == label).astype(np.float32), (size, size), borderType=cv2.BORDER_CONSTANT)
+        share = cv2.blur((part == label).astype(np.float32), (NEIGHBOURS, NEIGHBOURS), borderType=cv2.BORDER_CONSTANT)
         more = share > best[cut]
         best[cut][more] = share[more]
         winner[cut][more] = label

@@ -12,6 +12,9 @@ from magic_core import transforms
 from magic_core.errors import Code, MagicError
 from magic_perception.percentiles import bounds, extents
 
+#: Cells of the map of heights in which things are counted that stand on a level, m.
+CELL = 0.01
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -113,17 +116,15 @@ class Support:
     share: float
 
 
-def standing(
-    heights: NDArray[np.floating], xy: NDArray[np.floating], level: float, band: float = 0.008, cell: float = 0.01
-) -> tuple[float, float]:
+def standing(heights: NDArray[np.floating], xy: NDArray[np.floating], level: float, band: float = 0.008) -> tuple[float, float]:
     """How many things stand on a level, and its area in m^2.
 
     heights (N,) and xy (N, 2) metres in a frame with z up.  A thing is a connected region of at most half a metre that rises from the
     level by more than 12 mm, and around which at least six tenths of what is seen is the level.  It counts by the share of its outline at
     which the level is seen: specks of noise on a floor far below have gaps around them.
     """
-    low = bounds(xy)[0] - 4 * cell
-    index = np.floor((xy - low) / cell).astype(int)
+    low = bounds(xy)[0] - 4 * CELL
+    index = np.floor((xy - low) / CELL).astype(int)
     size = bounds(index)[1] + 5
     if size.max() > 1000:
         return 0.0, 0.0
@@ -139,7 +140,7 @@ def standing(
     things = 0.0
     for i in range(1, n):
         x, y, w, h, area = stats[i]
-        if area < 4 or max(w, h) * cell > 0.5:
+        if area < 4 or max(w, h) * CELL > 0.5:
             continue
         cut = (slice(max(y - 3, 0), y + h + 3), slice(max(x - 3, 0), x + w + 3))
         mine = (labels[cut] == i).astype(np.uint8)
@@ -148,7 +149,7 @@ def standing(
         around = np.count_nonzero(on[cut] & known)
         if known.sum() >= 0.25 * ring.sum() and around >= 0.6 * known.sum():
             things += around / np.count_nonzero(ring)
-    return things, float(on.sum()) * cell * cell
+    return things, float(on.sum()) * CELL * CELL
 
 
 def supports(points: NDArray[np.float64], plane: Plane, band: float = 0.008) -> list[Support]:

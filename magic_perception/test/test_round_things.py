@@ -305,7 +305,8 @@ def test_of_a_bowl_that_opens_wide_the_rim_is_not_taken_for_the_side_below(seed)
 
 
 def test_a_spoon_of_the_tables_own_colour_is_what_depth_has_it_for():
-    """Colour has no edge to cut along, and pixels that lose their depth at rim and handle are told by those about them: the ball shows that none is carried."""
+    """Colour has no edge to cut along, and pixels that lose their depth at rim and handle are told by those about them: the ball shows that
+    none is carried."""
     spoon = shapes.make("spoon", 4016).mesh
     truth = scenes.placed(laid_down(spoon), 0.5, 0.0, 0.8).painted((206, 160, 117))
     caster = sensor.scene_raycaster([truth, scenes.placed(shapes.make("sphere", 1).mesh, 0.42, 0.2)])

@@ -35,8 +35,8 @@ TILTED, RAISED = np.deg2rad(10.0), 0.001
 
 @dataclass(frozen=True)
 class Meeting:
-    """One stretch of contact: first and last seconds from the motion's start; contact points, outward normals (3,) as of a :class:`Replay`; and how
-    far (3,) the target had been moved, in its own frame as it stood, m, when it began and when it ended."""
+    """One stretch of contact: first and last seconds from the motion's start; contact points, outward normals (3,) as of a :class:`Replay`;
+    and how far (3,) the target had been moved, in its own frame as it stood, m, when it began and when it ended."""
 
     first: float
     last: float
@@ -140,7 +140,8 @@ def replay(
 
 
 def _motion(strategy: Shown, target: SceneObject, phases: tuple[Phase, ...], releases: bool) -> ToolMotion:
-    """The demonstrated motion in the world, from 0 s on; releases: the tool is let go where it ends, or at the phase of that name, and hangs for a second."""
+    """The demonstrated motion in the world, from 0 s on; releases: the tool is let go where it ends, or at the phase of that name, and
+    hangs for a second."""
     times = np.asarray(strategy.times, dtype=float)
     times = times - times[0]
     world_from_tool = target.world_from_object @ strategy.target_from_tool

@@ -225,8 +225,8 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
 def _try_all(
     options: Options, strategy: Strategy, problem: _Problem, candidates: Sequence[Any], answer: dict[str, Any], runs: list[_Tried]
 ) -> None:
-    """Plan and verify candidates, those that promise most first, until one passes surely enough; each is told in the answer, and its motions are put
-    to ``runs``, that which is taken last."""
+    """Plan and verify candidates, those that promise most first, until one passes surely enough; each is told in the answer, and its
+    motions are put to ``runs``, that which is taken last."""
     from magic_server.pipeline import Agenda, Choice
 
     most = 1 if options.method == ONLY_BEST else None
@@ -294,7 +294,8 @@ def _judge(options: Options, case: Case, problem: _Problem | None, runs: list[_T
 
 
 def _seen(case: Case, problem: _Problem | None) -> list[dict[str, float]]:
-    """How sure perception was of each tool, how much of it was seen, and how far it is off (m) and was stated to be at most, five times of six."""
+    """How sure perception was of each tool, how much of it was seen, and how far it is off (m) and was stated to be at most, five times of
+    six."""
     if problem is None or problem.layout is None:
         return []
     true = dict(zip(case.tools, problem.layout.tools, strict=True))
@@ -582,7 +583,8 @@ def _truth_text(truth: dict[str, Any], done: list[dict[str, Any]]) -> str:
 
 
 def _surface_text(done: list[dict[str, Any]]) -> str:
-    """How far the surfaces of the reconstructed tools are off, of those that perception was sure of and of the others, and against what was stated."""
+    """How far the surfaces of the reconstructed tools are off, of those that perception was sure of and of the others, and against what was
+    stated."""
     seen = [item for case in done for item in case.get("seen", ())]
     text = ""
     for range_, sure in (("above 0.5", True), ("up to 0.5", False)):

@@ -91,7 +91,8 @@ class Body:
 
 @dataclass(frozen=True)
 class Setup:
-    """All that a run is built from.  ``target_kind`` is static or dynamic; table and fixtures never move, loose obstacles once they are touched."""
+    """All that a run is built from.  ``target_kind`` is static or dynamic; table and fixtures never move, loose obstacles once they are
+    touched."""
 
     tool: Body
     target: Body
@@ -351,10 +352,10 @@ class FloatingRun:
         phase begins, sampled every ``interval`` seconds up to the release, and every :data:`BETWEEN_LOOKS` of its way; ``check`` may raise
         to end it early.
 
-        ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it cannot
-        be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.  ``planned``: what this found of the
-        tool as it is thought to be, at the deepest, m: no obstacle is looked at where what the tool is off by adds too little to that, nor the
-        table where that itself is harmless, as a tool that is off is raised to go no deeper into it.
+        ``harmless``: a depth in metres of which nobody has to know.  A tool comes no deeper than by what it moves: samples at which it
+        cannot be deeper than that are left out, and overlaps that are not deeper may be told as less than they are.  ``planned``: what this
+        found of the tool as it is thought to be, at the deepest, m: no obstacle is looked at where what the tool is off by adds too little
+        to that, nor the table where that itself is harmless, as a tool that is off is raised to go no deeper into it.
         """
         setup, motion = self.setup, self._motion
         others = {o.id: (list(o.hulls), o.world_from_object) for o in setup.obstacles}

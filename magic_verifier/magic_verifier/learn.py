@@ -176,7 +176,8 @@ def frames_of(bag: Recorded, world: str) -> list[RgbdFrame]:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Every colour picture of a bag with the depth that goes with it, of all cameras, by their stamps, as often as they are gone through."""
+    """Every colour picture of a bag with the depth that goes with it, of all cameras, by their stamps, as often as they are gone
+    through."""
 
     bag: Recorded
     world: str
@@ -213,7 +214,8 @@ class Pictures:
 
 
 def left_first(scene: Scene, frames: list[RgbdFrame]) -> str:
-    """Id of the object that is the first not to be where it was: the one that a hand took.  Raises BAD_MOTION where none leaves its place."""
+    """Id of the object that is the first not to be where it was: the one that a hand took.  Raises BAD_MOTION where none leaves its
+    place."""
     from magic_perception.following import FEWEST, THROUGH, Follower
 
     seen = [item for item in scene.objects if item.source == "camera"]
@@ -230,8 +232,8 @@ def left_first(scene: Scene, frames: list[RgbdFrame]) -> str:
 
 
 def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tuple[Array, Array, SceneObject]:
-    """Times (T,) in seconds and world_from_tool (T, 4, 4), by nothing but pictures, and the tool as these show it, which its first look showed
-    from one side alone; raises BAD_MOTION where the tool is lost."""
+    """Times (T,) in seconds and world_from_tool (T, 4, 4), by nothing but pictures, and the tool as these show it, which its first look
+    showed from one side alone; raises BAD_MOTION where the tool is lost."""
     from magic_perception.following import follow
 
     others = [item.mesh.transformed(item.world_from_object) for item in scene.objects if item.id != tool.id]
@@ -247,8 +249,8 @@ def followed(bag: Recorded, world: str, tool: SceneObject, scene: Scene) -> tupl
 
 
 def all_shown(bag: Recorded, world: str, tool: SceneObject, scene: Scene, times: Array, poses: Array) -> SceneObject:
-    """The tool as all pictures show it that there are of its use, along a track that something else told, times (T,) and world_from_tool (T, 4, 4); as
-    it was first seen where they do not show it in :data:`MOMENTS` moments."""
+    """The tool as all pictures show it that there are of its use, along a track that something else told, times (T,) and world_from_tool
+    (T, 4, 4); as it was first seen where they do not show it in :data:`MOMENTS` moments."""
     if min(bag.counts[f"{camera}/{COLOR}"] for camera in _cameras(bag)) < MOMENTS:
         return tool
     from magic_perception.following import reshaped_along
