@@ -138,10 +138,10 @@ def arc_curvature(a: ArrayLike, scale: ArrayLike) -> NDArray[np.float64]:
     return np.sign(a) * np.where(value > g[-1], np.abs(a) * 0.75, arc)
 
 
-def pyramid(size: float, count: int = SCALES) -> NDArray[np.float64]:
-    """Observation scales (count,) in pixels, geometric, for an object of that size in pixels."""
+def pyramid(size: float) -> NDArray[np.float64]:
+    """Observation scales (SCALES,) in pixels, geometric, for an object of that size in pixels."""
     low = max(SMALLEST_SCALE * size, SCALE_FLOOR)
-    return np.geomspace(low, max(LARGEST_SCALE * size, 1.5 * low), count)
+    return np.geomspace(low, max(LARGEST_SCALE * size, 1.5 * low), SCALES)
 
 
 @dataclass(frozen=True)
@@ -576,7 +576,6 @@ def estimate(
     index: int,
     concave: bool | None = None,
     scales: NDArray[np.float64] | None = None,
-    two_step: bool = True,
 ) -> Estimate:
     """Curvature at the contour point ``index`` and its motion functional scale.
 
@@ -584,7 +583,7 @@ def estimate(
     the convexity search, scale by scale, and only scales with that sign are accepted,
     if there is one.  Raises ``NO_CURVATURE`` where no scale has enough points.
     """
-    found = estimate_many(contour, np.array([int(index)]), concave, scales, two_step)[0]
+    found = estimate_many(contour, np.array([int(index)]), concave, scales)[0]
     if found is None:
         raise MagicError(
             Code.NO_CURVATURE, "contour points around the contact", int(contour.lengths[contour.loop[index]]), "at least 5 on its edge"

@@ -13,21 +13,23 @@ from magic_core.scene import CanonicalView
 
 _SHIFT = 4  # sub-pixel drawing: 1/16 px
 CONTACT, CIRCLE, NORMAL, LABEL = (255, 60, 60), (80, 220, 255), (255, 220, 60), (240, 240, 240)
+#: How strongly a heat map covers the picture where it is hottest.
+STRENGTH = 0.65
 
 
 def _fixed(value: float) -> int:
     return int(round(float(np.clip(value, -20000, 20000)) * 2**_SHIFT))
 
 
-def overlay(image: NDArray[np.uint8], heatmap: NDArray[np.float32], strength: float = 0.65) -> NDArray[np.uint8]:
+def overlay(image: NDArray[np.uint8], heatmap: NDArray[np.float32]) -> NDArray[np.uint8]:
     """The image (H, W, 3) uint8 RGB with a heat map (H, W) in 0..1 over it, transparent where it is 0."""
     colors = cv2.cvtColor(cv2.applyColorMap((np.clip(heatmap, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
-    share = strength * np.clip(heatmap * 3, 0, 1)[..., None]
+    share = STRENGTH * np.clip(heatmap * 3, 0, 1)[..., None]
     return np.clip(image * (1 - share) + colors * share, 0, 255).astype(np.uint8)
 
 
 def draw_match(
-    view: CanonicalView, contact: Contact | Sequence[Contact] | None, heatmap: NDArray[np.float32] | None = None, labels: bool = True
+    view: CanonicalView, contact: Contact | Sequence[Contact] | None, heatmap: NDArray[np.float32] | None = None
 ) -> NDArray[np.uint8]:
     """The view's picture (H, W, 3) uint8 RGB with contacts on it, best first: a dot, the normal, the circle of curvature.
 
@@ -57,7 +59,7 @@ def draw_match(
         cv2.circle(
             image, (_fixed(point[0]), _fixed(point[1])), _fixed(0.013 * side if first else 0.008 * side), CONTACT, -1, cv2.LINE_AA, _SHIFT
         )
-        if labels and not first:
+        if not first:
             at = (int(round(point[0] + 0.015 * side)), int(round(point[1] - 0.015 * side)))
             cv2.putText(image, str(rank + 1), at, cv2.FONT_HERSHEY_SIMPLEX, 0.0012 * side, LABEL, 1, cv2.LINE_AA)
     return image

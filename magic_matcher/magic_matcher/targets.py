@@ -26,6 +26,8 @@ LEAST_ACROSS = 0.03
 #: Finds the place on a target, in its view, that is like the strategy's contact on the demonstrated one, of those that face a picture
 #: direction (2,).
 FeatureOf = Callable[[Strategy, CanonicalView, NDArray[np.float64]], Contact]
+#: Points within so many pixels of the farthest are of one flat side.
+FLAT = 0.5
 
 
 @dataclass(frozen=True)
@@ -89,12 +91,12 @@ def contact_on(strategy: Strategy, view: CanonicalView, world_from_object: NDArr
     return contact
 
 
-def support_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
+def support_point(contour: Contour, direction: NDArray[np.float64]) -> int:
     """Index of the contour point farthest along a picture direction (2,); in the middle of a flat side."""
-    return _middle_of_highest(contour, np.nonzero(contour.loop == 0)[0], direction, tolerance)
+    return _middle_of_highest(contour, np.nonzero(contour.loop == 0)[0], direction, FLAT)
 
 
-def inner_point(contour: Contour, direction: NDArray[np.float64], tolerance: float = 0.5) -> int:
+def inner_point(contour: Contour, direction: NDArray[np.float64]) -> int:
     """Index of the contour point that a tool meets which is led against a picture direction (2,) inside the object.
 
     Inside is where, going from the object along ``direction``, one comes to the object again: a hole, a notch.  Of several the one
@@ -117,7 +119,7 @@ def inner_point(contour: Contour, direction: NDArray[np.float64], tolerance: flo
     # Stretches: neighbours on one loop.  A loop that begins within a stretch cuts it in two, which changes nothing that counts.
     stretch = np.concatenate([[0], np.cumsum((np.diff(towards) > 3) | (np.diff(contour.loop[towards]) != 0))])
     widest = stretch[int(np.argmax(across))]
-    return _middle_of_highest(contour, towards[stretch == widest], -direction, tolerance)
+    return _middle_of_highest(contour, towards[stretch == widest], -direction, FLAT)
 
 
 def _middle_of_highest(contour: Contour, among: NDArray[np.int64], direction: NDArray[np.float64], tolerance: float) -> int:

@@ -23,6 +23,8 @@ SEARCHES = 2
 LONGEST = 8.0
 #: Joint step, rad, at which a path is looked at that will be moved along, and one that is only tried.
 FINE, COARSE = 0.03, 0.08
+#: A path is shortened at random places so many times.
+ROUNDS = 15
 
 
 class FreeMotion:
@@ -160,10 +162,10 @@ def straight(start: Array, goal: Array, step: float) -> Array:
     return start + (goal - start) * (np.arange(parts + 1) / parts)[:, None]
 
 
-def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str, rounds: int = 15) -> Array:
+def _shorten(robot: Robot, path: Array, rng: np.random.Generator, budget: Budget, stage: str) -> Array:
     """Replace stretches of a path (n, J) by straight lines wherever those are free: from corner to corner, then at random places."""
     path = _pulled(robot, path, budget, stage)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         if len(path) < 3:
             break
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])

@@ -28,6 +28,11 @@ from magic_planner.robot import Robot
 
 #: Sine of the slope up to which fingers are made to close level, which turns them against the faces by as much.
 LEVEL = 0.17
+#: Grasps that are looked at together: more would fill the memory.
+CHUNK = 256
+#: Lines along the closing axis on a pad: across the fingers and along them.
+ACROSS = 5
+DEEP = 5
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ def surface(
 
 
 def in_the_way(
-    robot: Robot, frames: NDArray[np.float64], static: NDArray[np.float64], swept: NDArray[np.float64], standoff: float, chunk: int = 256
+    robot: Robot, frames: NDArray[np.float64], static: NDArray[np.float64], swept: NDArray[np.float64], standoff: float
 ) -> NDArray[np.bool_]:
     """(G,) whether any of the points, all in the tool frame, lies within a box about a link of the open hand.
 
@@ -118,8 +123,8 @@ def in_the_way(
         origins = frames[:, :3, 3]
         reached = np.all((points > origins.min(axis=0) - far) & (points < origins.max(axis=0) + far), axis=1) if len(frames) else []
         transposed = points[reached].astype(np.float32).T
-        for first in range(0, len(frames), chunk):
-            part = slice(first, first + chunk)
+        for first in range(0, len(frames), CHUNK):
+            part = slice(first, first + CHUNK)
             axes = np.ascontiguousarray(frames[part, :3, :3].transpose(2, 0, 1), dtype=np.float32)
             local = np.matmul(axes, transposed)  # (3, G, N), each axis of the hand by itself: that is what makes it quick
             local -= np.einsum("kgi,gi->kg", axes, origins[part].astype(np.float32))[:, :, None]
@@ -324,18 +329,16 @@ def _levelled(directions: NDArray[np.float64], up: NDArray[np.float64]) -> NDArr
     return np.asarray(level / np.linalg.norm(level, axis=1, keepdims=True))
 
 
-def pad_profiles(
-    robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh], across: int = 5, deep: int = 5
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What each finger pad meets when it closes: heights (G, across, deep, 2) of the tool over the plane between the pads, metres.
+def pad_profiles(robot: Robot, frames: NDArray[np.float64], pieces: Sequence[Mesh]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What each finger pad meets when it closes: heights (G, ACROSS, DEEP, 2) of the tool over the plane between the pads, metres.
 
     One line along the closing axis for each cell of a grid on the pad; [..., 0] is the height towards the finger on the
     positive side of that axis, [..., 1] towards the other, -inf where the line meets nothing between the open fingers.
-    Also returns the grid's points (across, deep, 2) on the pad: metres across the fingers and along them, towards the tips.
+    Also returns the grid's points (ACROSS, DEEP, 2) on the pad: metres across the fingers and along them, towards the tips.
     """
     index = "xy".index(robot.config.closing_axis)
     half, reach = 0.8 * robot.pad_half_width, robot.tip_reach - 0.001
-    grid = np.stack(np.meshgrid(np.linspace(-half, half, across), np.linspace(-reach, reach, deep), indexing="ij"), axis=-1)
+    grid = np.stack(np.meshgrid(np.linspace(-half, half, ACROSS), np.linspace(-reach, reach, DEEP), indexing="ij"), axis=-1)
     flat = grid.reshape(-1, 2)
     closing, origin = frames[:, :3, index], frames[:, :3, 3]
     starts = origin[:, None] + flat[None, :, :1] * frames[:, None, :3, 1 - index] + flat[None, :, 1:] * frames[:, None, :3, 2]
@@ -347,7 +350,7 @@ def pad_profiles(
         met = (found.leave > found.enter + 1e-6) & (found.leave < open_half + 0.002) & (found.enter > -open_half - 0.002)
         lines, ends = found.lines[met], np.stack([found.leave[met], -found.enter[met]], axis=1)
         heights[lines] = np.maximum(heights[lines], ends)
-    return heights.reshape(len(frames), across, deep, 2), grid
+    return heights.reshape(len(frames), ACROSS, DEEP, 2), grid
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,14 @@ from magic_core.errors import Code, MagicError
 
 Array = NDArray[np.float64]
 GRAVITY = np.array([0.0, 0.0, -9.81])
+#: Of a step towards a pose: damped least squares, and no joint goes farther (rad).
+DAMPING = 1e-2
+LARGEST_STEP = 0.4
+#: A branch that comes nearer to a joint's limit than this (rad) ends there.
+MARGIN = 0.01
+#: Each pose of a path is followed in so many steps, the first of which goes this share of the way to the middle of the ranges.
+ITERATIONS = 6
+PULL = 0.02
 
 
 @dataclass(frozen=True)
@@ -97,10 +105,10 @@ class Chain:
         linear = np.where(turning, np.cross(axes, arm), axes)
         return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
 
-    def gravity_torques(self, q: Array, payload: float = 0.0, payload_centre: Array | None = None, force: Array | None = None) -> Array:
+    def gravity_torques(self, q: Array, payload: float = 0.0, payload_centre: Array | None = None) -> Array:
         """Torques (N, J) in N m (N for prismatic joints) that hold the arm still at q (N, J).
 
-        payload: kg in the hand, its centre (3,) in the tip frame; force (3,) newtons on the tip's origin, base axes.
+        payload: kg in the hand, its centre (3,) in the tip frame.
         """
         frames, tip = self.frames(np.atleast_2d(q))
         axes = np.einsum("njik,jk->nji", frames[:, :, :3, :3], self.axes)
@@ -112,8 +120,6 @@ class Chain:
         if payload:
             centre = np.zeros(3) if payload_centre is None else np.asarray(payload_centre)
             loads.append((self.count - 1, np.einsum("nij,j->ni", tip[:, :3, :3], centre) + tip[:, :3, 3], payload * GRAVITY))
-        if force is not None:
-            loads.append((self.count - 1, tip[:, :3, 3], np.asarray(force, dtype=float)))
         torques = np.zeros((len(tip), self.count))
         for last, point, weight in loads:
             for j in range(last + 1):
@@ -145,12 +151,12 @@ class Chain:
             q[active] = np.clip(q[active] + self._step(q[active], self.jacobian(frames, tip), error, pull), self.lower, self.upper)
         return q, solved
 
-    def _step(self, q: Array, jacobian: Array, error: Array, pull: float, damping: float = 1e-2, largest: float = 0.4) -> Array:
+    def _step(self, q: Array, jacobian: Array, error: Array, pull: float) -> Array:
         # Long errors are shortened: far from the goal the linear model holds for a short way only.
         size = np.linalg.norm(error, axis=1, keepdims=True)
         error = error * np.minimum(1.0, 0.5 / np.maximum(size, 1e-12))
         # The damping fades with the error, so that the last steps are Newton's.
-        squared = (damping * np.minimum(1.0, 4 * size[:, 0])) ** 2 + 1e-8
+        squared = (DAMPING * np.minimum(1.0, 4 * size[:, 0])) ** 2 + 1e-8
         transposed = jacobian.transpose(0, 2, 1)
         gram = jacobian @ transposed + squared[:, None, None] * np.eye(6)
         if pull:
@@ -160,11 +166,9 @@ class Chain:
         else:
             step = np.einsum("nij,ni->nj", jacobian, np.linalg.solve(gram, error[:, :, None])[:, :, 0])
         longest = np.abs(step).max(axis=1, keepdims=True)
-        return step * np.minimum(1.0, largest / np.maximum(longest, 1e-12))
+        return step * np.minimum(1.0, LARGEST_STEP / np.maximum(longest, 1e-12))
 
-    def track(
-        self, targets: Array, q: Array, jump: float = 0.35, margin: float = 0.01, iterations: int = 6, pull: float = 0.02
-    ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    def track(self, targets: Array, q: Array, jump: float = 0.35) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
         """Follow K poses with N branches at once, each step from the one before.
 
         targets (K, N, 4, 4) base_from_tip; q (N, J) solves the first pose.  Returns the paths (K, N, J),
@@ -184,20 +188,20 @@ class Chain:
             now = before + (before - paths[k - 2, alive]) * 0.8 if k > 1 else before.copy()
             now = np.clip(now, self.lower, self.upper)
             goal = targets[k, alive]
-            for n in range(iterations):
+            for n in range(ITERATIONS):
                 frames, tip = self.frames(now)
                 error = pose_error(goal, tip)
                 good = (np.linalg.norm(error[:, :3], axis=1) < 1e-4) & (np.linalg.norm(error[:, 3:], axis=1) < 5e-4)
                 if n and good.all():
                     break
-                move = self._step(now, self.jacobian(frames, tip), error, pull if n == 0 else 0.0)
+                move = self._step(now, self.jacobian(frames, tip), error, PULL if n == 0 else 0.0)
                 now = np.clip(now + move, self.lower, self.upper)
             else:
                 error = pose_error(goal, self.frames(now)[1])
             missed = (np.linalg.norm(error[:, :3], axis=1) > 2e-4) | (np.linalg.norm(error[:, 3:], axis=1) > 1e-3)
             jumped = np.abs(now - before).max(axis=1) > jump
             slack = np.minimum(now - self.lower, self.upper - now)
-            tight = slack.min(axis=1) < margin
+            tight = slack.min(axis=1) < MARGIN
             paths[k, alive] = now
             bad = missed | jumped | tight
             stopped[alive[bad]] = k

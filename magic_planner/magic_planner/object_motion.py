@@ -624,13 +624,12 @@ def demonstrated_motion(strategy: Strategy) -> tuple[NDArray[np.float64], NDArra
     return at, contacts, join_phases(pieces)
 
 
-def refined_times(
-    times: NDArray[np.float64], poses: NDArray[np.float64], length: float = STEP_LENGTH, angle: float = STEP_ANGLE
-) -> NDArray[np.float64]:
-    """The given times (T,) and as many between them as keep each step of poses (T, 4, 4) within length and angle."""
+def refined_times(times: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The given times (T,) and as many between them as keep each step of poses (T, 4, 4) within :data:`STEP_LENGTH` and
+    :data:`STEP_ANGLE`."""
     moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turned = turning(poses[:-1], poses[1:])
-    parts = np.maximum(1, np.ceil(np.maximum(moved / length, turned / angle) - 1e-9)).astype(int)
+    parts = np.maximum(1, np.ceil(np.maximum(moved / STEP_LENGTH, turned / STEP_ANGLE) - 1e-9)).astype(int)
     inner = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(times[:-1], times[1:], parts, strict=True)]
     return np.concatenate([times[:1], *inner])
 

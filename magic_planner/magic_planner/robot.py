@@ -31,6 +31,10 @@ from magic_planner.timing import Limits
 SEEDS = 6000
 #: How far the table's slab lies below its plane, m: what lies on it does not touch it.
 TABLE_GAP = 0.001
+#: A path is checked for collisions at steps of so many rad.
+CHECKED = 0.04
+#: A solution keeps so far from the limits of the joints, rad.
+FROM_LIMIT = 0.02
 
 
 @dataclass(frozen=True)
@@ -240,19 +244,17 @@ class Robot:
                 return False
         return True
 
-    def first_collision(
-        self, path: NDArray[np.float64], step: float = 0.04, budget: Budget | None = None, stage: str = ""
-    ) -> tuple[int, Collision] | None:
+    def first_collision(self, path: NDArray[np.float64], budget: Budget | None = None, stage: str = "") -> tuple[int, Collision] | None:
         """Index of the first row of a path (N, J) before which the arm touches something, and the pair.
 
-        Rows are joined by straight lines, checked every ``step`` rad.
+        Rows are joined by straight lines, checked every :data:`CHECKED` rad.
         """
         for i, q in enumerate(path):
             if budget is not None and i % 16 == 0:
                 budget.check(stage)
             between = [q]
             if i:
-                parts = max(1, int(np.ceil(np.abs(q - path[i - 1]).max() / step)))
+                parts = max(1, int(np.ceil(np.abs(q - path[i - 1]).max() / CHECKED)))
                 between = [path[i - 1] + (q - path[i - 1]) * n / parts for n in range(1, parts + 1)]
             for point in between:
                 if self.collides(point):
@@ -290,7 +292,7 @@ class Robot:
         self.inverse(np.repeat(self.chain.forward(self.home)[None], 4, axis=0))
 
     def inverse(
-        self, targets: NDArray[np.float64], starts: NDArray[np.float64] | None = None, seeds: int = 12, margin: float = 0.02
+        self, targets: NDArray[np.float64], starts: NDArray[np.float64] | None = None, seeds: int = 12
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """All solutions found for poses (N, 4, 4): index of the pose (S,) and joint positions (S, J), near duplicates left out.
 
@@ -305,7 +307,7 @@ class Robot:
             )
         each = near.shape[1]
         q, solved = self.chain.solve(np.repeat(targets, each, axis=0), near.reshape(-1, self.count), iterations=25)
-        inside = np.minimum(q - self.chain.lower, self.chain.upper - q).min(axis=1) > margin
+        inside = np.minimum(q - self.chain.lower, self.chain.upper - q).min(axis=1) > FROM_LIMIT
         index = np.repeat(np.arange(len(targets)), each)
         keep_index: list[int] = []
         keep_q: list[NDArray[np.float64]] = []

@@ -29,6 +29,8 @@ LIGHT = np.array([-0.35, -0.45, 1.0])
 OVERSAMPLING = 1.25
 #: Pixels for a letter of the caption, on the average of English sentences.
 LETTER = 7.5
+#: The table's squares, m.
+SQUARE = 0.1
 
 
 def _painted(item: SceneObject, color: tuple[int, int, int], world_from_object: NDArray[np.float64]) -> Mesh:
@@ -38,20 +40,20 @@ def _painted(item: SceneObject, color: tuple[int, int, int], world_from_object: 
     return mesh.transformed(world_from_object)
 
 
-def _table(plane: NDArray[np.float64], centre: NDArray[np.float64], size: float = 4.0, square: float = 0.1) -> Mesh:
-    """A chequered piece of the table plane around a world point; squares of ``square`` metres, aligned with the world."""
-    count = int(size / square)
-    low = np.floor(centre[:2] / square) * square - count // 2 * square
+def _table(plane: NDArray[np.float64], centre: NDArray[np.float64], size: float = 4.0) -> Mesh:
+    """A chequered piece of the table plane around a world point; squares of :data:`SQUARE` metres, aligned with the world."""
+    count = int(size / SQUARE)
+    low = np.floor(centre[:2] / SQUARE) * SQUARE - count // 2 * SQUARE
     vertices, faces, colors = [], [], []
     a, b, c, d = plane
     for i in range(count):
         for j in range(count):
-            x, y = low + square * np.array([i, j])
-            corners = np.array([[x, y], [x + square, y], [x + square, y + square], [x, y + square]])
+            x, y = low + SQUARE * np.array([i, j])
+            corners = np.array([[x, y], [x + SQUARE, y], [x + SQUARE, y + SQUARE], [x, y + SQUARE]])
             k = len(vertices)
             vertices += [[*p, -(a * p[0] + b * p[1] + d) / c] for p in corners]
             faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
-            colors += [TABLE_COLORS[(round(x / square) + round(y / square)) % 2]] * 4
+            colors += [TABLE_COLORS[(round(x / SQUARE) + round(y / SQUARE)) % 2]] * 4
     return Mesh(np.array(vertices), np.array(faces), np.array(colors, dtype=np.uint8))
 
 

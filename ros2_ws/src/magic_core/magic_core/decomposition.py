@@ -38,6 +38,10 @@ SPACING = 0.002
 DIRECTIONS = 32
 MAX_EXTENT = 5.0
 MIN_EXTENT = 0.002
+#: Cubes along a mesh's longest edge, but for thin things.
+RESOLUTION = 56
+#: Boxes at most, before pieces that fill hollows are cut further.
+BOXES = 400
 
 
 def extremes(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
@@ -57,9 +61,9 @@ def _directions(count: int) -> NDArray[np.float64]:
     return np.column_stack([np.cos(angle) * np.sqrt(1 - z * z), np.sin(angle) * np.sqrt(1 - z * z), z])
 
 
-def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Mesh, ...]:
-    """Convex pieces in the mesh's frame; ``resolution`` cubes along the longest edge (for thin things up
-    to :data:`FINEST`), of at most ``most`` boxes; pieces that fill hollows are cut further, up to :data:`ALL`.
+def convex_pieces(mesh: Mesh) -> tuple[Mesh, ...]:
+    """Convex pieces in the mesh's frame; :data:`RESOLUTION` cubes along the longest edge (for thin things up
+    to :data:`FINEST`), of at most :data:`BOXES` boxes; pieces that fill hollows are cut further, up to :data:`ALL`.
 
     Raises ``BAD_MESH`` for a mesh without faces, or of a size that cannot be simulated.
     """
@@ -69,7 +73,7 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
     extent = float((high - low).max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
         raise MagicError(Code.BAD_MESH, "largest extent of the mesh", f"{extent:.3g} m", f"{MIN_EXTENT} to {MAX_EXTENT} m")
-    pitch = max(min(extent / resolution, float((high - low).min()) / THINNEST), extent / max(resolution, FINEST))
+    pitch = max(min(extent / RESOLUTION, float((high - low).min()) / THINNEST), extent / max(RESOLUTION, FINEST))
     surface = _surface(mesh, pitch)
     origin = low - 1.5 * pitch
     index = np.floor((surface - origin) / pitch).astype(int)
@@ -81,7 +85,7 @@ def convex_pieces(mesh: Mesh, resolution: int = 56, most: int = 400) -> tuple[Me
     if hull is not None and _volume(mesh, grid, filled, pitch) >= CONVEX * ConvexHull(hull.vertices).volume:
         return (hull,)
     boxes = _boxes(filled)
-    boxes = sorted(boxes, key=lambda b: -int(np.prod(b[1] - b[0])))[:most]
+    boxes = sorted(boxes, key=lambda b: -int(np.prod(b[1] - b[0])))[:BOXES]
     tree = cKDTree(surface)
     pieces = []
     for lower, upper in boxes:

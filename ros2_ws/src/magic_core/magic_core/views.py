@@ -26,6 +26,8 @@ _APART = np.deg2rad(25.0)
 _PLAIN = 0.03
 #: Skewness of a surface across a plane of symmetry, at most: reconstructions are not quite symmetric.
 _SKEW = 0.25
+#: Directions of an object's own shape, at most.
+DIRECTIONS = 3
 
 
 def find_view(
@@ -114,11 +116,11 @@ def view_of_contact(item: SceneObject, kind: str, object_from_contact: NDArray[n
     return along(item.mesh, item.pieces, kind, direction)
 
 
-def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]:
+def own_directions(mesh: Mesh, kind: str) -> NDArray[np.float64]:
     """Directions (K, 3) of an object's own shape in which it may have been meant to be seen, whatever its attitude, best first.
 
     Silhouettes: of the principal axes of the surface and of directions all over the sphere, those in which holes and
-    notches show most, at most ``count`` and well apart; none for what is convex from everywhere.  A hole shows in the
+    notches show most, at most :data:`DIRECTIONS` and well apart; none for what is convex from everywhere.  A hole shows in the
     topology of the mask (:func:`holes_of`), how much it tells is its area.  ``section``: the three principal axes; a plane
     of symmetry is across one of them. They turn with the object; of a direction and its opposite, whose pictures mirror
     each other, the one nearer to :func:`own_axes` is given.
@@ -138,7 +140,7 @@ def own_directions(mesh: Mesh, kind: str, count: int = 3) -> NDArray[np.float64]
     # Summits alone: the slopes of one show the same, only worse.
     near = np.abs(tried @ tried.T) > np.cos(0.8 * _APART)
     left = (told > _PLAIN) & (told >= np.where(near, told, 0.0).max(axis=1))
-    while left.any() and len(found) < count:
+    while left.any() and len(found) < DIRECTIONS:
         best = int(np.argmax(np.where(left, told, -1.0)))
         direction, value = _refined(caster, mesh, tried[best], axes)
         # Shapes with a plane of symmetry are told best across it, exactly along an axis.
