@@ -89,7 +89,7 @@ class ArmPlanner:
         budget: Budget | None = None,
         feedback: Callable[[str, str], None] = lambda stage, message: None,
     ) -> MotionPlan:
-        """:meth:`solve` of a problem by its parts (:class:`Problem`), as scripts outside this repository ask for it."""
+        """:meth:`solve` for a caller that has the parts of a :class:`Problem`, as a script has them."""
         problem = Problem(strategy, tool, target, candidate, reflection, motion, table, obstacles, start, attempt, seed)
         return self.solve(problem, budget, feedback)
 

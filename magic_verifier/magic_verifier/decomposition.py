@@ -1,4 +1,4 @@
-"""Convex pieces of a mesh, by their former place: scripts outside this repository import them from here."""
+"""Convex pieces of a mesh: :mod:`magic_core.decomposition`, by the name that scripts of users import."""
 
 from magic_core.decomposition import convex_pieces
 

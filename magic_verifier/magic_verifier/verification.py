@@ -155,7 +155,7 @@ def verify(
     seed: int = 0,
     **options: Any,
 ) -> Verdict:
-    """:func:`verify_proposal` of a plan by its parts, as scripts outside this repository ask for it; options: those of both.
+    """:func:`verify_proposal` for a caller that has the parts of a :class:`Proposal`, as a script has them; options: those of both.
 
     ``candidate``, the contact that the plan was made for, goes into no verdict.
     """

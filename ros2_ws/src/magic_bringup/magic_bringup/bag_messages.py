@@ -1,3 +1,5 @@
-"""Reading a bag's messages, by its former name: scripts outside this repository import it from here."""
+"""Reading a bag's messages: :mod:`magic_bags.bag_messages`, by the name that scripts of users import."""
 
-from magic_bags.bag_messages import *  # noqa: F403
+from magic_bags.bag_messages import messages
+
+__all__ = ["messages"]

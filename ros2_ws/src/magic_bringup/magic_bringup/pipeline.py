@@ -1,3 +1,5 @@
-"""The candidates of a run, by its former name: scripts outside this repository import it from here."""
+"""In which order the candidates of a run are tried: :class:`magic_server.pipeline.Agenda`, by the name that scripts of users import."""
 
-from magic_server.pipeline import *  # noqa: F403
+from magic_server.pipeline import Agenda
+
+__all__ = ["Agenda"]

@@ -1,3 +1,5 @@
-"""Recording a made scene, by its former name: scripts outside this repository import it from here."""
+"""Writing a bag: :class:`magic_bags.recording.Recording`, by the name that scripts of users import."""
 
-from magic_bags.recording import *  # noqa: F403
+from magic_bags.recording import Recording
+
+__all__ = ["Recording"]
