@@ -302,9 +302,11 @@ def test_same_frames_same_scene(hooking):
         np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
 
 
-def test_the_papers_method(hooking):
-    _, captured, _, _ = hooking
-    for item in perceive([c[0] for c in captured], parameters=Parameters(method="paper")).objects:
+def test_the_papers_method_closes_the_mesh_of_each_thing(hooking):
+    meshes, captured, _, _ = hooking
+    objects = perceive([c[0] for c in captured], parameters=Parameters(method="paper")).objects
+    assert len(objects) == len(meshes)
+    for item in objects:
         tight(item.mesh)
 
 
