@@ -70,14 +70,7 @@ def action_info(arguments: list[str]) -> int:
 
 
 def action_list(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="ros2 action list", description="Output a list of action names")
-    parser.add_argument("-t", "--show-types", action="store_true", help="additionally show the action type")
-    parser.add_argument("-c", "--count-actions", action="store_true", help="only display the number of actions discovered")
-    parsed = parser.parse_args(arguments)
-    with connect.node() as node:
-        found = connect.settle(node, lambda: get_action_names_and_types(node))
-    connect.print_names(found, parsed.show_types, parsed.count_actions)
-    return 0
+    return connect.list_names("action", "Output a list of action names", get_action_names_and_types, arguments, may_hide=False)
 
 
 def action_send_goal(arguments: list[str]) -> int:

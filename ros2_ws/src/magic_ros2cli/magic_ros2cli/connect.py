@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -97,11 +98,26 @@ def hidden(name: str) -> bool:
     return any(part.startswith("_") for part in name.split("/"))
 
 
-def print_names(found: Iterable[tuple[str, list[str]]], show_types: bool, count: bool) -> None:
-    """Print names, with their types in brackets where that is asked for, or how many there are instead."""
-    found = sorted(found)
-    if count:
-        print(len(found))
-        return
-    for name, types in found:
-        print(f"{name} [{', '.join(types)}]" if show_types else name)
+def list_names(
+    kind: str, description: str, query: Callable[[Any], list[tuple[str, list[str]]]], arguments: list[str], may_hide: bool = True
+) -> int:
+    """The verb ``list`` of a kind of things: their names, with types where that is asked for, or how many there are instead.
+
+    query: names and types, of a node.  may_hide: whether ros2cli leaves hidden ones out, unless it is asked for them.
+    """
+    parser = argparse.ArgumentParser(prog=f"ros2 {kind} list", description=description)
+    parser.add_argument("-t", "--show-types", action="store_true", help=f"additionally show the {kind} type")
+    parser.add_argument("-c", f"--count-{kind}s", dest="count", action="store_true", help=f"only display the number of {kind}s discovered")
+    if may_hide:
+        parser.add_argument(f"--include-hidden-{kind}s", dest="all", action="store_true", help=f"consider hidden {kind}s as well")
+    parser.set_defaults(all=not may_hide)
+    parsed = parser.parse_args(arguments)
+    with node() as made:
+        found = settle(made, lambda: query(made))
+    shown = sorted((name, types) for name, types in found if parsed.all or not hidden(name))
+    if parsed.count:
+        print(len(shown))
+    else:
+        for name, types in shown:
+            print(f"{name} [{', '.join(types)}]" if parsed.show_types else name)
+    return 0

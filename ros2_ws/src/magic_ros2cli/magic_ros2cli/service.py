@@ -10,16 +10,7 @@ from magic_ros2cli.errors import CommandError
 
 
 def service_list(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="ros2 service list", description="Output a list of available services")
-    parser.add_argument("-t", "--show-types", action="store_true", help="additionally show the service type")
-    parser.add_argument("-c", "--count-services", action="store_true", help="only display the number of services discovered")
-    parser.add_argument("--include-hidden-services", action="store_true", help="consider hidden services as well")
-    parsed = parser.parse_args(arguments)
-    with connect.node() as node:
-        found = connect.settle(node, node.get_service_names_and_types)
-    shown = ((n, t) for n, t in found if parsed.include_hidden_services or not connect.hidden(n))
-    connect.print_names(shown, parsed.show_types, parsed.count_services)
-    return 0
+    return connect.list_names("service", "Output a list of available services", lambda node: node.get_service_names_and_types(), arguments)
 
 
 def service_type(arguments: list[str]) -> int:

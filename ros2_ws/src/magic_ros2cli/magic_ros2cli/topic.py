@@ -21,16 +21,7 @@ DURABILITIES = {"transient_local": DurabilityPolicy.TRANSIENT_LOCAL, "volatile":
 
 
 def topic_list(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="ros2 topic list", description="Output a list of available topics")
-    parser.add_argument("-t", "--show-types", action="store_true", help="additionally show the topic type")
-    parser.add_argument("-c", "--count-topics", action="store_true", help="only display the number of topics discovered")
-    parser.add_argument("--include-hidden-topics", action="store_true", help="consider hidden topics as well")
-    parsed = parser.parse_args(arguments)
-    with connect.node() as node:
-        found = connect.settle(node, node.get_topic_names_and_types)
-    shown = ((n, t) for n, t in found if parsed.include_hidden_topics or not connect.hidden(n))
-    connect.print_names(shown, parsed.show_types, parsed.count_topics)
-    return 0
+    return connect.list_names("topic", "Output a list of available topics", lambda node: node.get_topic_names_and_types(), arguments)
 
 
 def topic_info(arguments: list[str]) -> int:
