@@ -10,8 +10,9 @@ from magic_core.errors import Code, MagicError
 
 METHODS = ("completed", "paper")
 
-#: The workspace before a robot that the node takes where nothing else is said, m.
-WORKSPACE = {"region_low": (0.15, -0.6, -0.05), "region_high": (0.95, 0.6, 0.5)}
+#: The workspace before a robot that the node takes where nothing else is said, m. It begins at the robot's base, which is cut out of the
+#: pictures: a motion that pulls something towards the robot may end right beside it, and what came of it is to be seen.
+WORKSPACE = {"region_low": (0.0, -0.6, -0.05), "region_high": (0.95, 0.6, 0.5)}
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,8 @@ REMEDIES: dict[Code, Remedy] = {
     ),
     Code.GOAL_UNSEEN: Remedy(
         "Carried out, but whether the goal is met cannot be told by what cameras see.",
-        "Look for yourself; another camera where the message says that something is not seen; loop.judge: false asks no such thing.",
+        "Look for yourself; another camera, or a larger region (region_low, region_high), where the message says that something is not seen; "
+        "loop.judge: false asks no such thing.",
     ),
     Code.ARM_NOT_AT_REST: Remedy(
         "The arm was told to stop and is not known to stand.",
