@@ -209,8 +209,8 @@ def run_case(options: Options, case: Case, film: Path | None = None) -> dict[str
         # The reason of a failure is that of the best-scored candidate.
         answer["reason"] = "NO_MATCH" if not tried else "OK" if answer["success"] else tried[0]["code"]
     except MagicError as error:
-        if error.code == Code.BAD_REQUEST and problem is None:
-            raise  # a name by which nothing can be made: no failure of the method
+        if error.code in (Code.BAD_REQUEST, Code.BAD_STRATEGY) and problem is None:
+            raise  # a name by which nothing can be made, a scene that is not told: no failure of the method
         answer["reason"] = error.code.name
         tried.append({"code": error.code.name, "message": error.message})
     if options.source == "images":
@@ -471,7 +471,8 @@ def _stored(path: Path) -> dict[str, Any] | None:
 
 
 def attempt(options: Options, case: Case, film: Path | None) -> dict[str, Any]:
-    """:func:`run_case` with its wall time; an error that nothing foresaw is a failure of this case alone.  Raises BAD_REQUEST for names of nothing."""
+    """:func:`run_case` with its wall time; an error that nothing foresaw is a failure of this case alone.  Raises BAD_REQUEST
+    for names of nothing, BAD_STRATEGY for a scene that the strategy does not tell."""
     started = time.perf_counter()
     try:
         result = run_case(options, case, film)

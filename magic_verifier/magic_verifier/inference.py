@@ -31,7 +31,7 @@ turned on the spot, is refused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,10 @@ MOVED, TIPPED = 0.02, 45.0
 OTHERWISE = 0.005
 #: What is tilted by more than this (degrees) and was not tipped over has rolled; what is turned about the vertical by more was turned.
 ROLLED, TURNED = 5.0, 15.0
+#: What was up of a thing that fell the way that it was led points within this (rad) of that way.
+ASIDE = np.deg2rad(30.0)
+#: It falls to the same side within this (degrees): a standing cylinder that is met a little beside its middle rolls on its rim as it falls.
+SAME_SIDE = 60.0
 #: How long (s) things are watched after the motion, and how fast (m/s) what has come to rest may still be.
 AFTER, SLOW = 1.0, 0.1
 #: Touch is looked for every so many steps.
@@ -72,7 +76,7 @@ class Changed:
     it last touched it, holds it against being pulled on; tool_on: what the tool rests on when it is let go, nothing where it falls; tool_height: of its
     middle above the table then.  stood_on: what the target touched at first; lifted, farthest: by how much its middle was higher than at first,
     and how far the tool led it from there along the table, at most; tumbled (degrees): how far what was
-    up was ever tilted; turned (degrees): about the vertical in the end; fixtures: ids of what is known to stand fast.
+    up was ever tilted; turned (degrees): about the vertical in the end; up (3,): where what was up points in the end, world; fixtures: ids of what is known to stand fast.
     """
 
     way: Array
@@ -89,6 +93,7 @@ class Changed:
     farthest: float = 0.0
     tumbled: float = 0.0
     turned: float = 0.0
+    up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     fixtures: tuple[str, ...] = ()
 
     @property
@@ -128,14 +133,18 @@ class Changed:
             lines.append(f"the tool {'encloses it' if self.encloses else 'only pushes it: it does not enclose it'}")
         return lines
 
-    def unasked(self) -> list[str]:
-        """What was changed that no goal which is found asks for, in words."""
-        lines = []
+    def unasked(self, goal: Goal) -> list[str]:
+        """What was changed that a goal does not ask for, in words."""
+        nodes = list(goal.written.nodes())
+        touched = {node.args["whom"] for node in nodes if node.kind == "touching"}
+        lines = [f"that the target touches {name}" for name in self.on if name in self.fixtures and name not in touched]
         others = [name for name in self.on if name not in (TABLE, TOOL, *self.fixtures)]
         if others:
             lines.append(
-                f"that the target touches {', '.join(others)}: other scenes name what they see otherwise, and only fixtures keep their names"
+                f"that the target touches {', '.join(others)}: what is seen has another name in other scenes, and only fixtures keep theirs"
             )
+        if self.lifted > max(self.rise, 0.0) + MOVED and self.tilt <= ROLLED and not any(node.ever for node in nodes):
+            lines.append(f"that the target is lifted by {1000 * self.lifted:.0f} mm on its way")
         if self.turned > TURNED and not self.rolled:
             lines.append(f"that the target turns by {self.turned:.0f} degrees about the vertical")
         if self.farthest > self.level + MOVED:
@@ -208,6 +217,7 @@ def changed(
         farthest,
         tumbled,
         turned,
+        pose[:3, :3] @ start[2, :3],
         tuple(item.id for item in obstacles if item.source != "camera"),
     )
 
@@ -255,8 +265,10 @@ def proposals(seen: Changed, normal: Array | None = None) -> list[Goal]:
         return [shipped("scoop", height=height), shipped("carry", height=height)]
     if seen.tilt > TIPPED and max(abs(seen.rise), seen.lifted) > OTHERWISE:
         tip = shipped("tip", angle=float(np.floor(SHARE * seen.tilt / 5.0) * 5.0))
-        side = [_moved(_along(seen, normal), OTHERWISE, "it fell to another side")] if seen.level > MOVED else []
-        return [_and(tip, [*side, *_supports(seen)])]
+        # Of what is turned right over no side is told, nor of what fell aside of the way that it was led.
+        ahead = seen.level > MOVED and float(seen.up @ transforms.unit(seen.way * [1.0, 1.0, 0.0])) > np.cos(ASIDE)
+        side = {"points": {"what": TARGET, "along": _along(seen, normal), "within": SAME_SIDE}, "say": "it fell to another side"}
+        return [_and(tip, [side] * ahead + _supports(seen))]
     if seen.level > MOVED:
         return _moves(seen, _along(seen, normal))
     if seen.farthest <= MOVED and (seen.rolled or seen.turned <= TURNED) and seen.touched:

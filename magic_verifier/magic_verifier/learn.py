@@ -667,6 +667,11 @@ def _learn(given: argparse.Namespace) -> int:
     alone = not demonstration.obstacles
     strategy = replace(learned.strategy, environment={"world_from_target": pose_data(target.world_from_object)} if alone else {})
     _say(learned, strategy)
+    if not alone:
+        print(
+            "note: fixtures and other things stood there, which a strategy does not tell of: to evaluate it, write world_from_target and fixtures "
+            "under environment in strategy.yaml (magic_core/shapes/fixtures.py says how)"
+        )
     return _keep(learned, strategy, given)
 
 

@@ -6,7 +6,8 @@
 2. The plane in which the contact is reasoned about is chosen: across the thinnest side of the tool in which both contacts are on an
    outline where they were shown.  Looked at from above if that direction is upright, else from the side; in section where the contact is
    inside the silhouette, as a bowl's is.  The target may be met outside, in a hole or notch, or inside its cut.  What is round was
-   met somewhere near the middle of the way that it was led: the contact is there.
+   met somewhere near the middle of the way that it was led: the contact is there.  Where two flat sides lay on each other any point of them
+   may be what pressed: the contact is in the middle of the target's, with the normal of the way.
 3. The part of the motion that belongs to the contact is kept, with its phases: approach, contact, goal, retreat.  Where the tool keeps
    its attitude it becomes waypoints (mode ``plan``), else it is carried over as it is (``retarget``).
 4. Where no goal is given it is found (:mod:`magic_verifier.inference`): of those that what was changed suggests, the strictest that the
@@ -36,7 +37,7 @@ from magic_matcher.matching import target_contact
 from magic_matcher.targets import target_view
 from magic_verifier import goals
 from magic_verifier.demonstration import Meeting, Replay, replay
-from magic_verifier.floating import TARGET
+from magic_verifier.floating import TABLE, TARGET
 from magic_verifier.inference import Changed, changed, proposals
 from magic_verifier.posing import box_axes
 from magic_verifier.verification import Proposal, Verdict, verify_proposal
@@ -239,31 +240,84 @@ class _Draft:
         """As :func:`_drafted`, looked at along a direction (3,).
 
         A round thing that was met a millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led,
-        and so does the tool; in a hollow hardly wider than it any number of degrees.  There the normals are those of the way.
+        and so does the tool; in a hollow hardly wider than it any number of degrees.  Flat sides press on each other along their edges, with the
+        normals of neither.  There the normals are those of the way.
         """
         found, way = self.found, self.way
-        draft, target_gap, tool_gap = self._read(direction, self.towards, found)
+        draft, target_gap, tool_gap, found = self._read(direction, self.towards, found)
         radius = draft.target_contact.disc_radius if draft.target_outline == "outer" else None
-        if not radius or way @ self.towards >= 0:
+        flat = draft.target_outline == "outer" and bool(np.isinf(draft.target_contact.radius))
+        if not (radius or flat) or way @ self.towards >= 0:
             return draft, tool_gap, target_gap, 0.0
         led = levelled(transforms.unit(way - (way @ direction) * direction))
         tool_led = self.world_from_tool[:3, :3].T @ led
-        about = radius if _elsewhere(draft, found, tool_led, radius) <= OFF_OUTLINE else 0.0
         askew = float(np.arccos(np.clip(-(way @ self.towards) / np.linalg.norm(way), -1.0, 1.0)))
+        target_led = -self.demonstration.target.world_from_object[:3, :3].T @ led
+        if radius is None:
+            if askew >= NEARLY:
+                return draft, tool_gap, target_gap, 0.0
+            draft, target_gap, tool_gap, _ = self._read(direction, -led, replace(found, tool_normal=tool_led, target_normal=target_led))
+            return replace(draft, tool_contact=_led(draft, tool_led, 0.0)), tool_gap, target_gap, 0.0
+        about = radius if _elsewhere(draft, found, tool_led, radius) <= OFF_OUTLINE else 0.0
         if not about and askew >= NEARLY:
             return draft, tool_gap, target_gap, askew
         # On a round thing the place goes with the normal.
-        target_led = -self.demonstration.target.world_from_object[:3, :3].T @ led
         met = found.target_point + radius * (target_led - found.target_normal)
-        draft, _, tool_gap = self._read(direction, -led, replace(found, tool_normal=tool_led, target_point=met, target_normal=target_led))
+        draft, _, tool_gap, _ = self._read(
+            direction, -led, replace(found, tool_normal=tool_led, target_point=met, target_normal=target_led)
+        )
         draft = replace(draft, tool_contact=_led(draft, tool_led, about))
         view = draft.target_view
         off = view.pixels(draft.target_contact.object_from_contact[:3, 3]) - view.pixels(found.target_point)
         return draft, tool_gap, float(np.linalg.norm(off)) * view.metres_per_pixel, 0.0
 
-    def _read(self, direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float, float]:
+    def _read(self, direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float, float, Replay]:
         """The draft with contacts as they were read, ``towards`` (3,) the target's outward normal; how far (m) the target's and the tool's are
-        from where they were shown."""
+        from where they were shown; and what was read.
+
+        Where flat sides lie on each other any point of them may be what presses: there the contact is taken to be in the middle of the target's.
+        """
+        draft, tool_gap = self._seen(direction, towards, read)
+        try:
+            return *_target_contact(draft, self.demonstration.target, read), tool_gap, read
+        except MagicError:
+            slid = self._slid(draft, read)
+            if slid is None:
+                raise
+        draft, tool_gap = self._seen(direction, towards, slid)
+        return *_target_contact(draft, self.demonstration.target, slid), tool_gap, slid
+
+    def _slid(self, draft: Strategy, read: Replay) -> Replay | None:
+        """What was read, as if it had been in the middle of the target's outer side, the tool as it was; ``None`` where either side is not flat as far
+        as that, as its normals tell."""
+        target = self.demonstration.target
+        try:
+            seen = target_view(target, draft)
+            touched = target_contact(draft, seen, target.world_from_object)
+        except MagicError:
+            return None
+        axes = seen.object_from_view[:3, :2]
+        contour = contours.extract(seen.mask)
+        off = touched.pixel - seen.pixels(read.target_point)
+        along = off - (off @ touched.normal) * touched.normal
+        square = contour.normals[contour.nearest(touched.pixel)] @ transforms.unit(read.target_normal @ axes) > np.cos(NEARLY)
+        if touched.disc_radius or not square or abs(off @ touched.normal) * seen.metres_per_pixel > OFF_OUTLINE:
+            return None
+        way = axes @ along * seen.metres_per_pixel
+        tool_way = self.world_from_tool[:3, :3].T @ target.world_from_object[:3, :3] @ way
+        tool_contour = contours.extract(draft.tool_view.mask)
+        tool_axes = draft.tool_view.object_from_view[:3, :2]
+        normal = transforms.unit(read.tool_normal @ tool_axes)
+        for share in (0.25, 0.5, 0.75, 1.0):
+            place = draft.tool_view.pixels(read.tool_point + share * tool_way)
+            index = tool_contour.nearest(place)
+            away = float(np.linalg.norm(tool_contour.points[index] - place)) * draft.tool_view.metres_per_pixel
+            if away > OFF_OUTLINE or tool_contour.normals[index] @ normal < np.cos(NEARLY):
+                return None
+        return replace(read, tool_point=read.tool_point + tool_way, target_point=read.target_point + way)
+
+    def _seen(self, direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float]:
+        """The draft with the tool's contact, and how far (m) that is from where it was read."""
         demonstration, task, motion = self.demonstration, self.task, self.motion
         tool, target = demonstration.tool, demonstration.target
         normal = levelled(transforms.unit(towards - (towards @ direction) * direction))
@@ -289,7 +343,7 @@ class _Draft:
             releases=task.releases,
             simulatable=task.simulatable,
         )
-        return *_target_contact(draft, target, read), tool_gap
+        return draft, tool_gap
 
 
 def _way(motion: _Motion, found: Replay, made: float, parted: float) -> Array:
@@ -718,8 +772,14 @@ def advice(learned: Learned) -> list[str]:
 
 def doubts(learned: Learned) -> list[str]:
     """What the trial with the demonstrated objects, passed or not, does not tell of other tools and targets: sentences, none where nothing is to be said."""
-    changed = learned.changed
-    notes = [f"the goal does not ask {line}" for line in changed.unasked()] if changed is not None else []
+    notes = []
+    if (changed := learned.changed) is not None:
+        notes += [f"the goal does not ask {line}" for line in changed.unasked(learned.strategy.goal)]
+        if TABLE in changed.stood_on and (touched := sorted(set(changed.stood_on) & set(changed.fixtures))):
+            notes.append(
+                f"as it was seen the target stands on the table and touches {', '.join(touched)}: what stands on a fixture is taken to go down to "
+                "the table; let it stand on the table, and clear of fixtures"
+            )
     if not learned.askew:
         return notes
     return [

@@ -236,6 +236,14 @@ def _upright(asked: Asked, what: str, within: float) -> Told:
     return Told(tilt <= within, f"{what} tilted by {tilt:.0f} degrees", f"allowed: {within:g} degrees", {f"{what}_tilt": tilt})
 
 
+def _points(asked: Asked, what: str, along: Any, within: float) -> Told:
+    direction = asked.direction(along)
+    cosines = [float((asked.state.pose(name)[:3, :3] @ _up_then(asked, name)) @ direction) for name in asked.bodies(what)]
+    angle = float(np.rad2deg(np.arccos(np.clip(min(cosines), -1.0, 1.0))))
+    measured = f"what was up of the {what} is {angle:.0f} degrees off that way"
+    return Told(angle <= within, measured, f"allowed: {within:g} degrees", {f"{what}_points_off": angle})
+
+
 def _turned(asked: Asked, what: str, by: float, about: str) -> Told:
     angles = []
     for name in asked.bodies(what):
@@ -393,6 +401,7 @@ DECIDED: dict[str, Callable[..., Told]] = {
     "drift": _drift,
     "above": _above,
     "upright": _upright,
+    "points": _points,
     "turned": _turned,
     "inside": _inside,
     "at_rest": _at_rest,

@@ -404,11 +404,14 @@ def test_meshes_that_are_no_bodies_have_their_code_and_the_others_go_on(tmp_path
     assert (summary["cases"], summary["successes"]) == (4, 1)
 
 
-def test_a_tool_that_no_generator_makes_ends_the_evaluation(tmp_path):
-    """As a failure of the method it would lower the rate."""
+def test_a_tool_or_a_scene_that_is_not_told_ends_the_evaluation(tmp_path):
+    """As failures of the method they would lower the rate."""
     case = Case("a name", ("l_hok:52000",), "cylinder:0.02")
     with pytest.raises(MagicError, match="'l_hok'"):
         ev.attempt(Options("hooking", variant="fg_no_selection", strategies=STRATEGIES), case, None)
+    strategies.save(replace(strategies.load(Path(STRATEGIES) / "hooking"), environment={}), tmp_path / "hooking")
+    with pytest.raises(MagicError, match="world_from_target: 'missing'"):
+        ev.attempt(Options("hooking", variant="fg_no_selection", strategies=str(tmp_path)), replace(case, tools=("l_hook:1",)), None)
 
 
 def test_a_case_that_breaks_does_not_end_the_others(tmp_path, monkeypatch):

@@ -74,6 +74,8 @@ def at(x, y=0.0, z=0.05, rpy=(0, 0, 0)):
         ({"above": {"what": "target", "height": 0.2}}, at(0.5, z=0.2), False),
         ({"upright": {"what": "target", "within": 10}}, at(0.5, rpy=(0.17, 0, 2.0)), True),
         ({"upright": {"what": "target", "within": 10}}, at(0.5, rpy=(0.18, 0, 2.0)), False),
+        ({"points": {"what": "target", "along": [1, 0, 0]}}, at(0.5, rpy=(0, 1.57, 0.7)), True),
+        ({"points": {"what": "target", "along": [1, 0, 0]}}, at(0.5, rpy=(0, 1.57, 0.9)), False),
         ({"turned": {"what": "target", "by": 150, "about": "level"}}, at(0.5, rpy=(np.pi, 0, 0.4)), True),
         ({"turned": {"what": "target", "by": 150, "about": "level"}}, at(0.5, rpy=(0, 0, np.pi)), False),
         ({"turned": {"what": "target", "by": 150, "about": "up"}}, at(0.5, rpy=(0, 0, np.pi)), True),

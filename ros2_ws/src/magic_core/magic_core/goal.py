@@ -144,6 +144,11 @@ PREDICATES: dict[str, Predicate] = {
         "what was up of the {what} is up, within {within:deg}",
         Code.UNSTABLE,
     ),
+    "points": Predicate(
+        {"what": _WHAT, "along": _ALONG, "within": _number("an angle in degrees", 45.0, 0.0, 180.0)},
+        ("poses",),
+        "what was up of the {what} points along {along}, within {within:deg}",
+    ),
     "turned": Predicate(
         {
             "what": _WHAT,

@@ -41,6 +41,8 @@ def pose_from_data(data: Mapping[str, Any]) -> NDArray[np.float64]:
 
 def demonstrated_pose(environment: Mapping[str, Any]) -> NDArray[np.float64]:
     """world_from_target (4, 4) of the demonstration that a strategy came from."""
+    if "world_from_target" not in environment:
+        raise MagicError(Code.BAD_STRATEGY, "environment: world_from_target", "missing", "where the target stood: position and orientation")
     try:
         return pose_from_data(environment["world_from_target"])
     except (KeyError, TypeError, ValueError) as error:
