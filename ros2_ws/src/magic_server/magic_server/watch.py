@@ -29,8 +29,9 @@ class SceneWatch:
 
     planned: the objects that the motion was planned for.  meant: ids of what is moved on purpose.  target: its id, and ``contact``:
     from how many seconds after the move's beginning on the tool may move it (infinite: not in this move).  tolerance: m that points of a
-    thing may have moved (:func:`magic_server.scene_change.beyond`); age: s that the newest look may be old.  What has come is not looked
-    at here: a hand that reaches in is seen where it moves something, and before each move of the arm.
+    thing may have moved (:func:`magic_server.scene_change.beyond`); age: s that the newest look may be old.  An id may be handed on to
+    another thing: what stands where a thing stood, as it stood, is that thing by whatever new id.  What has come is not looked at here: a
+    hand that reaches in is seen where it moves something, and before each move of the arm.
     """
 
     def __init__(self, planned: Look, meant: Collection[str], target: str, contact: float, tolerance: float, age: float) -> None:
@@ -59,12 +60,14 @@ class SceneWatch:
         partly = look.partly(self._planned, self._meant)
         there = scene_change.parts(self._planned.objects, look.objects, partly, self._tolerance)
         hidden = set(look.remembered).union(*there.values())
+        strangers = look.objects.keys() - self._planned.objects.keys() - self._planned.remembered.keys() - partly
         shown = {name: before for name, before in self._planned.remembered.items() if name in look.objects}
         for name, before in {**shown, **self._planned.objects}.items():
             if name in self._meant or (name == self._target and look.stamp - began >= self._contact):
                 continue
+            handed_on = any(beyond(before, look.objects[other], False, self._tolerance) is None for other in strangers)
             if name not in look.objects:
-                if name in hidden:
+                if name in hidden or handed_on:
                     self._missing[name] = 0
                     continue
                 away = float((before - scene_change.hull(hand[None])).min())  # how deep the hand is in its hull; below 0: outside
@@ -74,7 +77,7 @@ class SceneWatch:
                 continue
             self._missing[name] = 0
             moved = beyond(before, look.objects[name], name in partly, self._tolerance)
-            if moved is not None:
+            if moved is not None and not handed_on:
                 found, allowed = moved
                 raise Changed(
                     Code.SCENE_CHANGED,

@@ -64,6 +64,16 @@ def test_what_is_missed_in_one_picture_has_not_gone():
         take(watching, without, 4.0)
 
 
+@pytest.mark.parametrize("cup", [{"cup": 0.7}, {}])
+def test_what_stands_where_a_thing_stood_is_that_thing_by_another_id(cup):
+    watching = watch()
+    for number in range(1, 4):
+        take(watching, {"tool": 0.0, "target": 0.2, **cup, "object_9": 0.505}, float(number))
+    with pytest.raises(Changed, match="cup has"):
+        for number in (4, 5):
+            take(watching, {"tool": 0.0, "target": 0.2, **cup, "object_9": 0.52}, float(number))
+
+
 def test_what_the_hand_may_hide_has_not_gone():
     watching = watch()
     for number in range(1, 6):
