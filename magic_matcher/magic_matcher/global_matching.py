@@ -217,15 +217,13 @@ def unit(tokens: NDArray[np.float32]) -> NDArray[np.float32]:
     return tokens / np.maximum(length, 1e-9)[..., None]
 
 
-def prepare(
-    view: CanonicalView, pixel: NDArray[np.float64], extract: Extract, out: int, views: Views, m_share: float = PATCH_SHARE
-) -> PreparedGlobal:
+def prepare(view: CanonicalView, pixel: NDArray[np.float64], extract: Extract, out: int, views: Views) -> PreparedGlobal:
     """Features of a reference in all ``views``: patches around the contact, and the moments for the joint PCA."""
     pictures, _, matrices = draw(view, views, out)
     maps = extract(pictures)
     n = maps.shape[1]
     tokens = np.stack([token_of(matrix, pixel, out, n) for matrix in matrices])
-    patches, inside = _patches(maps, tokens, patch_side(n, m_share))
+    patches, inside = _patches(maps, tokens, patch_side(n, PATCH_SHARE))
     mean, scatter, count = _moments(maps.reshape(-1, maps.shape[-1]))
     return PreparedGlobal(patches, inside, mean, scatter, count, views)
 

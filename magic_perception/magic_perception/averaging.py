@@ -29,12 +29,14 @@ FAINT = 6.0
 SHIFT, DEEP_BLOB = 0.006, 7
 #: How far the camera may be from where it was (entries of its pose).
 PLACE = 1e-4
+#: Where depth spreads by more than this (m) between frames the median is taken: edges flicker between two surfaces.
+SPREAD = 0.015
 
 
-def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
+def average(frames: list[RgbdFrame]) -> RgbdFrame:
     """The mean of the frames of one camera that stands still, as of the last of them, whose stamp and pose it has.
 
-    A pixel needs depth in half of the frames that count there.  Where the values spread by more than ``spread`` metres (edges flicker
+    A pixel needs depth in half of the frames that count there.  Where the values spread by more than :data:`SPREAD` metres (edges flicker
     between two surfaces) the median is taken instead of the mean, so that no surface is made up between two.
     What moves, and what the robot hid before, is taken from the frames alone that show it as the last one does: the mean of a thing's
     places is a thing that is nowhere.  Blind is what is blind in the last frame. So is what is held. Raises ``BAD_IMAGE`` for frames of
@@ -47,7 +49,7 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
         return last
     if any(f.depth.shape != last.depth.shape for f in frames):
         raise MagicError(Code.BAD_IMAGE, "sizes of the frames to average", [f.depth.shape for f in frames], "one size")
-    older = [_still(frame, last, spread) for frame in frames[:-1]]
+    older = [_still(frame, last, SPREAD) for frame in frames[:-1]]
     used = np.stack([*older, np.ones_like(older[0])])
     depth = np.stack([f.depth for f in frames]).astype(np.float32)
     valid = np.isfinite(depth) & used
@@ -55,7 +57,7 @@ def average(frames: list[RgbdFrame], spread: float = 0.015) -> RgbdFrame:
     count, uses = _summed(valid.view(np.uint8)), _summed(used.view(np.uint8))
     mean = _summed(np.where(valid, depth, np.float32(0))) / np.maximum(count, 1)
     nearest, farthest = np.where(valid, depth, np.float32(np.inf)), np.where(valid, depth, np.float32(-np.inf))
-    wide = reduce(np.maximum, farthest) - reduce(np.minimum, nearest) > spread
+    wide = reduce(np.maximum, farthest) - reduce(np.minimum, nearest) > SPREAD
     if wide.any():
         ordered = np.sort(np.where(valid[:, wide], depth[:, wide], np.inf), axis=0)
         mean[wide] = np.take_along_axis(ordered, ((count[wide].astype(np.intp) - 1) // 2)[None], axis=0)[0]

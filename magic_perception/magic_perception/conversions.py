@@ -25,7 +25,8 @@ COEFFICIENTS = (4, 5, 8, 12, 14)
 
 
 def distortion(info: CameraInfo, intrinsics: Intrinsics) -> float:
-    """By how many pixels the lens moves what is at the edge of the picture, at most; 0 without coefficients, infinite where they are of no known model."""
+    """By how many pixels the lens moves what is at the edge of the picture, at most; 0 without coefficients, infinite where they are of no
+    known model."""
     given = np.array(info.d, float)
     if not given.any():
         return 0.0

@@ -54,6 +54,10 @@ TOGETHER = {"mallet": (((120, 451), (260, 437), (400, 437)), ((330, 385), (350, 
 
 #: Folders of meshes that stand as they are stored; the others lie in their most probable stable pose.
 STANDING = ("mugs", "mug_trees", "targets", "watches")
+#: Holes of less than this (m^2) in the true view are not counted.
+LEAST_HOLE = 6e-5
+#: Side of a picture in a strip, pixels.
+TILE = 150
 
 
 def read_frame(color: Path, depth: Path, intrinsics: Intrinsics, name: str) -> RgbdFrame:
@@ -239,15 +243,15 @@ def shared_volume(a: Mesh, b: Mesh, count: int = 60000) -> float | None:
     return overlap(*inside)
 
 
-def open_holes(view: CanonicalView, found: Mesh, least: float = 6e-5) -> tuple[int, int]:
-    """Holes of at least ``least`` square metres in the true object's view, and how many of them are at least half open and enclosed in
-    ``found``."""
+def open_holes(view: CanonicalView, found: Mesh) -> tuple[int, int]:
+    """Holes of at least :data:`LEAST_HOLE` square metres in the true object's view, and how many of them are at least half open and
+    enclosed in ``found``."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(holes_of(view.mask).astype(np.uint8), connectivity=4)
     shown = Raycaster([found]).orthographic(view.object_from_view, view.mask.shape, view.metres_per_pixel, 1.0)[0].ids >= 0
     holes = holes_of(shown)
     total = opened = 0
     for i in range(1, count):
-        if stats[i, cv2.CC_STAT_AREA] * view.metres_per_pixel**2 < least:
+        if stats[i, cv2.CC_STAT_AREA] * view.metres_per_pixel**2 < LEAST_HOLE:
             continue
         total += 1
         opened += int(np.mean(holes[labels == i]) > 0.5)
@@ -357,15 +361,15 @@ def summary(rows: list[dict[str, object]]) -> dict[str, object]:
     return result
 
 
-def strip(frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], views: list[NDArray[np.uint8]], size: int = 150) -> NDArray[np.uint8]:
+def strip(frames: list[RgbdFrame], masks: list[NDArray[np.bool_]], views: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """One row of pictures: the left camera's cut-out, then the true view, this reconstruction and the paper's."""
     rows, columns = np.nonzero(masks[0])
     middle = (int(rows.mean()), int(columns.mean()))
     half = int(max(np.ptp(rows), np.ptp(columns), 40) * 0.6)
     cut = frames[0].color[max(middle[0] - half, 0) : middle[0] + half, max(middle[1] - half, 0) : middle[1] + half]
     return np.hstack(
-        [cv2.resize(np.ascontiguousarray(tile), (size, size), interpolation=cv2.INTER_AREA) for tile in (cut, *views)]
-        + [np.zeros((size, size, 3), np.uint8)] * (3 - len(views))
+        [cv2.resize(np.ascontiguousarray(tile), (TILE, TILE), interpolation=cv2.INTER_AREA) for tile in (cut, *views)]
+        + [np.zeros((TILE, TILE, 3), np.uint8)] * (3 - len(views))
     )
 
 

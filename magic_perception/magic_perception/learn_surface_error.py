@@ -39,6 +39,8 @@ OTHERS = tuple(name for name in shapes.FAMILIES if name not in (*VESSELS, *SCOOP
 PILES = 4
 #: Bounds of the table's rows, mm.
 BINS = (0.0, 1.0, 1.5, 2.5, 5.0, 30.0)
+#: Parts of the scenes that are held out in turn.
+FOLDS = 5
 
 
 @dataclass(frozen=True)
@@ -101,11 +103,11 @@ def judged(seed: int) -> list[Judged]:
     return result
 
 
-def learned(things: list[Judged], folds: int = 5) -> surface_error.Quantile:
+def learned(things: list[Judged]) -> surface_error.Quantile:
     """The weights of all things, with a constant by which :data:`surface_error.SHARE` of them lie below what weights state that do not know
     their scene."""
     errors = _numbers(things)[1]
-    over = np.sort(np.log(np.maximum(errors, surface_error.LEAST) / _held_out(things, folds, _fitted)))
+    over = np.sort(np.log(np.maximum(errors, surface_error.LEAST) / _held_out(things, FOLDS, _fitted)))
     place = min(int(np.ceil((len(over) + 1) * surface_error.SHARE)), len(over)) - 1
     model = _fitted(things)
     return replace(model, constant=model.constant + max(float(over[place]), 0.0))

@@ -21,6 +21,8 @@ EDGE, SHARE, COLOR = 0.010, 0.15, 14.0
 AHEAD = 2.0
 #: What is so near to where it was, m, stands there.
 STANDS = 0.02
+#: A thing is looked for within this of where it was (m), among those whose box edges are within this factor of its own, for so many scenes.
+REACH, GROWTH, MEMORY = 0.10, 0.5, 10
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,14 @@ class _Track:
 class Tracker:
     """Hands ids on from the last scenes.
 
-    An object takes the id of the one it resembles most in place (within ``reach`` metres of where that was, or would be if it went on as it
-    did) and in size (box edges within ``growth`` of each other plus 15 mm).  What is left then takes the id of what is missing where both
-    are alike in size and colour, no farther apart than a robot may have moved it, and nothing else could be either of them. A thing not
-    seen for ``memory`` scenes is forgotten, but its number is not given out again.  ``standing``: ids of what is where it was before.
+    An object takes the id of the one it resembles most in place (within :data:`REACH` metres of where that was, or would be if it went on
+    as it did) and in size (box edges within :data:`GROWTH` of each other plus 15 mm).  What is left then takes the id of what is missing
+    where both are alike in size and colour, no farther apart than a robot may have moved it, and nothing else could be either of them. A
+    thing not seen for :data:`MEMORY` scenes is forgotten, but its number is not given out again.  ``standing``: ids of what is where it was
+    before.
     """
 
-    def __init__(self, reach: float = 0.10, growth: float = 0.5, memory: int = 10) -> None:
-        self.reach, self.growth, self.memory = reach, growth, memory
+    def __init__(self) -> None:
         self.standing: frozenset[str] = frozenset()
         self._last: dict[str, _Track] = {}
         self._next = 1
@@ -80,7 +82,7 @@ class Tracker:
         ids = {old.id: item.id for old, item in zip(seen, renamed, strict=True)}
         renamed = [replace(item, cut_off=tuple(ids.get(by, by) for by in item.cut_off)) for item in renamed]
         before = self._last
-        self._last = {n: replace(track, age=track.age + 1) for n, track in before.items() if track.age + 1 < self.memory}
+        self._last = {n: replace(track, age=track.age + 1) for n, track in before.items() if track.age + 1 < MEMORY}
         for item in renamed:
             self._last[item.id] = _Track.of(item, scene.stamp, before.get(item.id))
         kept = ((name, before[name], self._last[name]) for name in self._last.keys() & before.keys())
@@ -99,7 +101,7 @@ class Tracker:
             for name, old in self._last.items():
                 distance = min(float(np.linalg.norm(item.centre - place)) for place in (old.centre, old.expected(item.stamp)))
                 change = np.abs(item.extents - old.extents)
-                if distance < self.reach and np.all(change < 0.015 + self.growth * np.maximum(old.extents, item.extents)):
+                if distance < REACH and np.all(change < 0.015 + GROWTH * np.maximum(old.extents, item.extents)):
                     costs.append((distance + 0.5 * float(change.max()), i, name))
         names: dict[int, str] = {}
         for _, i, name in sorted(costs):
@@ -113,7 +115,7 @@ class Tracker:
         def alike(item: _Track, old: _Track) -> bool:
             edges = np.abs(item.extents - old.extents) < EDGE + SHARE * np.maximum(item.extents, old.extents)
             distance = float(np.linalg.norm(item.centre - old.centre))
-            near = distance < self.reach + SPEED * max(item.stamp - old.stamp, 0.0)
+            near = distance < REACH + SPEED * max(item.stamp - old.stamp, 0.0)
             return bool(near and edges.all() and np.linalg.norm(item.color - old.color) < COLOR)
 
         left = [i for i in range(len(new)) if i not in names]

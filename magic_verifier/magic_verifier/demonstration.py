@@ -52,8 +52,8 @@ class Meeting:
 class Replay:
     """What a replay found: contact points p_T in the tool's and p_O in the target's frame (3,) metres, the unit outward
     normal of each surface there (3,) in the same frames, the share of the goal phase in contact, how many points were read,
-    when in the phase they touched first and last, seconds from the motion's start, and each stretch of contact in the phase; tips: when in the phase
-    the target begins to tip over, infinite where it does not."""
+    when in the phase they touched first and last, seconds from the motion's start, and each stretch of contact in the phase; tips: when in
+    the phase the target begins to tip over, infinite where it does not."""
 
     tool_point: NDArray[np.float64]
     tool_normal: NDArray[np.float64]
@@ -160,8 +160,8 @@ def _motion(strategy: Shown, target: SceneObject, phases: tuple[Phase, ...], rel
 def _contacts(
     run: FloatingRun, watched: str, target: SceneObject, held: bool, checked: tuple[str, ...]
 ) -> tuple[list[_Stretch], float, float]:
-    """The stretches in which tool and target press on each other in the watched phase, the share of it in which they do, and when in it the target
-    begins to tip over.
+    """The stretches in which tool and target press on each other in the watched phase, the share of it in which they do, and when in it the
+    target begins to tip over.
 
     target: as it stood; held: it is put back there after each step; checked: the bodies whose state has to be sound.
     """

@@ -46,6 +46,9 @@ PLANNING_TIME = 10.0
 ARM_ATTEMPTS = 3
 #: The method that takes the best candidate, whatever simulation says of it.
 ONLY_BEST = "no_simulation_verification"
+#: Pictures in a row of a contact sheet, and on it at most.
+COLUMNS = 4
+PICTURES = 80
 
 
 @lru_cache(maxsize=16)
@@ -433,12 +436,12 @@ def _test_sentence(options: Options) -> str:
     return text + (f"; of others {', '.join(others)}" if others else "")
 
 
-def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path: Path, columns: int = 4, most: int = 80) -> None:
+def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path: Path) -> None:
     """One picture of the cases that passed, or of those that failed, each with its name and reason."""
     import cv2
 
     tiles = []
-    for case in [c for c in done if bool(c["success"]) is success][:most]:
+    for case in [c for c in done if bool(c["success"]) is success][:PICTURES]:
         film = folder / f"{_key(case['object'])}.png"
         picture = cv2.imread(str(film)) if film.exists() else None  # OpenCV writes a warning for each that is not there
         if picture is None:
@@ -452,9 +455,9 @@ def contact_sheet(folder: Path, done: list[dict[str, Any]], success: bool, path:
         path.unlink(missing_ok=True)
         return
     height, width = (max(t.shape[i] for t in tiles) for i in (0, 1))
-    sheet: NDArray[np.uint8] = np.full((height * math.ceil(len(tiles) / columns), width * min(columns, len(tiles)), 3), 255, np.uint8)
+    sheet: NDArray[np.uint8] = np.full((height * math.ceil(len(tiles) / COLUMNS), width * min(COLUMNS, len(tiles)), 3), 255, np.uint8)
     for index, tile in enumerate(tiles):
-        v, u = height * (index // columns), width * (index % columns)
+        v, u = height * (index // COLUMNS), width * (index % COLUMNS)
         sheet[v : v + tile.shape[0], u : u + tile.shape[1]] = tile
     cv2.imwrite(str(path), sheet)
 

@@ -465,7 +465,8 @@ def goal_of(given: argparse.Namespace) -> tuple[Goal | None, dict[str, float]]:
 
 
 def _read_goal(path: Path, values: dict[str, float]) -> Goal:
-    """The goal that a file holds as ``goal`` of a ``strategy.yaml`` does, with numbers of it that are given; raises BAD_STRATEGY, BAD_REQUEST."""
+    """The goal that a file holds as ``goal`` of a ``strategy.yaml`` does, with numbers of it that are given; raises BAD_STRATEGY,
+    BAD_REQUEST."""
     try:
         data = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

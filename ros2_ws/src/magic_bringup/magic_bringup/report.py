@@ -53,6 +53,8 @@ TERMS = (
 
 #: What the video of a run is called beside its messages.
 VIDEO = "video.webp"
+#: Rows and columns of the picture of the scene, pixels.
+SCENE_PICTURE = (480, 720)
 
 # ---------------------------------------------------------------- pictures
 
@@ -149,7 +151,7 @@ def look_at(eye: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.
     return transforms.make(np.column_stack([x, np.cross(z, x), z]), eye)
 
 
-def scene_picture(scene: Scene, path: NDArray[np.float64] | None = None, size: tuple[int, int] = (480, 720)) -> Image:
+def scene_picture(scene: Scene, path: NDArray[np.float64] | None = None) -> Image:
     """The reconstructed objects on the table, ray-cast; ``path`` (N, 3) world metres is drawn over it."""
     from magic_core.rendering import Raycaster, shade
 
@@ -163,8 +165,9 @@ def scene_picture(scene: Scene, path: NDArray[np.float64] | None = None, size: t
     meshes.append(_table(scene.table, center, 1.2 * reach))
     # From the robot's right front: far enough that the sphere around everything fits a field of view of 40 degrees.
     world_from_camera = look_at(center + 1.35 * reach * transforms.unit([-0.75, -0.8, 0.85]), center)
-    focal = size[0] / 2 / np.tan(np.radians(20))
-    intrinsics = Intrinsics(size[1], size[0], focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2)
+    height, width = SCENE_PICTURE
+    focal = height / 2 / np.tan(np.radians(20))
+    intrinsics = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     cast, _ = Raycaster(meshes).perspective(intrinsics, world_from_camera)
     picture = shade(cast, light=(-0.5, -0.3, 1.0), background=(236, 239, 244))
     if path is not None and len(path) > 1:

@@ -12,15 +12,18 @@ from magic_core.errors import Code, MagicError
 #: A joint that is where it was up to a second ago, within this (rad, m), has been there meanwhile.
 RESTS = 1e-3
 
+#: A state that follows another within so many seconds is not kept.
+THINNING = 0.004
+
 
 class JointHistory:
     """Positions of joints over the last ``memory`` seconds, put together from messages that may each tell of some joints only.
 
-    States that follow within ``thinning`` seconds of the one before are not kept: an arm at 1 kHz would fill the memory.
+    States that follow within :data:`THINNING` seconds of the one before are not kept: an arm at 1 kHz would fill the memory.
     """
 
-    def __init__(self, memory: float = 10.0, thinning: float = 0.004) -> None:
-        self.memory, self.thinning = memory, thinning
+    def __init__(self, memory: float = 10.0) -> None:
+        self.memory = memory
         self._tracks: dict[str, list[tuple[float, float]]] = {}
         self._lock = threading.Lock()
 
@@ -41,7 +44,7 @@ class JointHistory:
                 track = self._tracks.setdefault(name, [])
                 if track and stamp < track[-1][0] - self.memory:
                     track.clear()  # time went back: a bag was started again
-                if track and 0 <= stamp - track[-1][0] < self.thinning:
+                if track and 0 <= stamp - track[-1][0] < THINNING:
                     continue
                 insort(track, (stamp, float(position)))
                 while track[0][0] < track[-1][0] - self.memory:

@@ -129,7 +129,8 @@ def run(node_type: Callable[[], Node], threads: int = 4, args: list[str] | None 
 
 
 def _begin_ros(arguments: Sequence[str]) -> None:
-    """Initialise rclpy; raises BAD_REQUEST for arguments that ROS would ignore, as those of who forgot ``--ros-args``, and for arguments and an environment that it cannot read."""
+    """Initialise rclpy; raises BAD_REQUEST for arguments that ROS would ignore, as those of who forgot ``--ros-args``, and for arguments
+    and an environment that it cannot read."""
     own, _ = split(arguments)
     if any(":=" not in word for word in own):  # ROS 1's remappings ROS still heeds
         allowed = "--ros-args -p PARAMETER:=VALUE, --ros-args --params-file FILE, --ros-args -r NAME:=NAME, --version"

@@ -94,30 +94,25 @@ class LabNode(Node):
         self._camera_out: dict[str, Any] = {}
         self._reset()
         self._static_out.publish(TFMessage(transforms=self._static()))
-        self._arm_server = ActionServer(
-            self,
-            FollowJointTrajectory,
-            self._arm_action,
-            self._follow,
-            goal_callback=self._admit,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-            callback_group=group,
-            result_timeout=RESULT_TIMEOUT,
-        )
-        self._gripper_server = ActionServer(
-            self,
-            GripperCommand,
-            self._gripper_action,
-            self._grip,
-            goal_callback=self._admit_grip,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-            callback_group=group,
-            result_timeout=RESULT_TIMEOUT,
-        )
+        self._arm_server = self._server(FollowJointTrajectory, self._arm_action, self._follow, self._admit, group)
+        self._gripper_server = self._server(GripperCommand, self._gripper_action, self._grip, self._admit_grip, group)
         self.create_service(Trigger, "lab/reset", self._on_reset, callback_group=group)
         self._diagnostics = Diagnostics(self, self._report, group)
         self._thread = threading.Thread(target=self._live, daemon=True)
         self._thread.start()
+
+    def _server(self, kind: Any, name: str, execute: Callable[[Any], Any], admit: Callable[[Any], Any], group: Any) -> ActionServer:
+        """An action server whose goals may always be cancelled."""
+        return ActionServer(
+            self,
+            kind,
+            name,
+            execute,
+            goal_callback=admit,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=group,
+            result_timeout=RESULT_TIMEOUT,
+        )
 
     # ------------------------------------------------------------ parameters
 

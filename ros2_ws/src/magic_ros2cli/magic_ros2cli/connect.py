@@ -24,6 +24,8 @@ DISCOVERY = 5.0
 SETTLED = 1.0
 #: And as empty when no other node has been seen for this long, s.
 EMPTY = 1.5
+#: A graph that goes on changing is taken as it is after so long, s.
+LONGEST = 5.0
 
 
 @contextmanager
@@ -41,7 +43,7 @@ def node(**options: Any) -> Iterator[Any]:
         rclpy.try_shutdown()
 
 
-def settle(made: Any, query: Callable[[], T], longest: float = 5.0) -> T:
+def settle(made: Any, query: Callable[[], T]) -> T:
     """The answer of a graph query once it, and the list of nodes, have stopped changing."""
     start = changed = time.monotonic()
     state: Any = None
@@ -51,7 +53,7 @@ def settle(made: Any, query: Callable[[], T], longest: float = 5.0) -> T:
         if state != before:
             changed = now
         others = len(state[0]) > 1
-        if (now - changed >= SETTLED and (others or now - start >= EMPTY)) or now - start >= longest:
+        if (now - changed >= SETTLED and (others or now - start >= EMPTY)) or now - start >= LONGEST:
             return state[1]
         time.sleep(0.05)
 

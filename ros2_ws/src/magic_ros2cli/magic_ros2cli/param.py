@@ -80,14 +80,14 @@ def text_of(value: ParameterValue, hide_type: bool = False) -> str:
     return f"{plain}" if hide_type else f"{label} {plain}"
 
 
-def _call(node: Any, target: str, kind: Any, service: str, request: Any, seconds: float = connect.DISCOVERY) -> Any:
+def _call(node: Any, target: str, kind: Any, service: str, request: Any) -> Any:
     """Call a parameter service of a node; raises :class:`CommandError` where the node is not there or does not answer."""
     client = node.create_client(kind, f"{target}/{service}")
-    if not connect.wait_for(client.service_is_ready, seconds):
+    if not connect.wait_for(client.service_is_ready, connect.DISCOVERY):
         raise CommandError("Node not found")
-    answer = connect.spin_until(node, client.call_async(request), seconds)
+    answer = connect.spin_until(node, client.call_async(request), connect.DISCOVERY)
     if answer is None:
-        raise CommandError(f"{target} did not answer within {seconds:.0f} s")
+        raise CommandError(f"{target} did not answer within {connect.DISCOVERY:.0f} s")
     return answer
 
 
