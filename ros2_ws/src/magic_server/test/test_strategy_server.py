@@ -541,71 +541,82 @@ def test_markers_that_cannot_be_drawn_change_nothing_else(bench, monkeypatch):
     assert (result.code, result.verified, status) == (0, True, GoalStatus.STATUS_SUCCEEDED), result.message
 
 
-def test_the_contacts_belong_to_the_objects_that_are_planned_with(bench):
-    """Perception may have sent a new scene, in which an object's own frame is another one, when the matcher answers."""
-    first = fakes.scene().objects[0]
-    turned = transforms.from_rpy(0.0, 0.0, np.pi)
-    newer = replace(first, world_from_object=first.world_from_object @ turned)
-    scenes = {"older": fakes.scene(), "newer": replace(fakes.scene(), objects=(newer, fakes.scene().objects[1]))}
+def sent(bench, scene):
+    """Send a scene, and wait until the server has it."""
+    came = bench.server.scene_came
+    bench.fakes.publish(scene)
+    bench.until(lambda: bench.server.scene_came > came)
+
+
+def contacts_on(scene):
+    """What the matcher answers that has found a contact on the first object of a scene."""
+    candidate = conversions.candidate_to_msg(fakes.candidate(), scene.objects[0].world_from_object)
+    return MatchContact.Response(candidates=[candidate], target_id="object_2", features="fake")
+
+
+@pytest.fixture
+def seen_again(bench):
+    """Scenes that perception sends one after the other: ``older``; ``newer``, in which the first object's own frame is turned by half a
+    turn; ``newest``, in which it is 1 mm higher than at first.  ``planned``: where that object was planned with."""
+    first, second = fakes.scene().objects
+    turned = replace(first, world_from_object=first.world_from_object @ transforms.from_rpy(0.0, 0.0, np.pi))
+    higher = replace(first, world_from_object=transforms.make(translation=[0.0, 0.0, 0.001]) @ first.world_from_object)
+    older, newer, newest = (replace(fakes.scene(), objects=(item, second)) for item in (first, turned, higher))
+    planned = []
+
+    def plan(goal, canceled):
+        planned.append(conversions.pose_from_msg(goal.tool.pose))
+        return fakes.FakeServers.plan(goal, canceled)
+
+    bench.fakes.on_plan = plan
+    sent(bench, older)
+    yield SimpleNamespace(older=older, newer=newer, newest=newest, planned=planned)
+    bench.fakes.publish(fakes.scene())
+
+
+def test_contacts_on_the_scene_with_which_a_run_began_are_planned_with_it(bench, seen_again):
+    """A newer scene comes while the matcher, which has not seen it yet, looks at the older one."""
     asked = []
 
     def match(request):
-        # The matcher has not seen the newer scene yet when it is asked first; then it has.
-        seen = scenes["older" if not asked else "newer"]
-        if not asked:
-            came = bench.server.scene_came
-            bench.fakes.publish(scenes["newer"])
-            bench.until(lambda: bench.server.scene_came > came)
         asked.append(request)
-        candidates = [conversions.candidate_to_msg(fakes.candidate(), seen.objects[0].world_from_object)]
-        return MatchContact.Response(candidates=candidates, target_id="object_2", features="fake")
+        sent(bench, seen_again.newer)
+        return contacts_on(seen_again.older)
 
     bench.fakes.on_match = match
-    planned = []
-    bench.fakes.on_plan = lambda goal, canceled: planned.append(goal) or fakes.FakeServers.plan(goal, canceled)
-    try:
-        result, _ = bench.run()
-        assert result.code == 0, result.message
-        assert len(asked) == 1  # the older scene is this run's own
-        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), first.world_from_object, atol=1e-9)
-        # The matcher's objects are newer than those with which the run began: these are taken.
-        bench.fakes.publish(scenes["older"])
-        bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] > 0)
+    result, _ = bench.run()
+    assert result.code == 0, result.message
+    assert len(asked) == 1
+    np.testing.assert_allclose(seen_again.planned[0], seen_again.older.objects[0].world_from_object, atol=1e-9)
 
-        def ahead(request):
-            bench.fakes.publish(scenes["newer"])
-            bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] < 0)
-            return match(request)
 
-        bench.fakes.on_match = ahead
-        planned.clear()
-        result, _ = bench.run()
-        assert result.code == 0, result.message
-        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), newer.world_from_object, atol=1e-9)
-        # A long match: its objects came after the run began, and when it answers there are newer ones again.
-        shifted = replace(first, world_from_object=transforms.make(translation=[0.0, 0.0, 0.001]) @ first.world_from_object)
-        scenes["newest"] = replace(fakes.scene(), objects=(shifted, fakes.scene().objects[1]))
-        bench.fakes.publish(scenes["older"])
-        bench.until(lambda: conversions.pose_from_msg(bench.server.scene.objects[0].pose)[0, 0] > 0)
+def test_contacts_on_a_newer_scene_are_planned_with_that(bench, seen_again):
+    """The matcher has seen a newer scene than the one with which the run began."""
 
-        def slow(request):
-            for name in ("newer", "newest"):
-                came = bench.server.scene_came
-                bench.fakes.publish(scenes[name])
-                bench.until(lambda came=came: bench.server.scene_came > came)
-            asked.append(request)
-            return MatchContact.Response(
-                candidates=[conversions.candidate_to_msg(fakes.candidate(), newer.world_from_object)], target_id="object_2", features="fake"
-            )
+    def match(request):
+        sent(bench, seen_again.newer)
+        return contacts_on(seen_again.newer)
 
-        bench.fakes.on_match = slow
-        planned.clear()
-        asked.clear()
-        result, _ = bench.run()
-        assert (result.code, len(asked)) == (0, 1), result.message
-        np.testing.assert_allclose(conversions.pose_from_msg(planned[0].tool.pose), newer.world_from_object, atol=1e-9)
-    finally:
-        bench.fakes.publish(fakes.scene())
+    bench.fakes.on_match = match
+    result, _ = bench.run()
+    assert result.code == 0, result.message
+    np.testing.assert_allclose(seen_again.planned[0], seen_again.newer.objects[0].world_from_object, atol=1e-9)
+
+
+def test_contacts_on_a_scene_that_came_and_is_past_are_planned_with_that(bench, seen_again):
+    """The match took long: its objects came after the run had begun, and when it answers there are newer ones again."""
+    asked = []
+
+    def match(request):
+        asked.append(request)
+        sent(bench, seen_again.newer)
+        sent(bench, seen_again.newest)
+        return contacts_on(seen_again.newer)
+
+    bench.fakes.on_match = match
+    result, _ = bench.run()
+    assert (result.code, len(asked)) == (0, 1), result.message
+    np.testing.assert_allclose(seen_again.planned[0], seen_again.newer.objects[0].world_from_object, atol=1e-9)
 
 
 def test_an_id_whose_objects_are_on_their_way_is_waited_for_a_moment(bench, monkeypatch):
