@@ -71,12 +71,13 @@ LOOK_EVERY = 6
 class Changed:
     """What a demonstration changed, lengths in metres.
 
-    way (3,): how the middle of the target moved, world, until the tool last touched it; height: of it above the table in the end, and rise since the start; tilt
-    (degrees) of what was up; on: what it touches in the end; touched: whether the tool met it at all; encloses: whether the tool, where
-    it last touched it, holds it against being pulled on; tool_on: what the tool rests on when it is let go, nothing where it falls; tool_height: of its
-    middle above the table then.  stood_on: what the target touched at first; lifted, farthest: by how much its middle was higher than at first,
-    and how far the tool led it from there along the table, at most; tumbled (degrees): how far what was
-    up was ever tilted; turned (degrees): about the vertical in the end; up (3,): where what was up points in the end, world; fixtures: ids of what is known to stand fast.
+    way (3,): how the middle of the target moved, world, until the tool last touched it; height: of it above the table in the end, and rise
+    since the start; tilt (degrees) of what was up; on: what it touches in the end; touched: whether the tool met it at all; encloses:
+    whether the tool, where it last touched it, holds it against being pulled on; tool_on: what the tool rests on when it is let go, nothing
+    where it falls; tool_height: of its middle above the table then.  stood_on: what the target touched at first; lifted, farthest: by how
+    much its middle was higher than at first, and how far the tool led it from there along the table, at most; tumbled (degrees): how far
+    what was up was ever tilted; turned (degrees): about the vertical in the end; up (3,): where what was up points in the end, world;
+    fixtures: ids of what is known to stand fast.
     """
 
     way: Array

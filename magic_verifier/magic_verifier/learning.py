@@ -49,10 +49,11 @@ TICK, WINDOW = 0.02, 0.6
 SPACING = (0.002, np.deg2rad(1.0), 0.25)
 #: The motion is kept from where the contact is so far from where it will be made, and the approach ends so far from there, metres.
 APPROACH, NEAR = 0.12, 0.02
-#: Rolling moves a contact: it is read until the tool has turned by so much since it was made (rad), or the target tips over, for so long (s) at least.
+#: Rolling moves a contact: it is read until the tool has turned by so much since it was made (rad), or the target tips over, for so long
+#: (s) at least.
 TURNED, READ = np.deg2rad(10.0), 0.2
-#: Tool and target meet in another place than before where the tool's normal is turned by so much (rad), or its point is so far (share of its
-#: size) from there; a touch that moves the target by less (m) is none.
+#: Tool and target meet in another place than before where the tool's normal is turned by so much (rad), or its point is so far (share of
+#: its size) from there; a touch that moves the target by less (m) is none.
 OTHERWISE, ELSEWHERE, MOVED = np.deg2rad(60.0), 0.15, 0.02
 #: A tool leads a target along a straight way if it is so long (m), and the path along it no longer than so many times that.
 LED, DETOUR = 0.03, 1.1
@@ -197,8 +198,8 @@ def _changed(demonstration: Demonstration, task: Task) -> Changed:
 def _drafted(
     demonstration: Demonstration, task: Task, motion: _Motion, found: Replay, made: float, parted: float
 ) -> tuple[Strategy, float, float, float]:
-    """The strategy but for its phases, looked at so that both contacts are where they were shown; how far (m) each is from there; and how far
-    (rad) askew of the way that the target was led.
+    """The strategy but for its phases, looked at so that both contacts are where they were shown; how far (m) each is from there; and how
+    far (rad) askew of the way that the target was led.
 
     The directions across the tool's sides are tried, thinnest first, and in each the target's outlines.  Raises BAD_REQUEST that says how
     near the best of them came.
@@ -240,8 +241,8 @@ class _Draft:
         """As :func:`_drafted`, looked at along a direction (3,).
 
         A round thing that was met a millimetre or two aside of its middle shows a normal some degrees askew of the way that it was led,
-        and so does the tool; in a hollow hardly wider than it any number of degrees.  Flat sides press on each other along their edges, with the
-        normals of neither.  There the normals are those of the way.
+        and so does the tool; in a hollow hardly wider than it any number of degrees.  Flat sides press on each other along their edges,
+        with the normals of neither.  There the normals are those of the way.
         """
         found, way = self.found, self.way
         draft, target_gap, tool_gap, found = self._read(direction, self.towards, found)
@@ -272,10 +273,11 @@ class _Draft:
         return draft, tool_gap, float(np.linalg.norm(off)) * view.metres_per_pixel, 0.0
 
     def _read(self, direction: Array, towards: Array, read: Replay) -> tuple[Strategy, float, float, Replay]:
-        """The draft with contacts as they were read, ``towards`` (3,) the target's outward normal; how far (m) the target's and the tool's are
-        from where they were shown; and what was read.
+        """The draft with contacts as they were read, ``towards`` (3,) the target's outward normal; how far (m) the target's and the tool's
+        are from where they were shown; and what was read.
 
-        Where flat sides lie on each other any point of them may be what presses: there the contact is taken to be in the middle of the target's.
+        Where flat sides lie on each other any point of them may be what presses: there the contact is taken to be in the middle of the
+        target's.
         """
         draft, tool_gap = self._seen(direction, towards, read)
         try:
@@ -288,8 +290,8 @@ class _Draft:
         return *_target_contact(draft, self.demonstration.target, slid), tool_gap, slid
 
     def _slid(self, draft: Strategy, read: Replay) -> Replay | None:
-        """What was read, as if it had been in the middle of the target's outer side, the tool as it was; ``None`` where either side is not flat as far
-        as that, as its normals tell."""
+        """What was read, as if it had been in the middle of the target's outer side, the tool as it was; ``None`` where either side is not
+        flat as far as that, as its normals tell."""
         target = self.demonstration.target
         try:
             seen = target_view(target, draft)
@@ -347,8 +349,8 @@ class _Draft:
 
 
 def _way(motion: _Motion, found: Replay, made: float, parted: float) -> Array:
-    """How far (3,), in the target's frame as it stood, the tool's contact point is led from when the contact is made until they part, or the
-    tool turns, m.  Zeros where that is less than LED, or not straight.
+    """How far (3,), in the target's frame as it stood, the tool's contact point is led from when the contact is made until they part, or
+    the tool turns, m.  Zeros where that is less than LED, or not straight.
     """
     first, last = motion.index(made), motion.index(parted)
     poses = motion.target_from_tool[first : last + 1]
@@ -362,8 +364,8 @@ def _way(motion: _Motion, found: Replay, made: float, parted: float) -> Array:
 
 
 def _elsewhere(draft: Strategy, found: Replay, normal: Array, radius: float) -> float:
-    """How much elsewhere (m) the tool would have been, had it met a round target (radius, m) along a normal (3,) of its own frame instead of
-    as it was read; infinite where it has no such place.
+    """How much elsewhere (m) the tool would have been, had it met a round target (radius, m) along a normal (3,) of its own frame instead
+    of as it was read; infinite where it has no such place.
 
     In a hollow hardly wider than the target it is little, whatever the angle: a millimetre of the track turns the normal by ten degrees.
     """
@@ -376,7 +378,8 @@ def _elsewhere(draft: Strategy, found: Replay, normal: Array, radius: float) -> 
 
 
 def _led(draft: Strategy, normal: Array, about: float) -> Contact:
-    """The tool's contact with the outward normal (3,) along which it was led, in the tool's frame: where its edge is square to that, if it is nearby."""
+    """The tool's contact with the outward normal (3,) along which it was led, in the tool's frame: where its edge is square to that, if it
+    is nearby."""
     view, contact = draft.tool_view, draft.tool_contact
     place = _square_to(draft, normal, about)
     if place is not None:
@@ -387,8 +390,8 @@ def _led(draft: Strategy, normal: Array, about: float) -> Contact:
 
 
 def _square_to(draft: Strategy, normal: Array, about: float) -> Array | None:
-    """The pixel (2,) at which the tool's outline is square to a normal (3,) of its frame, ``None`` where there is none within ``about`` (m) of
-    its contact, or as far from it as a contact may be off."""
+    """The pixel (2,) at which the tool's outline is square to a normal (3,) of its frame, ``None`` where there is none within ``about`` (m)
+    of its contact, or as far from it as a contact may be off."""
     view, contact = draft.tool_view, draft.tool_contact
     contour = contours.extract(view.mask)
     towards = transforms.unit(normal @ view.object_from_view[:3, :2])
@@ -478,8 +481,9 @@ def _apart(a: Array, b: Array) -> tuple[float, float]:
 
 
 def _contacts(demonstration: Demonstration, task: Task, motion: _Motion) -> tuple[Replay, float, float, tuple[Meeting, ...]]:
-    """What the replay reads of the contact that the goal is reached with, when it is made and when tool and target part, seconds; and, where the
-    target was moved from several places of a tool that keeps its attitude, one after the other, all of these meetings, that one the last."""
+    """What the replay reads of the contact that the goal is reached with, when it is made and when tool and target part, seconds; and,
+    where the target was moved from several places of a tool that keeps its attitude, one after the other, all of these meetings, that one
+    the last."""
     end = float(motion.times[-1])
     scene = demonstration.tool, demonstration.target, demonstration.obstacles, demonstration.table
     if task.releases:
@@ -524,7 +528,8 @@ def _same_place(one: Meeting, other: Meeting, size: float) -> bool:
 
 
 def _with_earlier(draft: Strategy, target: SceneObject, earlier: tuple[Meeting, ...]) -> Strategy:
-    """The strategy with the contacts of earlier meetings, in its own views; raises BAD_REQUEST where one of them is not seen in profile there."""
+    """The strategy with the contacts of earlier meetings, in its own views; raises BAD_REQUEST where one of them is not seen in profile
+    there."""
     pairs = []
     for number, meeting in enumerate(earlier, 1):
         contact, gap = _on_outline(draft.tool_view, meeting)
@@ -590,7 +595,8 @@ def _tool_contact(
 
 
 def _on_outline(view: CanonicalView, read: Replay | Meeting) -> tuple[Contact | None, float]:
-    """The place on the tool's outline where it met the target, ``None`` where that is not on it, and how far (m) it is from what was read."""
+    """The place on the tool's outline where it met the target, ``None`` where that is not on it, and how far (m) it is from what was
+    read."""
     contour = contours.extract(view.mask)
     pixel, towards = view.pixels(read.tool_point), read.tool_normal @ view.object_from_view[:3, :2]
     away = np.linalg.norm(contour.points - pixel, axis=1) + np.where(contour.normals @ towards > FACING, 0.0, np.inf)
@@ -771,7 +777,8 @@ def advice(learned: Learned) -> list[str]:
 
 
 def doubts(learned: Learned) -> list[str]:
-    """What the trial with the demonstrated objects, passed or not, does not tell of other tools and targets: sentences, none where nothing is to be said."""
+    """What the trial with the demonstrated objects, passed or not, does not tell of other tools and targets: sentences, none where nothing
+    is to be said."""
     notes = []
     if (changed := learned.changed) is not None:
         notes += [f"the goal does not ask {line}" for line in changed.unasked(learned.strategy.goal)]
