@@ -126,12 +126,16 @@ def _handles(laid: Laid, bowl: Bowl) -> list[Polygon]:
 
 
 def _without_whiskers(handle: Polygon) -> Polygon:
-    """A handle without what sticks out of its sides and is much narrower than it: smear that has the thing's colour."""
+    """A handle without what sticks out of its sides and is much narrower than it: smear that has the thing's colour.
+
+    The bar about the hole that it hangs by is as narrow, but sticks out of nothing: the outline tells what does.
+    """
+    outline = Polygon(handle.exterior)
     ring = np.asarray(handle.minimum_rotated_rectangle.exterior.coords)
     length = float(np.linalg.norm(np.diff(ring[:3], axis=0), axis=1).max())
-    narrow = WHISKER * handle.area / max(length, 1e-6) / 2
-    left = parts_of(handle.buffer(-narrow).buffer(narrow))
-    return left[0] if left and left[0].area > 0.8 * handle.area else handle
+    narrow = WHISKER * outline.area / max(length, 1e-6) / 2
+    left = parts_of(outline.buffer(-narrow).buffer(narrow))
+    return parts_of(left[0].intersection(handle))[0] if left and left[0].area > 0.8 * outline.area else handle
 
 
 def fit_bowl(laid: Laid, sights: list[Sight], noise: float, parameters: Parameters) -> Bowl | None:

@@ -289,6 +289,16 @@ def test_a_scoop_is_hollow_also_where_its_near_wall_hides_it(family, seed, yaw, 
     assert off_by(truth, found) < least
 
 
+def test_a_handle_keeps_the_bar_about_the_hole_that_it_hangs_by_and_loses_whiskers():
+    # 30 mm wide; a hole of 22 mm leaves 4 mm about it at the end, and smear sticks out of the side as narrow.
+    bar = shapely.LineString([(0, 0), (0.1, 0)]).buffer(0.015).difference(shapely.Point(0.1, 0).buffer(0.011))
+    whisker = shapely.box(0.04, 0.0, 0.043, 0.03)
+    left = scoops._without_whiskers(bar.union(whisker))
+    assert bar.difference(left).area < 0.02 * bar.area
+    assert left.difference(bar).area < 0.2 * whisker.area
+    assert len(left.interiors) == 1
+
+
 def test_a_ladle_that_lies_so_far_on_its_side_that_it_would_hold_no_water_is_a_scoop():
     """With a stem that rises steeply its rim leans by 40 degrees; as a height field it was filled down to the table."""
     ladle = laid_down(shapes.make("ladle", 5, angle=0.78, handle=0.30, bowl_radius=0.06, depth=0.03, aspect=1.0).mesh)
