@@ -183,11 +183,11 @@ def seen_into(sights: list[Sight], body: Body, noise: float) -> bool:
 
 
 def _through_the_top(body: Body, sight: Sight, spots: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether a camera looks at spots (..., 3) inside a body's foot through its top."""
+    """Whether a camera looks at spots (..., 3) inside a body's foot through its top, and not past the rim itself."""
     radius, top = body.profile[-1]
     share = (top - spots[..., 2]) / np.maximum(sight.eye[2] - spots[..., 2], 1e-6)
     met = spots[..., :2] + share[..., None] * (sight.eye[:2] - spots[..., :2])
-    return np.linalg.norm(met - body.axis, axis=-1) < radius
+    return np.linalg.norm(met - body.axis, axis=-1) < radius - RIM
 
 
 #: Spacing of the offsets at which a mask's edge is looked for, m.
@@ -340,16 +340,30 @@ def _to_the_masks(body: Body, lid: bool, sights: list[Sight], noise: float) -> B
         level = fitted.profile[:, 1] * (body.profile[-1, 1] / fitted.profile[-1, 1])
         return replace(fitted, profile=np.column_stack([fitted.profile[:, 0], level]))
     fitted = replace(fitted, open=True)
-    return replace(fitted, through=True) if _seen_through(fitted, sights) else fitted
+    return replace(fitted, through=True) if seen_through(fitted, sights) else fitted
 
 
-def _seen_through(body: Body, sights: list[Sight]) -> bool:
+#: A body is a band where the table shows to a camera at so much of its foot, or at so much of what it sees of that through the top, if that is so large, m^2.
+#: Of twelve cups, bowls and mugs none showed any; of five bands that were deeper than wide the slivers seen of the table, 0.1 cm2 and more, were open by 13 to 85 %.
+SHOWS, OPENS, SLIVER = 0.12, 0.3, 5e-5
+#: Wall and smear at the rim of an open body are so wide, m.
+RIM = 0.006
+
+
+def seen_through(body: Body, sights: list[Sight]) -> bool:
     """Whether some part of the table inside an open body shows to some camera through its top, as of a band."""
-    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    spots = np.array(
-        [[[*(body.axis + f * body.profile[0, 0] * np.array([np.cos(t), np.sin(t)])), 0.001] for t in turns] for f in (0.2, 0.4, 0.6, 0.75)]
-    )
-    return max(float(np.mean((carve([sight], [spots]) < 0.3) & _through_the_top(body, sight, spots))) for sight in sights) > 0.12
+    turns, shares = np.arange(32) * 2 * np.pi / 32, np.linspace(0.1, 0.9, 9)
+    ring = np.column_stack([np.cos(turns), np.sin(turns)])
+    spots = np.stack([np.column_stack([body.axis + f * body.profile[0, 0] * ring, np.full(len(ring), 0.001)]) for f in shares])
+    # Each stands for an area of the foot, m^2: the farther out, the larger.
+    area = shares[:, None] * (0.1 * 2 * np.pi / len(turns) * body.profile[0, 0] ** 2)
+    for sight in sights:
+        through = _through_the_top(body, sight, spots)
+        table = through & (carve([sight], [spots]) < 0.3)
+        seen = float((area * through).sum())
+        if table.mean() > SHOWS or (seen > SLIVER and float((area * table).sum()) > OPENS * seen):
+            return True
+    return False
 
 
 def _united(mesh: Mesh, bars: list[Mesh]) -> Mesh:

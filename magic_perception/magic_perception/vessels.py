@@ -6,6 +6,8 @@ faces a camera and the inside of the far wall then tell the profile together; ea
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,7 @@ from magic_perception.body import Body
 from magic_perception.parameters import Parameters
 from magic_perception.sight import Sight
 from magic_perception.solids import Reconstruction
-from magic_perception.turned import fit_to_silhouettes, seen_into, turned_body
+from magic_perception.turned import fit_to_silhouettes, seen_into, seen_through, turned_body
 
 #: Of the rim: its least and largest radius, m; four fifths of the highest points lie within this share of the radius from its circle, in this
 #: share of all directions from its middle.
@@ -90,5 +92,6 @@ def build_vessel(
     body = fit_to_silhouettes(body, sights)
     if not seen_into(sights, body, noise):
         return None
+    body = replace(body, through=seen_through(body, sights))
     mesh, pieces = turned_body(body, max(parameters.wall, 0.0035))
     return Reconstruction(mesh, tuple(pieces), "round")

@@ -101,6 +101,23 @@ def test_a_can_on_its_side():
     assert solid.volume == pytest.approx(truth.to_trimesh().volume, rel=0.1)
 
 
+@pytest.mark.parametrize(("floor", "holes"), [(0.004, 0), (0.0, 1)])
+def test_of_the_table_in_a_narrow_band_a_sliver_tells_that_it_has_no_floor(floor, holes):
+    # 58 mm wide and 40 mm high: its own wall hides most of what is in it, and smear fills a part of the rest.
+    outside = trimesh.creation.cylinder(0.029, 0.04).apply_translation([0, 0, 0.02])
+    inside = trimesh.creation.cylinder(0.026, 0.06).apply_translation([0, 0, 0.03 + (floor or -0.01)])
+    band = trimesh.boolean.difference([outside, inside], engine="manifold")
+    truth = Mesh(band.vertices, band.faces).painted((60, 90, 200)).transformed(transforms.make(translation=[0.45, -0.05, 0]))
+    caster = sensor.scene_raycaster([truth])
+    frames = [
+        sensor.capture([], sensor.D435, pose, [0, i], camera=name, raycaster=caster, model=sensor.SMEARED)
+        for i, (name, pose) in enumerate(sensor.STATION.items())
+    ]
+    (item,) = perceive(frames).objects
+    assert item.mesh.to_trimesh().euler_number == 2 - 2 * holes
+    assert distance(truth, item.mesh.transformed(item.world_from_object)) < 0.0025
+
+
 PLACES = ((0.38, -0.28), (0.62, -0.2), (0.42, 0.02), (0.66, 0.1), (0.4, 0.3))
 
 
