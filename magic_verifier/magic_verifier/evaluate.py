@@ -506,6 +506,9 @@ def evaluate(options: Options, out: Path, limit: int = 0, jobs: int = 1, films: 
 
     _check(options)
     todo = all_cases(options)[: limit or None]
+    if not todo:
+        why = "; controls are things of which geometry tells that they cannot do the task" if options.set == "controls" else ""
+        raise MagicError(Code.BAD_REQUEST, f"cases of the set {options.set} of {options.task}", 0, f"a set with a case at least{why}")
     _take_folder(options, out)
     known = {case.name: stored for case in todo if (stored := _stored(out / "cases" / f"{_key(case.name)}.json")) is not None}
     waiting = [case for case in todo if case.name not in known]

@@ -414,6 +414,13 @@ def test_a_tool_or_a_scene_that_is_not_told_ends_the_evaluation(tmp_path):
         ev.attempt(Options("hooking", variant="fg_no_selection", strategies=str(tmp_path)), replace(case, tools=("l_hook:1",)), None)
 
 
+def test_a_set_without_a_case_is_refused_and_is_no_rate(tmp_path, monkeypatch):
+    monkeypatch.setattr(ev, "all_cases", lambda _options: [])
+    with pytest.raises(MagicError, match="cases of the set controls of hooking: 0"):
+        ev.evaluate(Options("hooking", set="controls", strategies=STRATEGIES), tmp_path / "out", log=lambda _text: None)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_case_that_breaks_does_not_end_the_others(tmp_path, monkeypatch):
     def run_case(options, case, film=None):
         raise ZeroDivisionError("in the middle")
