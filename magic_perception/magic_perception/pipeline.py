@@ -135,6 +135,7 @@ def perceive(
             building = stack.enter_context(_building(views, parameters, workers))
             report.cameras = _disagreements(views, ground.frames, parameters.seed)
             worst = _worst(report.cameras)
+            _look_at_one_scene(views)
             report.notes += _about_poses(report.cameras, views)
             apart = _apart(worst, views)
             if views.corrects and worst is not None and worst.certain and worst.motion.any():
@@ -297,6 +298,22 @@ def _worst(pairs: list[cameras.Disagreement]) -> cameras.Disagreement | None:
             f"up to {1000 * cameras.MOST_OFFSET:.0f} mm and {np.degrees(cameras.MOST_ANGLE):.1f} degrees; calibrate them again",
         )
     return worst
+
+
+def _look_at_one_scene(views: _Views) -> None:
+    """What one camera sees may not stand where another sees the bare table, and the other way round, as with cameras that were exchanged: then they often see
+    nothing in common by which their poses could be compared.  Raises ``CAMERAS_DISAGREE``."""
+    images = [_at_rest(image, views.hanging) for image in views.labels[: views.now]]
+    for i, j in itertools.combinations(range(views.now), 2):
+        one, other = views.looks[i], views.looks[j]
+        shares = cameras.looked_through(one, images[i], other), cameras.looked_through(other, images[j], one)
+        if min(shares) > cameras.THROUGH:
+            raise MagicError(
+                Code.CAMERAS_DISAGREE,
+                f"share of what {one.frame.camera} sees that {other.frame.camera} looks through, and the other way round",
+                " and ".join(f"{share:.2f}" for share in shares),
+                f"at most {cameras.THROUGH:g}; were the cameras, or their poses, exchanged?",
+            )
 
 
 def _about_poses(pairs: list[cameras.Disagreement], views: _Views) -> list[str]:

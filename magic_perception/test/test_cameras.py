@@ -34,6 +34,10 @@ def pair():
         scenes.shape("cylinder", 1, 0.62, 0.12),
         scenes.shape("scissors", 1, 0.6, -0.27, 0.2),
     ]
+    return seen_by_both(meshes)
+
+
+def seen_by_both(meshes):
     caster = sensor.scene_raycaster(meshes)
     return [
         sensor.capture([], scenes.INTRINSICS, pose, [5, i], camera=name, raycaster=caster)
@@ -68,6 +72,23 @@ def test_cameras_far_apart_are_refused_with_how_far(pair, motion):
     told = float(str(caught.value).split("sees the scene ")[1].split(" mm")[0])
     middle = np.array([0.57, -0.1, 0.02])
     assert told == pytest.approx(1000 * np.linalg.norm(transforms.apply(motion, middle) - middle), abs=5)
+
+
+def test_cameras_that_were_exchanged_are_refused():
+    """Of cameras that mirror each other each sees its things where the other sees the bare table: nothing is common to both, and everything is there twice."""
+    things = [scenes.shape("caliper", 1, 0.45, -0.22, 0.5), scenes.shape("cylinder", 1, 0.7, 0.1)]
+    left, right = seen_by_both(things)
+    exchanged = [replace(left, world_from_camera=right.world_from_camera), replace(right, world_from_camera=left.world_from_camera)]
+    with pytest.raises(MagicError, match="left.*looks through.*exchanged") as caught:
+        perceive(exchanged, parameters=REGION)
+    assert caught.value.code is Code.CAMERAS_DISAGREE
+
+
+def test_cameras_of_which_each_sees_its_own_side_do_not_look_through_things():
+    """A wall between them: of its sides neither sees the other's."""
+    wall = slab([0.2, 0.003, 0.1], [0.55, 0.0, 0.05], (200, 60, 60))
+    found = perceive(seen_by_both([wall]), parameters=REGION)
+    assert len(found.objects) >= 1
 
 
 def test_cameras_a_little_apart_are_brought_together(pair):
