@@ -96,7 +96,10 @@ class MatcherNode(Node):
             canonical_view(corner, np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]), "top")
         except (IndexError, MagicError) as error:  # a request will be answered with the reason
             self.get_logger().debug(f"warm-up: {error}")
-        self.get_logger().info(f"strategies in {root}: {', '.join(names) or 'none'}")
+        if names:
+            self.get_logger().info(f"strategies in {root}: {', '.join(names)}")
+        else:
+            self.get_logger().warning(f"no strategies in {root} (parameter strategies)")
 
     def _strategy(self, name: str) -> Strategy:
         """The strategy of that name, read again where its file has changed."""

@@ -381,7 +381,7 @@ def _folder(name: str, root: str | Path | None) -> Path:
         ) from None
     names = sorted(p.parent.name for p in root.glob("*/strategy.yaml"))
     if name not in names:
-        raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, [*names, "or the path of a strategy folder"])
+        raise MagicError(Code.UNKNOWN_STRATEGY, "strategy", name, [*(names or [f"none is in {root}"]), "or the path of a strategy folder"])
     return root / name
 
 

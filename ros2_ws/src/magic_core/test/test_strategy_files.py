@@ -222,6 +222,13 @@ def test_a_trajectory_that_is_none(folder, row, column, value, says):
     assert error.value.code == Code.BAD_STRATEGY
 
 
+@pytest.mark.parametrize("name", ["empty", "nowhere"])
+def test_a_folder_without_strategies_is_named(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MagicError, match=f"'pull' .allowed: none is in {tmp_path / name}, or"):
+        strategies.find("pull", tmp_path / name)
+
+
 def test_without_the_installed_ones_a_path_is_asked_for(monkeypatch):
     def nowhere():
         raise LookupError("package 'magic_bringup' not found")
