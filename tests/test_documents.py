@@ -272,6 +272,11 @@ def test_the_parts_of_the_reference_that_need_no_node_are_up_to_date():
         assert part in page, "docs/reference.md is not up to date: ros2 run magic_bringup reference"
 
 
+def test_programs_of_the_environment_that_documents_name_are_there():
+    named = {name for path in DOCUMENTS for name in re.findall(r"ros2_ws/\.venv/bin/([\w-]+)", path.read_text())}
+    assert named and not [name for name in named if not (Path(sys.prefix) / "bin" / name).exists()]
+
+
 def test_every_symptoms_code_exists():
     from magic_core.errors import Code
 
