@@ -249,8 +249,8 @@ REMEDIES: dict[Code, Remedy] = {
         "End all but one (`ros2 node list`); another ROS_DOMAIN_ID for each setup.",
     ),
     Code.SCENE_CHANGED: Remedy(
-        "Target or obstacles moved while the arm was at work; it was stopped, and no further plan was allowed or found.",
-        "Keep the scene still, or raise loop.replans; loop.watch_tolerance says how much is a move.",
+        "Target or obstacles moved, or something came in, while the arm was at work; it was stopped, and no further plan was allowed or found.",
+        "Keep the scene still, or raise loop.replans; loop.watch_tolerance says how much is a move, loop.intrusion how near something may come.",
     ),
     Code.TOOL_SLIPPED: Remedy(
         "The tool is off in the hand, by more than is allowed or than a plan could be made for; the arm stands with it.",

@@ -41,6 +41,7 @@ from magic_server import execution, in_hand, pipeline, scene_change, seen_goal, 
 from magic_server.after_task import After, points_of, thing
 from magic_server.arm import Arm
 from magic_server.held import Carried, Held, HeldStages, rest_of
+from magic_server.intrusion import Intruded, Intrusion, Way, strangers
 from magic_server.joints import STANDSTILL
 from magic_server.permission import Claim, Limits, Look, NotYet, Purpose, World, permit
 from magic_server.remote import Token
@@ -64,6 +65,8 @@ STILL, STILL_FOR = 0.003, 0.1
 SLOWEST = 20.0
 #: joint_states that are silent for so much longer than ``state_age`` while the arm moves stop it, s: a busy machine delivers late.
 SILENT = 1.0
+#: Of the points on each link every so many stand for it where something has come in, and at most so many of the tool's corners.
+SPARSE, MOST_OF_TOOL = 8, 300
 #: Failures after which the next candidate is tried, from the state as it is then.
 RETRIED = frozenset({Code.GRASP_FAILED, Code.GOAL_MISSED})
 #: Two contacts of one tool that are nearer than this are the same, m.
@@ -193,6 +196,9 @@ class ClosedLoop:
                 error = off.error
                 self._follow(error, lambda error: self._bounds.elsewhere(error, error.code, time.monotonic()))
                 following = self._corrected(job, off.held)
+            except Intruded as error:
+                self._at_rest(error)
+                raise
             except (Changed, Unwatched) as stop:
                 if isinstance(stop, Unwatched) and self._has_let_go:
                     raise  # what is left is the way back: nothing that another plan would do
@@ -289,6 +295,7 @@ class ClosedLoop:
         )
 
         newest: list[Look | None] = [None]
+        intrusion = self._intrusion(move, speed)
 
         def check() -> None:
             try:
@@ -297,6 +304,8 @@ class ClosedLoop:
                 # Of a simulation that is slower than the wall's clock only its own clock tells how old a thing is.
                 now = newest[0].came if self._simulated and newest[0] is not None else time.monotonic()
                 watching.take(newest[0], began, self._now(), now, server.hand()[:3, 3])
+                if intrusion is not None and newest[0] is not None:
+                    self._look_for_intruders(intrusion, newest[0], began)
                 self._heard()
             except MagicError:
                 raise
@@ -304,6 +313,38 @@ class ClosedLoop:
                 raise MagicError(Code.INTERNAL, f"watching the scene: {type(error).__name__}: {error}") from error
 
         return check
+
+    def _intrusion(self, move: execution.Move, speed: float) -> Intrusion | None:
+        """What looks for what comes in where the arm is still to go, from a move on; ``None``: that is not wanted."""
+        if self._settings.intrusion <= 0:
+            return None
+        robot, trajectory = self._server.robot, self.jobs[-1].outcome.plan.arm_trajectory
+        points = trajectory.points[move.first :]
+        times = np.array([conversions.time_from_msg(p.time_from_start) for p in points])
+        order = [list(trajectory.joint_names).index(name) for name in robot.names]
+        tool = np.zeros((0, 3))
+        if self._held is not None:
+            tool = transforms.apply(transforms.inverse(self._held.tool_from_tcp), self._held.mesh.vertices)
+        way = Way(
+            robot,
+            (times - times[0]) / speed,
+            np.array([p.positions for p in points])[:, order],
+            {link: on[::SPARSE] for link, on in surfaces(robot).items()},
+            tool[:: 1 + len(tool) // MOST_OF_TOOL],
+            {name: joint.position for name, joint in self._server.joints.all().items() if name not in robot.names},
+        )
+        return Intrusion(way, self._settings.intrusion)
+
+    def _look_for_intruders(self, intrusion: Intrusion, look: Look, began: float) -> None:
+        """Whether something has come in by a look; raises :class:`magic_server.intrusion.Intruded`."""
+        claim, outcome = self.jobs[-1].claim, self.jobs[-1].outcome
+        try:
+            carried = self._tool_at(look.stamp)
+        except NotYet:
+            return  # where the hand was then nobody said: the tool in it cannot be told from what has come
+        before = {**look.remembered, **claim.scene.remembered, **claim.scene.objects}
+        come = strangers(before, look.objects, {outcome.tool_id, outcome.target_id}, carried)
+        intrusion.take(come, look.stamp, self._now() - began)
 
     def _heard(self) -> None:
         joints = [joint for name, joint in self._server.joints.all().items() if name in self._server.robot.names]

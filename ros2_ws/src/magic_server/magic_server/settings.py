@@ -75,6 +75,7 @@ class LoopSettings:
     tool_shift, tool_turn : m and rad; a tool that is off by no more in the hand is carried on as planned.
     slip_shift, slip_turn : m and rad; one that is off by more is given up.
     watch_tolerance : m that a thing may move while the arm moves.
+    intrusion : m that what comes in while the arm moves has to be away from where arm and tool are still to go; 0: it is not looked for.
     accuracy : m to which the middle of a thing is known that is seen twice.
     torque_error : Nm (N) to which a joint repeats its torque: with it the tool is weighed where it is looked at; 0: it is not.
     """
@@ -92,6 +93,7 @@ class LoopSettings:
     slip_shift: float = 0.03
     slip_turn: float = 0.5
     watch_tolerance: float = 0.03
+    intrusion: float = 0.0
     accuracy: float = 0.005
     torque_error: float = 0.0
 
@@ -200,6 +202,14 @@ def read_loop(node: Node, preset: str = "") -> LoopSettings:
         slip_turn=of("slip_turn", "slip_turn", "rad beyond which a tool that is off in the hand is given up", 0.0, 3.2),
         watch_tolerance=of(
             "watch_tolerance", "watch_tolerance", "m that a point of a thing may move while the arm moves, all of it half as much", 0.0, 0.5
+        ),
+        intrusion=of(
+            "intrusion",
+            "intrusion",
+            "m that what comes in while the arm moves has to be away from where arm and tool are still to go, else the arm is stopped and the "
+            "run ends; 0: it is not looked for. Not a safety function",
+            0.0,
+            1.0,
         ),
         accuracy=of("accuracy", "accuracy", "m to which the middle of a thing is known that is seen before and after the task", 0.0, 0.1),
         torque_error=parameter(

@@ -30,8 +30,8 @@ class SceneWatch:
     planned: the objects that the motion was planned for.  meant: ids of what is moved on purpose.  target: its id, and ``contact``:
     from how many seconds after the move's beginning on the tool may move it (infinite: not in this move).  tolerance: m that points of a
     thing may have moved (:func:`magic_server.scene_change.beyond`); age: s that the newest look may be old.  An id may be handed on to
-    another thing: what stands where a thing stood, as it stood, is that thing by whatever new id.  What has come is not looked at here: a
-    hand that reaches in is seen where it moves something, and before each move of the arm.
+    another thing: what stands where a thing stood, as it stood, is that thing by whatever new id.  What has come is not looked at here, but
+    before each move of the arm, and by :mod:`magic_server.intrusion`.
     """
 
     def __init__(self, planned: Look, meant: Collection[str], target: str, contact: float, tolerance: float, age: float) -> None:

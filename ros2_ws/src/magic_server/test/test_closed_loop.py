@@ -38,11 +38,12 @@ def tool(name, pose, hanging=False):
 class Table:
     """What stands on the table and what the arm has in its hand, as perception tells of it: there the tool has another id.
 
-    off: where the tool is in the hand, seen from where it was grasped.  target: m along x.  stays: the tool is not taken along.
+    off: where the tool is in the hand, seen from where it was grasped.  target: m along x.  stays: the tool is not taken along.  come: where
+    something has come in.
     """
 
     def __init__(self, arm):
-        self.arm, self.off, self.target, self.stays, self.blind = arm, np.eye(4), 0.5, False, False
+        self.arm, self.off, self.target, self.stays, self.blind, self.come = arm, np.eye(4), 0.5, False, False, None
 
     def hand(self):
         return ROBOT.forward(np.array(self.arm.positions))[0]
@@ -53,7 +54,8 @@ class Table:
         in_hand = self.arm.opening < 0.05 and not self.stays
         first = tool("object_9", self.hand() @ self.off, hanging=True) if in_hand else tool("object_1", LYING)
         box = replace(fakes.scene().objects[1], world_from_object=transforms.make(translation=[self.target, 0.3, 0.025]))
-        return Scene((first, box), np.array([0.0, 0.0, 1.0, 0.0]))
+        come = [] if self.come is None else [replace(box, id="object_7", world_from_object=transforms.make(translation=self.come))]
+        return Scene((first, box, *come), np.array([0.0, 0.0, 1.0, 0.0]))
 
 
 @pytest.fixture(scope="module")
@@ -431,6 +433,38 @@ def test_an_arm_that_goes_on_moving_ends_it(bench):
     bench.server._loop = replace(bench.usual, rest_time=0.4)
     result = run(bench, Code.ARM_NOT_AT_REST, executed=False)
     assert "object_2 has moved" in result.message and moves(bench) == 1
+
+
+def comes(bench, number, place):
+    """During the ``number``-th move something comes in, m from the hand, and stays; whether the move was stopped by that is told."""
+    stopped = []
+
+    def move(trajectory, canceled):
+        if moves(bench) == number:
+            bench.table.come = bench.table.hand()[:3, 3] + place
+            seen = bench.server.scene_came
+            bench.until(lambda: canceled() or bench.server.scene_came > seen + 1.0)
+            stopped.append(canceled())
+        return 0, ""
+
+    bench.arm.on_move = move
+    return stopped
+
+
+def test_what_comes_in_where_the_arm_is_to_go_stops_it_and_ends_the_run(bench):
+    bench.server._loop = replace(bench.usual, intrusion=0.1)
+    stopped = comes(bench, 1, [0.0, 0.0, 0.05])
+    result = run(bench, Code.SCENE_CHANGED, executed=False)
+    assert stopped == [True] and moves(bench) == 1 and len(asked(bench, "plan_motion")) == 1
+    assert "object_7 has come in while the arm moved, at (" in result.message
+
+
+@pytest.mark.parametrize("place, clearance", [([0.0, 0.6, 0.3], 0.1), ([0.0, 0.0, 0.05], 0.0)])
+def test_what_comes_in_elsewhere_or_is_not_looked_for_stops_no_move(bench, place, clearance):
+    bench.server._loop = replace(bench.usual, intrusion=clearance)
+    stopped = comes(bench, 1, place)
+    bench.run(variant="arm", tool_id="object_1")
+    assert stopped == [False]
 
 
 def unwatched(bench, number, until_stopped=True):
