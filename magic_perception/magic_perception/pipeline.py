@@ -307,7 +307,7 @@ def _look_at_one_scene(views: _Views) -> None:
     for i, j in itertools.combinations(range(views.now), 2):
         one, other = views.looks[i], views.looks[j]
         shares = cameras.looked_through(one, images[i], other), cameras.looked_through(other, images[j], one)
-        if min(shares) > cameras.THROUGH:
+        if all(share > cameras.THROUGH for share in shares):  # NaN, which tells nothing, is not
             raise MagicError(
                 Code.CAMERAS_DISAGREE,
                 f"share of what {one.frame.camera} sees that {other.frame.camera} looks through, and the other way round",

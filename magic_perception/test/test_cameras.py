@@ -84,6 +84,13 @@ def test_cameras_that_were_exchanged_are_refused():
     assert caught.value.code is Code.CAMERAS_DISAGREE
 
 
+@pytest.mark.parametrize("shares", [(0.5, np.nan), (np.nan, 0.5)])
+def test_cameras_of_which_one_sees_too_little_to_tell_are_not_taken_for_exchanged(pair, shares, monkeypatch):
+    told = iter(shares)
+    monkeypatch.setattr("magic_perception.cameras.looked_through", lambda *_: next(told))
+    assert perceive(pair, parameters=REGION).objects
+
+
 def test_cameras_of_which_each_sees_its_own_side_do_not_look_through_things():
     """A wall between them: of its sides neither sees the other's."""
     wall = slab([0.2, 0.003, 0.1], [0.55, 0.0, 0.05], (200, 60, 60))
