@@ -30,7 +30,7 @@ from magic_perception import conversions as pc
 from magic_perception import node
 from magic_perception.meanwhile import LOOKS
 from magic_perception.node import Perception
-from magic_perception.parameters import Parameters
+from magic_perception.parameters import WORKSPACE, Parameters
 from magic_perception.pipeline import perceive
 
 tf2_msgs = pytest.importorskip("tf2_msgs.msg")
@@ -143,13 +143,12 @@ def frames():
 
 
 def test_the_node_gives_what_the_core_gives(frames):
-    low, high = (0.15, -0.6, -0.05), (0.95, 0.6, 0.5)
     # Poses go through quaternions on their way: so do the core's.
     rounded = [
         type(f)(f.color, f.depth, f.intrinsics, cv.transform_from_msg(cv.transform_to_msg(f.world_from_camera)), f.camera, f.stamp)
         for f in frames
     ]
-    expected = perceive(rounded, parameters=Parameters(region_low=low, region_high=high))
+    expected = perceive(rounded, parameters=Parameters(**WORKSPACE))
     with Bench() as bench:
         bench.transforms()
         bench.until(lambda: bench.objects and bench.markers, "objects", tick=lambda: [bench.send(f) for f in frames])
@@ -711,7 +710,7 @@ def test_a_bag_through_the_node_and_through_the_core():
         for name, pairs in sorted(images.items())
     ]
     count = len(images["left"])
-    expected = perceive(frames, parameters=Parameters(region_low=(0.15, -0.6, -0.05), region_high=(0.95, 0.6, 0.5)))
+    expected = perceive(frames, parameters=Parameters(**WORKSPACE))
     with Bench(average=count, camera_timeout=10.0) as bench:
         out = {t: bench.tester.create_publisher(k, t, SENSOR) for t, k, _ in messages if t.startswith("/camera")}
         used = {t: p for t, p in out.items() if "aligned_depth_to_color/camera_info" not in t}

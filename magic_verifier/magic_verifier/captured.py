@@ -30,9 +30,10 @@ from magic_verifier.floating import settled
 from magic_verifier.subjects import Case, Meeting, scene_for, tool_object
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
-#: Frames of each camera that are averaged, and the workspace: the perception node's defaults.
+#: Frames of each camera that are averaged: the perception node's default.
 FRAMES = 3
-REGION = (0.15, -0.6, -0.05), (0.95, 0.6, 0.5)
+#: Where things are laid, lowest and highest x and y, m: within its workspace, and so far from the arm's base that they can be taken up.
+LAID = (0.15, -0.6), (0.95, 0.6)
 #: A reconstruction belongs to a thing when its middle is nearer than this share of the thing's longest side.
 NEAR = 0.35
 #: What is truly the case, as factors on the strategy's own numbers: half range of friction, and densities from 1/x to x.
@@ -69,10 +70,10 @@ def lay_out(strategy: Strategy, case: Case, seed: int) -> Layout:
 
 
 def _in_sight(item: SceneObject, covered: Any) -> bool:
-    """Whether both cameras see all of the object, and the workspace holds it."""
+    """Whether both cameras see all of the object, and it lies where things are laid."""
     import shapely
 
-    region = shapely.box(*np.add(REGION[0][:2], 0.01), *np.subtract(REGION[1][:2], 0.01))
+    region = shapely.box(*np.add(LAID[0], 0.01), *np.subtract(LAID[1], 0.01))
     if not region.contains(covered):
         return False
     corners = transforms.apply(item.world_from_object, item.mesh.vertices)
@@ -101,11 +102,11 @@ def capture(layout: Layout, case: Case, seed: int) -> list[RgbdFrame]:
 
 def perceive(layout: Layout, frames: list[RgbdFrame], physics: Physics) -> Scene:
     """What perception makes of the frames; fixtures, and a target that is one, are known to it."""
-    from magic_perception.parameters import Parameters
+    from magic_perception.parameters import WORKSPACE, Parameters
     from magic_perception.pipeline import perceive as reconstruct
 
     known = layout.fixtures + ((layout.target,) if physics.target_is_fixed else ())
-    return reconstruct(frames, known, Parameters(region_low=REGION[0], region_high=REGION[1]))
+    return reconstruct(frames, known, Parameters(**WORKSPACE))
 
 
 def pair(layout: Layout, scene: Scene) -> tuple[list[SceneObject | None], SceneObject | None]:
