@@ -350,7 +350,7 @@ class Perception(Node):
             report = Report(notes=notes)
             earlier = self.keyframes.useful(frames)
             scene = perceive(frames, known, self.settings.algorithm, self.segmenter, report, earlier, self.workers)
-            scene, masks, carried = self.remember(scene, frames, report, still)
+            scene, masks, carried = self.remember(scene, frames, report, still, held)
             self.made = Made(scene, frames, known, held, masks, carried, looks, len(looks))
             self.publish(scene)
             seconds = time.monotonic() - now
@@ -382,15 +382,17 @@ class Perception(Node):
         return scene is not None
 
     def remember(
-        self, scene: Scene, frames: list[RgbdFrame], report: Report, still: set[str]
+        self, scene: Scene, frames: list[RgbdFrame], report: Report, still: set[str], held: tuple[Held, ...]
     ) -> tuple[Scene, dict[str, list[np.ndarray]], frozenset[str]]:
         """The scene under the names that its things had before, the masks (H, W) of each of them in the frames, and the names of those that
         the robot carries.
 
-        The frames are kept for what they show; still: the cameras that did not move.
+        The frames are kept for what they show; still: the cameras that did not move; held: what the robot held.
         """
         numbers = [report.numbers.get(item.id, 0) for item in scene.objects]
-        scene = self.tracker.update(replace(scene, frame_id=self.settings.frame))
+        # What passes over others on its way is not to be taken for one of them.
+        in_hand = {report.held[0]: held[0].id} if len(held) == 1 and report.held else {}
+        scene = self.tracker.update(replace(scene, frame_id=self.settings.frame), in_hand)
         named = {item.id: n for n, item in zip(numbers, scene.objects, strict=True) if n}
         carried = frozenset(item.id for item in scene.objects if self.tracker.carried(item))
         # An arm that could not be cut out would be remembered as a thing.

@@ -57,6 +57,7 @@ class Report:
     """What perceive() can tell besides the scene: what it left out and why, and by stage the seconds by the clock and of this process on any processor.
 
     labels (H, W): of the frames; by id in the scene: numbers, the label of each object, shapes, pixels in the camera that saw most of it, evidence and departures.
+    held: the ids of what the robot holds, the largest first.
     cameras: how far each pair of cameras disagrees.  earlier: the earlier frames with what has become of each, blind where newer ones contradict it.  Stages: ``table``, ``masks``, ``cameras``, ``meshes`` (with convex pieces), ``views`` (colours and canonical views).
     """
 
@@ -65,6 +66,7 @@ class Report:
     notes: list[str] = field(default_factory=list)
     labels: list[NDArray[np.int32]] = field(default_factory=list)
     numbers: dict[str, int] = field(default_factory=dict)
+    held: list[str] = field(default_factory=list)
     shapes: dict[str, str] = field(default_factory=dict)
     pixels: dict[str, int] = field(default_factory=dict)
     cameras: list[cameras.Disagreement] = field(default_factory=list)
@@ -148,6 +150,7 @@ def perceive(
             solids, refused = _solids(building, views, apart)
             report.notes += [_about_refused(label, error, views) for label, error in refused.items()]
             report.numbers = {f"object_{number}": built.label for number, built in enumerate(solids, 1)}
+            report.held = [name for name, label in report.numbers.items() if label in views.held]
             report.labels = _of_all_frames(views, refused, frames, seeing)
             sizes = [len(built.points) for built in solids]
             hidden = shared_out(_hidden, (solids, views), range(len(solids)), sizes, workers)
@@ -247,13 +250,14 @@ class _Views:
         return list(range(1, max((int(image.max()) for image in self.labels), default=0) + 1))
 
     @cached_property
+    def held(self) -> set[int]:
+        """The labels of what the robot holds."""
+        return {label for label in self.numbers if mostly_held(self.looks, self.labels, label)}
+
+    @cached_property
     def hanging(self) -> set[int]:
-        """The labels of what hangs above the table."""
-        return {
-            label
-            for label in self.numbers
-            if mostly_held(self.looks, self.labels, label) or hangs(self.looks, self.labels, label, self.fixtures)
-        }
+        """The labels of what hangs above the table, what the robot holds among them."""
+        return {label for label in self.numbers if label in self.held or hangs(self.looks, self.labels, label, self.fixtures)}
 
     @property
     def compared(self) -> int:

@@ -34,16 +34,17 @@ DRAWN = Margins(edge=1, space=0.004)
 
 @dataclass(frozen=True)
 class Held:
-    """A thing in the hand: its shape, the link that it is fixed to, and link_from_object (4, 4)."""
+    """A thing in the hand: its shape, the link that it is fixed to, link_from_object (4, 4), and its id."""
 
     body: Body
     link: str
     link_from_object: NDArray[np.float64]
+    id: str
 
     @classmethod
     def of(cls, item: SceneObject, link: str) -> Held:
         """An object whose pose is given in the frame of a link."""
-        return cls(Body(item.mesh), link, item.world_from_object)
+        return cls(Body(item.mesh), link, item.world_from_object, item.id)
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -55,8 +56,8 @@ class Tracker:
     An object takes the id of the one it resembles most in place (within :data:`REACH` metres of where that was, or would be if it went on
     as it did) and in size (box edges within :data:`GROWTH` of each other plus 15 mm).  What is left then takes the id of what is missing
     where both are alike in size and colour, no farther apart than a robot may have moved it, and nothing else could be either of them. A
-    thing not seen for :data:`MEMORY` scenes is forgotten, but its number is not given out again.  ``standing``: ids of what is where it was
-    before.
+    thing not seen for :data:`MEMORY` scenes is forgotten, but its number is not given out again.  What is known by other means, as the
+    thing in the robot's hand, goes by that.  ``standing``: ids of what is where it was before.
     """
 
     def __init__(self) -> None:
@@ -64,11 +65,12 @@ class Tracker:
         self._last: dict[str, _Track] = {}
         self._next = 1
 
-    def update(self, scene: Scene) -> Scene:
-        """The scene with stable ids; known objects keep theirs."""
+    def update(self, scene: Scene, known: Mapping[str, str] | None = None) -> Scene:
+        """The scene with stable ids; known objects keep theirs.  known: by their ids in the scene, the ids of things that are known."""
         seen = [o for o in scene.objects if o.source == "camera"]
         new = [_Track.of(item, scene.stamp, None) for item in seen]
-        names = self._near(new)
+        names = {i: known[item.id] for i, item in enumerate(seen) if known and item.id in known}
+        names |= self._near(new, names)
         names |= self._far(new, names)
         taken = {o.id for o in scene.objects if o.source != "camera"}
         renamed: list[SceneObject] = []
@@ -76,7 +78,7 @@ class Tracker:
             while i not in names:
                 candidate = f"object_{self._next}"
                 self._next += 1
-                if candidate not in taken:
+                if candidate not in taken and candidate not in names.values():
                     names[i] = candidate
             renamed.append(replace(item, id=names[i]))
         ids = {old.id: item.id for old, item in zip(seen, renamed, strict=True)}
@@ -94,20 +96,22 @@ class Tracker:
         was not there before."""
         return item.source == "camera" and (item.hanging or (ROBOT in item.cut_off and item.id not in self.standing))
 
-    def _near(self, new: list[_Track]) -> dict[int, str]:
-        """The ids of what is about where something was, the most alike first."""
+    def _near(self, new: list[_Track], names: dict[int, str]) -> dict[int, str]:
+        """The ids of what is about where something was, of those without one, the most alike first."""
+        left = [i for i in range(len(new)) if i not in names]
+        gone = [name for name in self._last if name not in names.values()]
         costs = []
-        for i, item in enumerate(new):
-            for name, old in self._last.items():
+        for i, item in ((i, new[i]) for i in left):
+            for name, old in ((name, self._last[name]) for name in gone):
                 distance = min(float(np.linalg.norm(item.centre - place)) for place in (old.centre, old.expected(item.stamp)))
                 change = np.abs(item.extents - old.extents)
                 if distance < REACH and np.all(change < 0.015 + GROWTH * np.maximum(old.extents, item.extents)):
                     costs.append((distance + 0.5 * float(change.max()), i, name))
-        names: dict[int, str] = {}
+        found: dict[int, str] = {}
         for _, i, name in sorted(costs):
-            if i not in names and name not in names.values():
-                names[i] = name
-        return names
+            if i not in found and name not in found.values():
+                found[i] = name
+        return found
 
     def _far(self, new: list[_Track], names: dict[int, str]) -> dict[int, str]:
         """The ids of what is elsewhere, of those without one, where there is no other choice."""

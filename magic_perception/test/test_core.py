@@ -26,7 +26,7 @@ from magic_perception.registration import register_depth
 from magic_perception.segmenters import make_segmenter
 from magic_perception.stream import Stream, next_scene
 from magic_perception.table import camera_over_table, fit_plane
-from magic_perception.tracking import Tracker
+from magic_perception.tracking import REACH, Tracker
 
 
 def tight(mesh: Mesh) -> trimesh.Trimesh:
@@ -748,6 +748,23 @@ def test_what_a_robot_pushes_keeps_its_id_and_what_is_another_thing_gets_none(ho
     # Two that could both be it: neither is.
     found = ids(15.0, a=(one, [0.1, 0.3, 0.0]), c=(one, [0.1, -0.3, 0.0]), b=(other, [0.4, 0.3, 0.0]))
     assert not {found["a"], found["c"]} & set(first.values())
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_what_is_in_the_hand_is_not_taken_for_what_it_passes_over(hooking, told):
+    """A tool that hides another thing of its size for a while, stands where that stood, and goes on."""
+    scene = hooking[2]
+    tool, tracker = scene.objects[0], Tracker()
+
+    def ids(stamp, tool_at, other_seen=True):
+        places = [tool_at, *([[0.4, 0.3, 0.0]] if other_seen else [])]
+        seen = tuple(replace(tool, id=f"seen_{i}", world_from_object=transforms.make(translation=x)) for i, x in enumerate(places))
+        found = tracker.update(replace(scene, stamp=stamp, objects=seen), {"seen_0": "object_1"} if told else None)
+        return [item.id for item in found.objects]
+
+    assert ids(10.0, [0.7, 0.0, 0.0]) == ["object_1", "object_2"]
+    after = [ids(20.0, [0.4, 0.3, 0.2 * REACH], other_seen=False), ids(21.0, [0.4, 0.5, 0.0])]
+    assert (after == [["object_1"], ["object_1", "object_2"]]) is told
 
 
 # ---------------------------------------------------------------- offline

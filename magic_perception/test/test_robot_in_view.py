@@ -323,9 +323,11 @@ def test_what_is_held_to_a_thing_and_the_thing_are_two(panda, out, aside, away):
     held, hook = hook_at(robot, away)
     target = at_the_hook(hook, out, aside)
     view = told_what_is_held(robot, held)
-    scene = perceive([view.cut(frame) for frame in seen([target, hook, *pictures.at(OVER_THE_TABLE)])], (), REGION)
+    report = Report()
+    scene = perceive([view.cut(frame) for frame in seen([target, hook, *pictures.at(OVER_THE_TABLE)])], (), REGION, report=report)
     assert len(scene.objects) == 2
     (hanging,) = (o for o in scene.objects if o.hanging)
+    assert report.held == [hanging.id]
     (stands,) = (o for o in scene.objects if not o.hanging)
     np.testing.assert_allclose(stands.box_extents, target.extents, atol=0.004)
     np.testing.assert_allclose(stands.world_from_box[:3, 3], target.bounds.mean(axis=0), atol=0.004)
