@@ -56,7 +56,7 @@ class Tracker:
     An object takes the id of the one it resembles most in place (within :data:`REACH` metres of where that was, or would be if it went on
     as it did) and in size (box edges within :data:`GROWTH` of each other plus 15 mm).  What is left then takes the id of what is missing
     where both are alike in size and colour, no farther apart than a robot may have moved it, and nothing else could be either of them. A
-    thing not seen for :data:`MEMORY` scenes is forgotten, but its number is not given out again.  What is known by other means, as the
+    thing not seen for :data:`MEMORY` scenes is forgotten, but its number is not given out again.  What is told by other means, as the
     thing in the robot's hand, goes by that.  ``standing``: ids of what is where it was before.
     """
 
@@ -65,11 +65,11 @@ class Tracker:
         self._last: dict[str, _Track] = {}
         self._next = 1
 
-    def update(self, scene: Scene, known: Mapping[str, str] | None = None) -> Scene:
-        """The scene with stable ids; known objects keep theirs.  known: by their ids in the scene, the ids of things that are known."""
+    def update(self, scene: Scene, named: Mapping[str, str] | None = None) -> Scene:
+        """The scene with stable ids; known objects keep theirs.  named: by their ids in the scene, the ids of things that are told otherwise."""
         seen = [o for o in scene.objects if o.source == "camera"]
         new = [_Track.of(item, scene.stamp, None) for item in seen]
-        names = {i: known[item.id] for i, item in enumerate(seen) if known and item.id in known}
+        names = {i: named[item.id] for i, item in enumerate(seen) if named and item.id in named}
         names |= self._near(new, names)
         names |= self._far(new, names)
         taken = {o.id for o in scene.objects if o.source != "camera"}
